@@ -1,8 +1,10 @@
 """Plain packets for a ground station that holds no keys: protected frames end here, in both directions.
 
-Whoever connects on loopback gets every telemetry packet, live and played back, as a stream; a command packet
-that comes in, or one with a unit of a file's transfer, gets its time and CRC and goes up in a protected
-frame. Its sequence count stays: by it the packets `verification` name the command.
+A connection must begin with the gateway's token (`ground.link.command_stream`); a web page, which can open
+connections to loopback too, does not know it. After the token the connection gets every telemetry packet,
+live and played back, as a stream. A command packet that it sends, or a packet with a unit of a file's
+transfer, gets its time and CRC and goes up in a protected frame. Its sequence count stays: by it the packets
+`verification` name the command.
 """
 
 from __future__ import annotations
@@ -12,23 +14,22 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 
 from flight.app.utc_label import utc_ns
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
-from flight.link.files.packets import UP, is_unit
 from flight.link.process.lines import host_port
 from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
+from ground.link.command_stream import CommandStream, StreamError
 from ground.link.terminal import Terminal, report_of
-from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
 
 ADDRESS = "127.0.0.1:5013"
 
 _VERIFIED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
-_COMMANDS = {layout.identifier: layout for layout in TELECOMMANDS.values()}
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _UNSENT = 1 << 22
@@ -37,6 +38,21 @@ _SPI, _BLOCK = 1, 64
 _PIECE = 1 << 16
 _AGAIN_S = 20.0
 """Between the gateway's own pings: by UDP the link forgets a sender after a minute."""
+_TOKEN_S = 5.0
+"""Time (s) after which a connection without the token is closed."""
+_MOST_WITHOUT_TOKEN = 16
+"""Maximum number of connections without the token; one more closes the oldest of them."""
+_REPORT_S = 1.0
+"""Minimum time (s) between two reports about connections without the token."""
+
+
+@dataclass(slots=True)
+class _Connection:
+    """What has arrived on a connection, and what is to be sent; `opened` by the monotonic clock, s."""
+
+    stream: CommandStream
+    opened: float
+    unsent: bytearray = field(default_factory=bytearray)
 
 
 class Gateway:
@@ -45,22 +61,28 @@ class Gateway:
     Attributes:
         down: telemetry packets handed over.
         up: commands sent.
+        refused: connections that were closed because they did not send the token, or sent a byte that no
+            command packet has.
     """
 
-    def __init__(self, terminal: Terminal, address: str, complain: Callable[[str], object]) -> None:
+    def __init__(
+        self, terminal: Terminal, address: str, token: str, complain: Callable[[str], object]
+    ) -> None:
         """Listen on HOST:PORT of loopback; `complain` gets each refusal in words. Raises UsageError."""
         self._terminal = terminal
+        self._token = token
+        self._reported = -_REPORT_S
         self._sealer = terminal.sealer(_SPI, _BLOCK)
         self._complain = complain
         self._packer = CommandPacker()
         self._asked_at: float | None = None
         self._own: set[int] = set()
-        self._connections: dict[socket.socket, tuple[bytearray, bytearray]] = {}  # came, unsent
-        self.down = self.up = 0
+        self._connections: dict[socket.socket, _Connection] = {}
+        self.down = self.up = self.refused = 0
         try:
             host, port = host_port(address)
             if not IPv4Address(host).is_loopback:
-                raise UsageError(f"{address}: whoever connects commands the satellite: loopback only")
+                raise UsageError(f"{address}: plain packets are served on loopback only: give 127.0.0.1:PORT")
             self._listener = socket.create_server((host, port))
         except (OSError, OverflowError, ValueError) as error:
             raise UsageError(f"{address}: cannot be listened to: {error}") from error
@@ -70,11 +92,6 @@ class Gateway:
     def port(self) -> int:
         """The port that is bound."""
         return int(self._listener.getsockname()[1])
-
-    @property
-    def connected(self) -> int:
-        """How many ground stations there are."""
-        return len(self._connections)
 
     def run(self, ended: Callable[[], bool]) -> None:
         """Carry until `ended` returns true. Raises FlightError where the line to the satellite is gone."""
@@ -86,7 +103,7 @@ class Gateway:
         if self._asked_at is None or time.monotonic() - self._asked_at > _AGAIN_S:
             self._asked_at = time.monotonic()
             self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
-        waiting = [line for line, (_, unsent) in self._connections.items() if unsent]
+        waiting = [line for line, connection in self._connections.items() if connection.unsent]
         reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
         ready, writable, _ = select.select(reading, waiting, [], seconds)
         if self._terminal in ready:
@@ -98,6 +115,9 @@ class Gateway:
             self._receive(line)
         for line in [line for line in writable if line in self._connections]:
             self._flush(line)
+        for line, connection in self._without_token():
+            if time.monotonic() - connection.opened > _TOKEN_S:
+                self._refuse(line, f"it did not send the token within {_TOKEN_S:g} s")
 
     def close(self) -> None:
         """Close the listener and its connections; the terminal stays open."""
@@ -109,12 +129,13 @@ class Gateway:
         if packet[:2] == _VERIFIED and report_of(packet).counter in self._own:
             return  # of our own ping, which no ground station has sent
         self.down += 1
-        for line, (_, unsent) in list(self._connections.items()):
-            unsent.extend(packet)
-            self._flush(line)
+        for line, connection in list(self._connections.items()):
+            if connection.stream.authenticated:
+                connection.unsent.extend(packet)
+                self._flush(line)
 
     def _flush(self, line: socket.socket) -> None:
-        unsent = self._connections[line][1]
+        unsent = self._connections[line].unsent
         try:
             del unsent[: line.send(unsent) if unsent else 0]
         except BlockingIOError:
@@ -135,23 +156,12 @@ class Gateway:
         if not data:
             self._drop(line)
             return
-        came = self._connections[line][0]
-        came += data
-        while len(came) >= HEADER_BYTES:
-            length = HEADER_BYTES + 1 + int.from_bytes(came[4:HEADER_BYTES], "big")
-            if len(came) < length:
-                return
-            packet = bytes(came[:length])
-            del came[:length]
-            self._send(packet)
-
-    def _send(self, packet: bytes) -> None:
-        layout = _COMMANDS.get(int.from_bytes(packet[:2], "big"))
-        if not is_unit(packet, UP) and (layout is None or len(packet) != layout.length):
-            self._complain(f"{len(packet)} bytes that begin with {packet[:2].hex()} are no command: not sent")
-            return
-        self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
-        self.up += 1
+        try:
+            for packet in self._connections[line].stream.packets(data):
+                self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
+                self.up += 1
+        except StreamError as error:
+            self._refuse(line, str(error))
 
     def _accept(self) -> None:
         try:
@@ -159,7 +169,23 @@ class Gateway:
         except OSError:
             return
         line.setblocking(False)
-        self._connections[line] = (bytearray(), bytearray())
+        strangers = self._without_token()
+        if len(strangers) >= _MOST_WITHOUT_TOKEN:
+            self._refuse(strangers[0][0], f"{len(strangers)} others have not sent the token either")
+        self._connections[line] = _Connection(CommandStream(self._token), time.monotonic())
+
+    def _without_token(self) -> list[tuple[socket.socket, _Connection]]:
+        """Return the connections that have not sent the token, the oldest first."""
+        return [(line, one) for line, one in self._connections.items() if not one.stream.authenticated]
+
+    def _refuse(self, line: socket.socket, reason: str) -> None:
+        """Close a connection, count it and report why; a flood of strangers is reported once a second."""
+        self.refused += 1
+        now = time.monotonic()
+        if self._connections[line].stream.authenticated or now - self._reported > _REPORT_S:
+            self._reported = now
+            self._complain(f"connection closed: {reason} (closed so far: {self.refused})")
+        self._drop(line)
 
     def _drop(self, line: socket.socket) -> None:
         self._connections.pop(line, None)

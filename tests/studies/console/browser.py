@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -78,22 +80,53 @@ def missing() -> str:
 
 @contextlib.contextmanager
 def opened(url: str, width: int = 1600, height: int = 1150) -> Iterator[Page]:
-    """Open a page and yield it once it shows a time."""
+    """Open a page of the console and yield it once it shows a time."""
+    with browsing() as browser:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        found = Page(page)
+        page.on("console", found.heard)
+        page.on("pageerror", found.failed)
+        page.on("request", found.asked)
+        page.goto(url)
+        found.wait("document.body.dataset.time !== undefined")
+        yield found
+
+
+@contextlib.contextmanager
+def browsing() -> Iterator[Any]:
+    """Yield a running browser, as playwright calls it."""
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=_chromium(), args=["--no-sandbox"])
         try:
-            page = browser.new_page(viewport={"width": width, "height": height})
-            found = Page(page)
-            page.on("console", found.heard)
-            page.on("pageerror", found.failed)
-            page.on("request", found.asked)
-            page.goto(url)
-            found.wait("document.body.dataset.time !== undefined")
-            yield found
+            yield browser
         finally:
             browser.close()
+
+
+@contextlib.contextmanager
+def another_origin(text: str = "<!doctype html><title>another page</title>") -> Iterator[str]:
+    """Serve a page of another origin on loopback, as a page of the web would be, and yield its address."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(text.encode())
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with HTTPServer((HOST, 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://{HOST}:{server.server_port}/"
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 def _chromium() -> str | None:

@@ -1,0 +1,119 @@
+"""What a connection to the gateway may send: the token, then command packets, byte by byte."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import ChangeMode, Ping
+from flight.link.files.packets import DOWN, UP, UnitPacker
+from flight.link.files.pdu import SEGMENT_BYTES
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import HEALTH
+from flight.link.telemetry.packets import HEADER_BYTES, Packer
+from ground.link.command_stream import CommandStream, StreamError, new_token
+from tests.flight.link.telemetry.samples import plain_contents
+
+TOKEN = "0123456789abcdef" * 4
+PING, SAFE = CommandPacker().pack(Ping(3), 1), CommandPacker().pack(ChangeMode(Mode.SAFE, "end of pass"), 1)
+UNIT = UnitPacker(UP).pack(b"u" * SEGMENT_BYTES, 1)
+LINE = TOKEN.encode() + b"\n"
+
+
+def opened() -> CommandStream:
+    stream = CommandStream(TOKEN)
+    assert list(stream.packets(LINE)) == []
+    assert stream.authenticated
+    return stream
+
+
+@given(st.lists(st.integers(0, 2000), max_size=6))
+def test_the_packets_behind_the_token_come_whole_however_the_bytes_arrive(cuts: list[int]) -> None:
+    data = LINE + PING + UNIT + SAFE + PING
+    stream, found = CommandStream(TOKEN), list[bytes]()
+    edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
+    for begin, end in itertools.pairwise(edges):
+        found += stream.packets(data[begin:end])
+    assert found == [PING, UNIT, SAFE, PING]
+
+
+@pytest.mark.parametrize("data", [b"G", b"POST / HTTP/1.1\r\n", b"\x18", b"\n", b"\x00", b"A", b"abcx", PING])
+def test_a_byte_that_no_token_has_is_refused_at_once(data: bytes) -> None:
+    with pytest.raises(StreamError, match="not the token"):
+        list(CommandStream(TOKEN).packets(data))
+
+
+def test_how_much_of_a_token_is_right_is_not_disclosed() -> None:
+    """A wrong character is refused only when the line is complete, wherever it stands."""
+    for right in range(len(TOKEN)):
+        wrong = TOKEN[:right] + ("1" if TOKEN[right] == "0" else "0") + TOKEN[right + 1 :]
+        stream = CommandStream(TOKEN)
+        assert list(stream.packets(wrong.encode())) == []
+        with pytest.raises(StreamError, match="not the token"):
+            list(stream.packets(b"\n"))
+        assert not stream.authenticated
+    with pytest.raises(StreamError, match="not the token"):
+        list(CommandStream(TOKEN).packets(TOKEN.encode() + b" " + PING))
+
+
+def test_tokens_are_long_and_differ() -> None:
+    assert len({new_token() for _ in range(100)}) == 100
+    assert len(new_token()) == len(TOKEN)
+
+
+def changed(packet: bytes, at: int, value: int) -> bytes:
+    return packet[:at] + bytes((value,)) + packet[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("packet", "wrong"),
+    [
+        (changed(PING, 0, PING[0] | 0x20), 0),  # version 1
+        (changed(PING, 0, PING[0] & ~0x10), 0),  # telemetry
+        (changed(PING, 0, PING[0] & ~0x08), 0),  # without a secondary header
+        (changed(PING, 1, 0xFF), 1),  # another application
+        (changed(PING, 2, 0x40), 2),  # a segment
+        (changed(PING, 4, 1), 4),  # longer than any ping
+        (changed(PING, 5, PING[5] + 1), 5),
+        (changed(PING, 5, PING[5] - 1), 5),
+        (changed(PING, 6, PING[6] + 1), 6),  # another version of the definition
+        (changed(UNIT, 4, 0xFF), 4),  # longer than any frame
+        (changed(UNIT, 4, 0)[:5] + b"\x00", 5),  # shorter than its headers
+        (UnitPacker(DOWN).pack(b"unit", 1), 0),
+        (Packer().pack(HEALTH, 1, plain_contents(HEALTH)), 0),
+        (b"POST / HTTP/1.1\r\n", 0),
+    ],
+)
+def test_the_first_byte_that_no_command_has_ends_the_connection_at_that_byte(
+    packet: bytes, wrong: int
+) -> None:
+    for before in (b"", SAFE):
+        stream = opened()
+        for byte in before + packet[:wrong]:
+            list(stream.packets(bytes((byte,))))
+        with pytest.raises(StreamError, match=rf"0x{packet[wrong]:02x} as its byte {wrong + 1}$"):
+            list(stream.packets(packet[wrong : wrong + 1]))
+
+
+def test_commands_before_the_wrong_byte_are_returned_and_none_behind_it() -> None:
+    stream = opened()
+    packets = stream.packets(PING + SAFE + b"GET " + PING)
+    assert [next(packets), next(packets)] == [PING, SAFE]
+    with pytest.raises(StreamError):
+        next(packets)
+
+
+@given(st.binary(min_size=1, max_size=80))
+def test_no_bytes_but_commands_come_out(data: bytes) -> None:
+    stream = opened()
+    try:
+        found = list(stream.packets(data))
+    except StreamError:
+        return
+    assert b"".join(found) == data[: sum(map(len, found))]
+    begun = data[sum(map(len, found)) :][:HEADER_BYTES]
+    assert begun[:1] in (b"", bytes((PING[0],)), bytes((UNIT[0],)))

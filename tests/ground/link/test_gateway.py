@@ -1,0 +1,273 @@
+"""The gateway and those who connect to it: with the token, without it, and a web page in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import select
+import socket
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import ChangeMode, Ping
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import HEALTH
+from flight.link.telemetry.packets import Packer
+from ground.link import gateway as module
+from ground.link.command_stream import new_token
+from ground.link.gateway import Gateway
+from ground.link.keys import make_keys
+from ground.link.terminal import Terminal
+from ground.link.token_file import token_file, token_path
+from knightcube.errors import FlightError
+from tests.flight.link.telemetry.samples import plain_contents
+from tests.studies.console import browser
+
+ROOT = Path(__file__).resolve().parents[3]
+SAFE = CommandPacker().pack(ChangeMode(Mode.SAFE, "end of pass"), 1)
+TELEMETRY = Packer().pack(HEALTH, 1, plain_contents(HEALTH))
+PATIENCE_S = 60.0
+
+
+class Satellite:
+    """In place of a terminal: keeps what goes up, and gives what is to come down."""
+
+    def __init__(self) -> None:
+        self.up: list[bytes] = []
+        self._ours, self._theirs = socket.socketpair()
+
+    def fileno(self) -> int:
+        return self._ours.fileno()
+
+    def sealer(self, spi: int, block: int) -> None:
+        pass
+
+    def send_by(self, sealer: object, packet: bytes) -> int:
+        self.up.append(packet)
+        return len(self.up)
+
+    def say(self, packet: bytes) -> None:
+        self._theirs.send(packet)
+
+    def take(self) -> list[tuple[int, bytes]]:
+        return [(0, self._ours.recv(4096))]
+
+    def close(self) -> None:
+        self._ours.close()
+        self._theirs.close()
+
+    @property
+    def commands(self) -> list[bytes]:
+        """What went up beside the gateway's own pings."""
+        ping = CommandPacker().pack(Ping(), 1)[:2]
+        return [packet for packet in self.up if packet[:2] != ping]
+
+
+@dataclass
+class Station:
+    """A gateway with its token, satellite and complaints."""
+
+    gateway: Gateway
+    token: str
+    satellite: Satellite
+    complaints: list[str]
+    stack: contextlib.ExitStack
+
+    def connect(self, data: bytes = b"") -> socket.socket:
+        address = ("127.0.0.1", self.gateway.port)
+        line = self.stack.enter_context(socket.create_connection(address, PATIENCE_S))
+        line.sendall(data)
+        self.turn()
+        return line
+
+    @property
+    def line(self) -> bytes:
+        return f"{self.token}\n".encode()
+
+    def turn(self) -> None:
+        for _ in range(5):
+            self.gateway.turn(0.01)
+
+
+@pytest.fixture
+def station() -> Iterator[Station]:
+    token, complaints = new_token(), list[str]()
+    with contextlib.ExitStack() as stack:
+        satellite = Satellite()
+        stack.callback(satellite.close)
+        gateway = Gateway(cast(Terminal, satellite), "127.0.0.1:0", token, complaints.append)
+        stack.callback(gateway.close)
+        yield Station(gateway, token, satellite, complaints, stack)
+
+
+def closed(line: socket.socket) -> bool:
+    """Return whether the other end has closed a connection, on which nothing came."""
+    try:
+        return line.recv(1) == b""
+    except ConnectionResetError:
+        return True
+
+
+def open_still(line: socket.socket) -> bool:
+    """Return whether nothing has come on a connection, not even its end."""
+    return not select.select([line], [], [], 0.0)[0]
+
+
+def test_a_connection_without_the_token_neither_commands_nor_receives_telemetry(station: Station) -> None:
+    silent, wrong = station.connect(), station.connect(new_token().encode() + b"\n" + SAFE)
+    plain, web = station.connect(SAFE), station.connect(b"POST / HTTP/1.1\r\n\r\n" + SAFE)
+    known = station.connect(station.line)
+    station.satellite.say(TELEMETRY)
+    station.turn()
+    assert known.recv(4096) == TELEMETRY
+    assert open_still(silent)
+    assert closed(wrong)
+    assert closed(plain)
+    assert closed(web)
+    assert station.satellite.commands == []
+    assert station.gateway.refused == 3
+    assert len(station.complaints) == 1, "strangers are reported once a second"
+    known.sendall(SAFE[:9])
+    station.turn()
+    known.sendall(SAFE[9:])
+    station.turn()
+    assert [packet[15:-2] for packet in station.satellite.commands] == [SAFE[15:-2]]
+
+
+def test_a_byte_that_no_command_has_closes_a_known_connection_and_is_reported(station: Station) -> None:
+    known = station.connect(station.line + SAFE + b"\x08\x00" + SAFE)
+    station.turn()
+    assert closed(known)
+    assert len(station.satellite.commands) == 1
+    assert station.gateway.refused == 1
+    assert station.complaints == [
+        "connection closed: no command packet has 0x08 as its byte 1 (closed so far: 1)"
+    ]
+
+
+def test_a_connection_that_does_not_send_the_token_in_time_is_closed(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known, slow = station.connect(station.line), station.connect(station.line[:-1])
+    monkeypatch.setattr(module, "_TOKEN_S", 0.0)
+    station.turn()
+    assert closed(slow)
+    assert open_still(known)
+    assert "did not send the token within" in station.complaints[0]
+
+
+def test_strangers_do_not_keep_a_ground_station_out(station: Station) -> None:
+    strangers = [station.connect() for _ in range(module._MOST_WITHOUT_TOKEN + 1)]
+    assert closed(strangers[0])
+    assert all(open_still(line) for line in strangers[1:])
+    known = station.connect(station.line + SAFE)
+    assert closed(strangers[1])
+    assert len(station.satellite.commands) == 1
+    assert open_still(known)
+
+
+def test_the_file_with_the_token_is_its_users_alone_and_goes_with_the_gateway(tmp_path: Path) -> None:
+    path = token_path(tmp_path, 5013)
+    path.write_text("of a gateway that was killed\n")
+    path.chmod(0o644)
+    with token_file(path, "abc"):
+        assert path.read_text() == "abc\n"
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert list(tmp_path.iterdir()) == []
+    with (
+        pytest.raises(FlightError, match="the token cannot be written"),
+        token_file(tmp_path / "no" / "x", "a"),
+    ):
+        pytest.fail("no such folder")
+
+
+@dataclass
+class Opened:
+    """The command `flight gateway` in a process of its own, and the frames that it sends up."""
+
+    process: subprocess.Popen[str]
+    port: int
+    keys: Path
+    frames: socket.socket
+    ping_bytes: int
+    errors: Path
+
+    def command(self) -> int | None:
+        """Return the length of the next frame that is not the gateway's own ping, None within 3 s."""
+        until = time.monotonic() + 3.0
+        while (left := until - time.monotonic()) > 0.0:
+            self.frames.settimeout(left)
+            with contextlib.suppress(TimeoutError):
+                if (size := len(self.frames.recv(4096))) != self.ping_bytes:
+                    return size
+        return None
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Iterator[Opened]:
+    _, ground = make_keys(tmp_path / "keys")
+    errors = tmp_path / "errors"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as frames, errors.open("w") as out:
+        frames.bind(("127.0.0.1", 0))
+        frames.settimeout(PATIENCE_S)
+        link = f"127.0.0.1:{frames.getsockname()[1]}"
+        words = [sys.executable, "-m", "flight", "gateway", "--link", link, "--keys", str(ground)]
+        words += ["--serve", "127.0.0.1:0"]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=out, text=True, cwd=ROOT) as process:
+            try:
+                assert process.stdout is not None
+                found = re.search(r"127\.0\.0\.1:(\d+)", process.stdout.readline())
+                assert found is not None
+                yield Opened(process, int(found[1]), ground, frames, len(frames.recv(4096)), errors)
+            finally:
+                process.terminate()
+                process.wait(PATIENCE_S)
+
+
+def test_the_command_obeys_whoever_has_read_its_file_and_nobody_else(opened: Opened) -> None:
+    with socket.create_connection(("127.0.0.1", opened.port), PATIENCE_S) as stranger:
+        head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 9000\r\n\r\n"
+        skipped = 7 + int.from_bytes(head[4:6], "big")  # the length of the text, if it were a packet
+        with contextlib.suppress(ConnectionError):
+            stranger.sendall(head.ljust(skipped, b"\0") + SAFE)
+        assert opened.command() is None
+        assert closed(stranger)
+    path = token_path(opened.keys, opened.port)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    with socket.create_connection(("127.0.0.1", opened.port), PATIENCE_S) as known:
+        known.sendall(path.read_bytes() + SAFE)
+        assert opened.command() is not None
+    opened.process.terminate()
+    assert opened.process.wait(PATIENCE_S) == 0
+    reason = "connection closed: its first bytes are not the token (closed so far: 1)"
+    assert opened.errors.read_text() == f"flight: gateway: {reason}\n"
+    assert not path.exists()
+
+
+_ATTACK = """async ([port, packet]) => {
+  for (let shift = 0; shift < 7; shift++) {
+    const body = new Uint8Array([...Array(20000 + shift).fill(0), ...packet]);
+    const sent = fetch(`http://127.0.0.1:${port}/`, { method: "POST", mode: "no-cors", body });
+    await Promise.race([sent.catch(() => null), new Promise((done) => setTimeout(done, 1000))]);
+  }
+}"""
+"""A page's request that was obeyed once: zeros were skipped as packets of 7 bytes, up to the command."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(browser.missing()), reason=browser.missing() or "-")
+def test_a_web_page_in_a_browser_does_not_command_the_satellite(opened: Opened) -> None:
+    with browser.another_origin() as url, browser.browsing() as chromium:
+        page = chromium.new_page()
+        page.goto(url)
+        page.evaluate(_ATTACK, [opened.port, list(SAFE)])
+    assert opened.command() is None
