@@ -1,9 +1,10 @@
 """A configuration of Yamcs 5.12 for this satellite: `python -m ground.yamcs FOLDER [--epoch UTC]`.
 
 Yamcs connects to `flight gateway`, which holds the keys and hands plain packets over (`ground.link.gateway`).
-Both listen on loopback alone. Packets are archived by mission time and sequence count; commands are verified
-by the packet `verification`, whose packet identifier and sequence count are those of the command. Files come
-and go by Yamcs's own CFDP service.
+Both listen on loopback alone. No data link of Yamcs can send the gateway's token when it connects, so the
+folder holds the source of one that can, `GatewayLink.java`, to be compiled once. Packets are archived by
+mission time and sequence count; commands are verified by the packet `verification`, whose packet identifier
+and sequence count are those of the command. Files come and go by Yamcs's own CFDP service.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from pathlib import Path
 from flight.link.files.entity import FOREIGN, SATELLITE
 from flight.link.files.packets import DOWN, UP, VERSION
 from flight.link.files.pdu import SEGMENT_BYTES
+from flight.link.process.lines import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS
+from ground.link.token_file import token_path
 from ground.xtce import EPOCH, SPACE, document
 from knightcube.errors import UsageError
 
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
+KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
 """Yamcs's service for files, and its buckets, which are folders: of those that came and of those that go."""
 _LOOPBACK = "127.0.0.1"
@@ -66,7 +70,8 @@ services:
       remoteEntities: [{{name: satellite, id: {satellite}}}]
 dataLinks:
   - name: gateway
-    class: org.yamcs.tctm.TcpTcTmDataLink
+    class: GatewayLink
+    tokenFile: {token}
     tmStream: tm_realtime
     tcStream: tc_realtime
     host: {gateway_host}
@@ -97,6 +102,43 @@ streamConfig:
   sqlFile: {folder}/etc/files.sql
 """
 
+LINK_SOURCE = "GatewayLink.java"
+_LINK = """\
+import java.io.IOException;
+import java.nio.file.Files;
+import java.nio.file.Path;
+import org.yamcs.Spec;
+import org.yamcs.YConfiguration;
+import org.yamcs.tctm.TcpTcTmDataLink;
+
+/** Sends the token of `flight gateway` at the beginning of each connection. */
+public class GatewayLink extends TcpTcTmDataLink {
+    private Path tokenFile;
+
+    @Override
+    public Spec getSpec() {
+        Spec spec = super.getSpec();
+        spec.addOption("tokenFile", Spec.OptionType.STRING).withRequired(true);
+        return spec;
+    }
+
+    @Override
+    public void init(String instance, String name, YConfiguration config) {
+        tokenFile = Path.of(config.getString("tokenFile"));
+        super.init(instance, name, config);
+    }
+
+    @Override
+    protected synchronized void checkAndOpenSocket() throws IOException {
+        if (!isSocketOpen()) {
+            byte[] token = Files.readAllBytes(tokenFile); // of this start of the gateway
+            super.checkAndOpenSocket();
+            sendBuffer(token);
+        }
+    }
+}
+"""
+
 _STREAMS = """\
 create stream cfdp_in as select substring(packet, {before}) as pdu from tm_realtime \
 where extract_short(packet, 0) = {down}
@@ -125,9 +167,9 @@ ArchiveRetrieval: *replay
 """
 
 
-def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str, str]:
-    """Return the content of each file by its name below `folder`."""
-    host, _, port = gateway.rpartition(":")
+def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = KEYS) -> Mapping[str, str]:
+    """Return the content of each file by its name below `folder`; `keys` are those of the gateway."""
+    host, port = host_port(gateway)
     buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
         host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data", folder=folder, **buckets
@@ -135,6 +177,7 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str
     instance = _INSTANCE.format(
         gateway_host=host,
         gateway_port=port,
+        token=token_path(keys.absolute(), port),
         folder=folder,
         instance=INSTANCE,
         epoch=epoch,
@@ -151,15 +194,26 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str
         "etc/files.sql": _STREAMS.format(before=before, down=DOWN, space=SPACE, header=header),
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
+        LINK_SOURCE: _LINK,
         f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
     }
 
 
-def write(folder: Path, gateway: str = ADDRESS, http_port: int = HTTP_PORT, epoch: str = EPOCH) -> None:
+def write(
+    folder: Path,
+    gateway: str = ADDRESS,
+    http_port: int = HTTP_PORT,
+    epoch: str = EPOCH,
+    keys: Path = KEYS,
+) -> None:
     """Write the configuration into a folder. Raises UsageError."""
     folder = folder.absolute()
     try:
-        for name, text in files(folder, gateway, http_port, epoch).items():
+        contents = files(folder, gateway, http_port, epoch, keys)
+    except ValueError as error:
+        raise UsageError(f"{gateway}: give HOST:PORT of the gateway") from error
+    try:
+        for name, text in contents.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
@@ -174,10 +228,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m ground.yamcs", description=__doc__)
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the configuration and the archive")
     parser.add_argument("--gateway", default=ADDRESS, metavar="HOST:PORT", help=f"default {ADDRESS}")
+    parser.add_argument(
+        "--keys",
+        type=Path,
+        default=KEYS,
+        metavar="FOLDER",
+        help=f"the gateway's, for its token (default {KEYS})",
+    )
     parser.add_argument("--http", type=int, default=HTTP_PORT, metavar="PORT", help=f"default {HTTP_PORT}")
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
     options = parser.parse_args()
-    write(options.folder, options.gateway, options.http, options.epoch)
+    write(options.folder, options.gateway, options.http, options.epoch, options.keys)
 
 
 if __name__ == "__main__":

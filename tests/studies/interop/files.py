@@ -44,7 +44,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
     http = free_port()
     with _opened(place, loss, seed) as gateway:
         folder = place / "yamcs"
-        write(folder, gateway, http)
+        write(folder, gateway, http, keys=place / "keys" / "ground")
         with serving(folder, http) as server:
             _until(server.link_up, 60.0)
             down = _down(server, place, hashlib.sha256(data).digest())

@@ -21,10 +21,11 @@ _RATE = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class LinkedFlight:
-    """Where a flight writes, the gateway's address, and the processes by name; `flight` comes last."""
+    """Where a flight writes, address and keys of the gateway, the processes by name; `flight` is last."""
 
     run: Path
     gateway: str
+    keys: Path
     processes: dict[str, subprocess.Popen[bytes]]
     _start: list[str]
     _log: Path
@@ -63,12 +64,12 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
     flight = [sys.executable, "-m", "flight"]
     begin = [*flight, "run", str(config), "--realtime", "--out", str(run), *words]
     processes: dict[str, subprocess.Popen[bytes]] = {}
-    found = LinkedFlight(run, gateway, processes, begin, log)
+    found = LinkedFlight(run, gateway, place / "keys" / "ground", processes, begin, log)
     with ExitStack() as stack:
         stack.callback(found.stop)
         processes["link"] = _started([*flight, "link", str(config), "--log", str(run)], log)
         _wait(lambda: "link open" in log.read_text(), "the link", log)
-        way = ["--link", f"tcp:{link}", "--keys", str(place / "keys" / "ground"), "--serve", gateway]
+        way = ["--link", f"tcp:{link}", "--keys", str(found.keys), "--serve", gateway]
         processes["gateway"] = _started([*flight, "gateway", *way], log)
         _wait(lambda: "packets on" in log.read_text(), "the gateway", log)
         yield found

@@ -107,7 +107,7 @@ def fly(place: Path, plan: Plan) -> bool:
     http = free_port()
     with linked_flight(place / plan.config, text, *plan.faults) as flight:
         folder = place / plan.config / "yamcs"
-        write(folder, flight.gateway, http, _EPOCH)
+        write(folder, flight.gateway, http, _EPOCH, flight.keys)
         with serving(folder, http) as server:
             _until(server.link_up, _DEADLINE_S)
             flight.start()

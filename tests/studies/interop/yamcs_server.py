@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import quote
 
 from ground.xtce import SPACE
-from ground.yamcs import INSTANCE
+from ground.yamcs import INSTANCE, LINK_SOURCE
 
 _BUNDLE = "fprime_yamcs_bundle"
 _START_S = 120.0
@@ -35,15 +35,28 @@ def missing() -> str:
     return ""
 
 
-def words(folder: Path) -> list[str]:
-    """Return the command that starts Yamcs on the configuration in a folder."""
+def _jars() -> Path:
+    """Return what stands for all archives of the bundle on a class path."""
     found = importlib.util.find_spec(_BUNDLE)
     assert found is not None
     assert found.submodule_search_locations
-    jars = Path(found.submodule_search_locations[0]) / "lib" / "*"
+    return Path(found.submodule_search_locations[0]) / "lib" / "*"
+
+
+def compile_link(folder: Path) -> None:
+    """Compile the data link of a configuration. Raises RuntimeError with the compiler's words."""
+    compiler = ["java", "-cp", str(_jars()), "-m", "jdk.compiler/com.sun.tools.javac.Main", "-proc:none"]
+    command = [*compiler, "-d", str(folder), str(folder / LINK_SOURCE)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"the data link cannot be compiled:\n{done.stdout}{done.stderr}")
+
+
+def words(folder: Path) -> list[str]:
+    """Return the command that starts Yamcs on the configuration in a folder."""
     places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
     flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
-    return ["java", *flags, "-cp", str(jars), "org.yamcs.YamcsServer", *places, "--no-color"]
+    return ["java", *flags, "-cp", f"{_jars()}:{folder}", "org.yamcs.YamcsServer", *places, "--no-color"]
 
 
 def troubles(log: str) -> list[str]:
@@ -55,6 +68,7 @@ def troubles(log: str) -> list[str]:
 def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
     """Start Yamcs on a configuration, yield it when it answers, and end it. Its log is `folder/log`."""
     log = folder / "log"
+    compile_link(folder)
     with log.open("w") as out:
         process = subprocess.Popen(words(folder), stdout=out, stderr=subprocess.STDOUT)
     try:
