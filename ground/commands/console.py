@@ -27,8 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
         "orbit on a map, and forms for commands. A flight that goes on is shown live, from its log or by its "
-        "link; a run that is over is replayed on the same page. The page is served on loopback only. Needs "
-        "the extra `ground`. Ctrl-C ends."
+        "link; a run that is over is replayed on the same page. The page is served on loopback only, and "
+        "only to the browser that opens the printed address: its token is good for one browser. Needs the "
+        "extra `ground`. Ctrl-C ends."
     )
     parser.epilog = (
         "examples: python -m flight console runs/demo; "
@@ -63,6 +64,7 @@ def console(options: argparse.Namespace) -> int:
     try:
         from aiohttp import web  # noqa: PLC0415 - an extra
 
+        from ground.console.access import Access  # noqa: PLC0415
         from ground.console.server import application  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise FlightError(
@@ -74,13 +76,19 @@ def console(options: argparse.Namespace) -> int:
     with address, ExitStack() as stack:
         shown = _shown(options, stack)
         shown.look()
-        url = f"http://127.0.0.1:{address.getsockname()[1]}/"
-        sys.stdout.write(f"console of {shown.name}: {url} (Ctrl-C ends)\n")
-        sys.stdout.flush()
+        page = f"http://127.0.0.1:{address.getsockname()[1]}/"
+        access = Access(lambda token: _say(f"for one more browser: {page}?token={token}"))
+        url = f"{page}?token={access.token}"
+        _say(f"console of {shown.name}, for one browser: {url} (Ctrl-C ends)")
         if options.open:
             webbrowser.open(url)
-        web.run_app(application(shown), sock=address, print=None, access_log=None)
+        web.run_app(application(shown, access), sock=address, print=None, access_log=None)
     return 0
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
 
 
 def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:

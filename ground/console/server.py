@@ -16,6 +16,7 @@ from aiohttp import WSMsgType, web
 
 from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
+from ground.console.access import Access, foreign
 from ground.console.commanding import Commanding
 from ground.console.cursor import Cursor
 from ground.console.history import History
@@ -27,6 +28,7 @@ from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
+NO_ACCESS = "open the newest address that `flight console` printed: the page needs the token in it"
 _LOOK_S = 0.1
 _MOST_POINTS = 4000
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
@@ -35,8 +37,9 @@ _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _HEADERS = {
-    # Nothing is fetched from anywhere else, whatever a log or a reply holds.
-    "Content-Security-Policy": "default-src 'self'; connect-src 'self'; img-src 'self' data:",
+    # Nothing is fetched from anywhere else, whatever a log or a reply holds; no other page frames this one.
+    "Content-Security-Policy": "default-src 'self'; connect-src 'self'; img-src 'self' data:; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",
@@ -92,9 +95,31 @@ class Console:
             self.utc_ns = int(packets["run"]["utc_ns"][-1])
 
 
-def application(console: Console) -> web.Application:
+def application(console: Console, access: Access) -> web.Application:
     """Return the application; `console` must have looked once."""
-    app = web.Application(middlewares=[_only_own_page, _errors_in_words])
+
+    @web.middleware
+    async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:
+        """Refuse a request of another page, and one without a session."""
+        socket = request.headers.get("Upgrade", "").lower() == "websocket"
+        if reason := foreign(request.headers, socket or request.method not in ("GET", "HEAD")):
+            raise web.HTTPForbidden(text=reason)
+        name = _cookie_name(request)
+        if access.admits(request.cookies.get(name, "")):
+            return await handler(request)
+        token = request.query.get("token", "") if (request.method, request.path) == ("GET", "/") else ""
+        session = access.exchange(token)
+        if session is None:
+            if request.path.startswith("/api/"):
+                return web.json_response({"error": NO_ACCESS}, status=401)
+            raise web.HTTPUnauthorized(text=NO_ACCESS)
+        # No redirect: behind a link on another site, a browser would not send the cookie with it.
+        response = await handler(request)
+        response.set_cookie(name, session, httponly=True, samesite="Strict")
+        return response
+
+    app = web.Application(middlewares=[only_own_page, _errors_in_words])
+    app.on_response_prepare.append(_add_headers)
     pages = _Pages(console)
     app.add_routes(
         [
@@ -133,19 +158,13 @@ async def _goodbye(console: Console) -> None:
         await line.close(message=b"the console was ended")
 
 
-@web.middleware
-async def _only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:
-    """Refuse what another page of the same browser asks: a name that points here, or another origin."""
-    host = request.url.host or ""
-    if host not in ("127.0.0.1", "localhost", "::1"):
-        raise web.HTTPForbidden(text="this console answers on loopback only")
-    origin = request.headers.get("Origin")
-    if origin is not None and origin != f"{request.scheme}://{request.host}":
-        raise web.HTTPForbidden(text="this console answers its own page only")
-    response = await handler(request)
-    if not response.prepared:
-        response.headers.update(_HEADERS)
-    return response
+async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(_HEADERS)
+
+
+def _cookie_name(request: web.Request) -> str:
+    """Return the cookie's name: browsers share cookies between the ports of a host."""
+    return "knightcube-console-" + (request.headers["Host"].partition(":")[2] or "80")
 
 
 @web.middleware

@@ -16,6 +16,7 @@ const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, flight_
 let heard = 0;
 let line = null;
 let seeking = false;
+let unknown = false; // the console no longer knows this page
 
 byId("name").textContent = table.name;
 document.title = `${table.name} - KnightCube console`;
@@ -39,7 +40,14 @@ function connect() {
   line = new WebSocket(`ws://${location.host}/api/live`);
   line.onopen = () => { if (state.live) moment(); else move(state.time, state.speed); };
   line.onmessage = (message) => take(JSON.parse(message.data));
-  line.onclose = () => setTimeout(connect, 1000);
+  line.onclose = async () => {
+    // A console that was started again has other tokens: a WebSocket only shows that it was refused, a request says why.
+    const answer = await fetch("/api/table").catch(() => null);
+    if (answer?.status !== 401) { setTimeout(connect, 1000); return; }
+    unknown = true;
+    byId("trouble").hidden = false;
+    byId("trouble").textContent = "The console was started again and does not know this page: open the newest address that it printed.";
+  };
 }
 
 function take(said) {
@@ -66,7 +74,7 @@ function take(said) {
 function light() {
   const silent = (performance.now() - heard) / 1000;
   const ended = newest.event?.name === "stopped";
-  const [kind, words] = silent > DEAD_AFTER || line.readyState !== WebSocket.OPEN ? ["dead", "console lost"]
+  const [kind, words] = unknown ? ["dead", "address stale"] : silent > DEAD_AFTER || line.readyState !== WebSocket.OPEN ? ["dead", "console lost"]
     : !state.live ? ["past", state.speed > 0 ? `replay ${state.speed} x` : "replay, paused"]
     : ended ? ["over", "flight ended"]
     : state.silence > DEAD_AFTER ? ["dead", `no telemetry for ${state.silence.toFixed(0)} s`]
@@ -101,6 +109,7 @@ function moment() {
 }
 window.addEventListener("hashchange", moment);
 
+history.replaceState(null, "", `/${location.hash}`); // the token has been used: a copy of the address would open nothing
 connect();
 setInterval(light, 250);
 plots.begin();

@@ -6,7 +6,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -16,9 +18,23 @@ from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.states import FACTS
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.studies.console.browser import Page, missing, opened
+from tests.studies.console.browser import Page, another_origin, browsing, missing, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing() or "-")]
+
+_FRAME = """(url) => new Promise((done) => {
+  const frame = Object.assign(document.createElement("iframe"), { src: url, onload: done });
+  document.body.append(frame);
+})"""
+_ASK = """async (url) => {
+  const asked = await fetch(`${url}api/table`).then(() => "answered", () => "refused");
+  const line = new WebSocket(`${url.replace("http", "ws")}api/live`);
+  const live = new Promise((done) => {
+    line.onmessage = () => done("answered");
+    line.onclose = () => done("refused");
+  });
+  return [asked, await live];
+}"""
 
 FACTS_BIT = {name: 1 << bit for bit, name in FACTS}
 
@@ -28,18 +44,59 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
 
 
-@pytest.fixture(scope="module")
-def page(folder: Path) -> Iterator[Page]:
-    words = [sys.executable, "-m", "flight", "console", str(folder), "--port", "0"]
+@contextmanager
+def serving(folder: Path, port: int = 0) -> Iterator[str]:
+    """Run `flight console` on a run, and yield the address that it prints."""
+    words = [sys.executable, "-m", "flight", "console", str(folder), "--port", str(port)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as server:
         try:
             assert server.stdout is not None
             found = re.search(r"http://\S+", server.stdout.readline())
             assert found is not None
-            with opened(found[0]) as shown:
-                yield shown
+            yield found[0]
         finally:
             server.terminate()
+
+
+@pytest.fixture(scope="module")
+def page(folder: Path) -> Iterator[Page]:
+    with serving(folder) as url, opened(url) as shown:
+        yield shown
+
+
+def test_a_page_of_a_console_that_was_started_again_says_that_it_is_stale(folder: Path) -> None:
+    with ExitStack() as first, ExitStack() as second:
+        url = first.enter_context(serving(folder))
+        page = second.enter_context(opened(url))
+        port = urlsplit(url).port
+        assert port
+        assert page.page.url == f"http://127.0.0.1:{port}/", "the used token is not left in the address"
+        page.page.reload()
+        page.wait("document.body.dataset.time !== undefined")
+        first.close()
+        with serving(folder, port):
+            page.wait("document.getElementById('light').textContent === 'address stale'", 60.0)
+            assert "open the newest address that it printed" in page.text("#trouble")
+            page.page.reload()
+            assert "open the newest address" in page.text("body")
+
+
+def test_another_page_neither_frames_the_console_nor_asks_it_anything(folder: Path) -> None:
+    """Also in the browser that the console knows: both pages are of the same host, so cookies are sent."""
+    with serving(folder) as url, another_origin() as foreign, browsing() as chromium:
+        context = chromium.new_context()
+        own, other = context.new_page(), context.new_page()
+        complaints: list[str] = []
+        other.on("console", lambda said: complaints.append(said.text))
+        own.goto(url)
+        other.goto(foreign)
+        other.evaluate(_FRAME, own.url)
+        other.wait_for_timeout(500)
+        assert [frame.url for frame in other.frames[1:]] == ["chrome-error://chromewebdata/"]
+        assert any("frame-ancestors" in text for text in complaints)
+        statuses = other.evaluate(_ASK, own.url)
+        assert statuses == ["refused", "refused"]
+        assert own.evaluate("fetch('/api/table').then((answer) => answer.status)") == 200
 
 
 def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_over(

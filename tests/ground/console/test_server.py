@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from aiohttp import CookieJar, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
 from flight.link.commands import codec
@@ -19,6 +20,7 @@ from flight.link.commands.values import Command
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
+from ground.console.access import Access
 from ground.console.commanding import Commanding
 from ground.console.history import History
 from ground.console.server import Console, application
@@ -35,14 +37,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
 
 
-def asked(folder: Path, ask: Callable[[TestClient[Any, Any]], Awaitable[Any]], send: Any = None) -> Any:
-    """Serve a run, and return what a client gets."""
+def asked(
+    folder: Path,
+    ask: Callable[[TestClient[Any, Any]], Awaitable[Any]],
+    send: Any = None,
+    access: Access | None = None,
+) -> Any:
+    """Serve a run, and return what a client gets that has opened the address, or with `access` has not."""
 
     async def talk(history: History) -> Any:
         place = Surroundings.of(folder / "config.yaml")
         console = Console(folder.name, LogTail(folder), history, place, Commanding(send))
         console.look()
-        async with TestClient(TestServer(application(console), host="127.0.0.1")) as client:
+        door = access or Access(lambda token: None)
+        server = TestServer(application(console, door), host="127.0.0.1")
+        async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:  # also of numeric hosts
+            if access is None:
+                async with client.get("/", params={"token": door.token}) as answer:
+                    assert answer.status == 200
             return await ask(client)
 
     with History() as history:
@@ -79,11 +91,109 @@ def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) 
 
 
 @pytest.mark.parametrize(
-    "headers", [{"Host": "evil.example"}, {"Host": "10.0.0.1"}, {"Origin": "http://evil.example"}]
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "10.0.0.1"},
+        {"Host": "127.0.0.1.evil.example"},
+        {"Host": "127.0.0.1:8040x"},
+        {"Host": ""},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://127.0.0.1:1"},
+    ],
 )
 def test_another_page_of_the_same_browser_gets_nothing(folder: Path, headers: dict[str, str]) -> None:
-    for path in ("/", "/api/table", "/api/live"):
+    """Also with the cookie of a session: a name that was rebound to loopback, or another origin."""
+    for path in ("/", "/api/table", "/api/live", "/page/main.js"):
         assert get(folder, path, headers)[0] == 403
+
+
+def own(client: TestClient[Any, Any]) -> str:
+    """Return the origin of the console's own page."""
+    return str(client.make_url("/").origin())
+
+
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "http://localhost:1"])
+def test_a_command_and_a_websocket_must_state_the_pages_own_origin(folder: Path, origin: str | None) -> None:
+    headers = {} if origin is None else {"Origin": origin}
+
+    async def ask(client: TestClient[Any, Any]) -> None:
+        body = {"command": "safe", "values": {"reason": ""}}
+        async with client.post("/api/command", json=body, headers=headers) as answer:
+            assert answer.status == 403
+        with pytest.raises(WSServerHandshakeError, match="403"):
+            await client.ws_connect("/api/live", origin=origin)
+        async with client.ws_connect("/api/live", origin=own(client)) as line:
+            assert (await line.receive_json())["live"]
+
+    asked(folder, ask, send=lambda packet: pytest.fail("sent"))
+
+
+def test_the_address_opens_the_page_for_one_browser_and_then_another_one_is_announced(folder: Path) -> None:
+    announced: list[str] = []
+    access = Access(announced.append)
+    first = access.token
+
+    async def ask(client: TestClient[Any, Any]) -> None:
+        for path in ("/", "/?token=", "/?token=%C3%A9", f"/api/table?token={first}", "/page/main.js"):
+            async with client.get(path) as answer:
+                assert (answer.status, "open the newest address" in await answer.text()) == (401, True), path
+        with pytest.raises(WSServerHandshakeError, match="401"):
+            await client.ws_connect("/api/live", origin=own(client))
+        async with client.head(f"/?token={first}") as answer:
+            assert answer.status == 401, "a preview of the address does not use the token up"
+        async with client.get(f"/?token={first}") as answer:
+            assert answer.status == 200
+            cookie = answer.headers["Set-Cookie"]
+            assert all(word in cookie for word in ("HttpOnly", "SameSite=Strict", str(client.port)))
+            assert first not in cookie
+        for path in ("/", f"/?token={first}", "/api/table"):
+            async with client.get(path) as answer:
+                assert answer.status == 200, "the same browser may use the address again"
+        client.session.cookie_jar.clear()
+        async with client.get(f"/?token={first}") as answer:
+            assert answer.status == 401, "the token of the first browser"
+        async with client.get(f"/?token={announced[0]}") as answer:
+            assert answer.status == 200
+
+    asked(folder, ask, access=access)
+    assert len(announced) == 2
+    assert len({first, *announced}) == 3
+
+
+def test_every_answer_forbids_frames_bases_and_foreign_forms(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Commanding, "words", lambda *_: 1 / 0)
+
+    async def ask(client: TestClient[Any, Any]) -> list[tuple[int, str]]:
+        found = []
+        headers = {"Origin": own(client)}
+        for path in ("/", "/page/main.js", "/api/table", "/nowhere", "/api/series", "/page/nowhere.js"):
+            async with client.get(path) as answer:
+                found.append((answer.status, answer.headers["Content-Security-Policy"]))
+        for path in ("/", "/api/words", "/api/command"):
+            async with client.post(path, json={"command": "safe"}, headers=headers) as answer:
+                found.append((answer.status, answer.headers["Content-Security-Policy"]))
+        async with client.get("/", headers={"Origin": "null"}) as answer:
+            found.append((answer.status, answer.headers["Content-Security-Policy"]))
+        client.session.cookie_jar.clear()
+        for path in ("/", "/api/table"):
+            async with client.get(path) as answer:
+                found.append((answer.status, answer.headers["Content-Security-Policy"]))
+        return found
+
+    answers = asked(folder, ask)
+    assert {status for status, _ in answers} == {200, 400, 401, 403, 404, 405, 500}
+    for _, policy in answers:
+        rules = {rule.strip() for rule in policy.split(";")}
+        assert rules >= {
+            "frame-ancestors 'none'",
+            "base-uri 'none'",
+            "form-action 'self'",
+            "default-src 'self'",
+        }
 
 
 def test_the_table_has_every_field_and_every_command(folder: Path) -> None:
@@ -111,7 +221,7 @@ def test_a_wrong_question_is_answered_in_words(folder: Path, query: str, complai
 
 def test_the_reader_is_pushed_the_newest_and_then_a_moment_of_the_past(folder: Path) -> None:
     async def ask(client: TestClient[Any, Any]) -> tuple[Any, Any]:
-        async with client.ws_connect("/api/live") as line:
+        async with client.ws_connect("/api/live", origin=own(client)) as line:
             newest = await line.receive_json()
             await line.send_json({"at": 2.0, "speed": 0.0})
             while not (past := await line.receive_json())["again"]:
@@ -130,7 +240,7 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
     growing.write_bytes(data[: len(data) // 2])
 
     async def ask(client: TestClient[Any, Any]) -> tuple[float, float]:
-        async with client.ws_connect("/api/live") as line:
+        async with client.ws_connect("/api/live", origin=own(client)) as line:
             first = (await line.receive_json())["time"]
             growing.write_bytes(data)
             for _ in range(10):  # pushes, ten a second
@@ -195,7 +305,8 @@ def test_what_is_shown_live_is_whole(folder: Path) -> None:
 
 def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
     async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
-        async with client.post("/api/command", json={"command": name, "values": values}) as answer:
+        body, headers = {"command": name, "values": values}, {"Origin": own(client)}
+        async with client.post("/api/command", json=body, headers=headers) as answer:
             return answer.status, await answer.json()
 
     found: tuple[int, Any] = asked(folder, ask, send)
