@@ -18,6 +18,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.link.files.pdu import HIGHEST_NUMBER, Transaction
+from flight.link.regular_files import read_regular
 from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
@@ -27,6 +28,8 @@ _MOST_PARTS = 4
 _KEPT_ENDINGS = 64
 _FREE_BYTES = 64 << 20
 """Of the disk, which no file that comes may take."""
+_LONGEST_RECORD = 4 << 20
+"""Bytes; the record of a file of 64 MiB of which every other unit is missing has less than 1 MB."""
 
 _Entity = Annotated[int, Meta(ge=0, le=(1 << 16) - 1)]
 _Long = Annotated[int, Meta(ge=0, le=HIGHEST_NUMBER)]
@@ -219,6 +222,7 @@ def _sync_folder(folder: Path) -> None:
 def _read(path: Path, shape: type[T]) -> T | None:
     """Return a record, None for none or a damaged one."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=shape)
+        data = read_regular(path, _LONGEST_RECORD)
+        return None if data is None else msgspec.json.decode(data, type=shape)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None

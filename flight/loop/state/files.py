@@ -8,12 +8,11 @@ a test can simulate a power loss before any of them.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
-import stat
 from pathlib import Path
 from typing import Protocol
 
+from flight.link.regular_files import read_regular
 from flight.link.telemetry.segments import make_lasting
 
 LARGEST_FILE = 1 << 20
@@ -49,28 +48,8 @@ class LinuxFiles:
     """The calls of the operating system."""
 
     def read(self, path: Path) -> bytes | None:
-        """Return a file's content, None when there is no such file.
-
-        Its kind and size are checked first: a FIFO would never end, a sparse file would fill the memory.
-        """
-        try:
-            file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-        except FileNotFoundError:
-            return None
-        try:
-            found = os.fstat(file)
-            if stat.S_ISDIR(found.st_mode):
-                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-            if not stat.S_ISREG(found.st_mode):
-                raise OSError(errno.EINVAL, "is no regular file", str(path))
-            if found.st_size > LARGEST_FILE:
-                raise OSError(errno.EFBIG, f"{found.st_size} bytes are too many", str(path))
-            data = b""
-            while chunk := os.read(file, LARGEST_FILE + 1 - len(data)):
-                data += chunk
-            return data
-        finally:
-            os.close(file)
+        """Return the content of a regular file of at most `LARGEST_FILE`, None when there is no such file."""
+        return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
         """Open an empty file for writing, replacing an old one, also one that is no regular file."""
