@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from flight.link.commands.codec import command_of
+from flight.link.commands.codec import CommandPacker, command_of
 from flight.link.commands.definitions import LAYOUTS
 from flight.link.commands.errors import CommandError
 from flight.link.commands.values import Command
@@ -17,7 +17,10 @@ from flight.link.telemetry.form import Field
 
 
 def command_of_words(text: str) -> Command:
-    """Return the command of a line of words. Raises CommandError."""
+    """Return the command of a line of words.
+
+    Raises CommandError, also for a number that its field does not hold.
+    """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:
         raise CommandError(f"{name!r} is no command: {', '.join(LAYOUTS)}")
@@ -32,7 +35,9 @@ def command_of_words(text: str) -> Command:
         fields[field.name] = numbers if field.count > 1 else numbers[0]
     if words:
         raise CommandError(f"{text}: nothing is to stand behind {packet.fields[-1].name}")
-    return command_of(packet, fields)
+    command = command_of(packet, fields)
+    CommandPacker().pack(command, 0)
+    return command
 
 
 def _number(field: Field, word: str) -> float | int:

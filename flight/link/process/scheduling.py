@@ -15,7 +15,7 @@ from flight.link.commands.errors import CommandError
 from flight.link.commands.words import command_of_words
 from flight.link.modes import Mode
 from flight.link.process.directives import SCHEDULE, Deletion, Listing, Scheduled
-from flight.link.process.timetable import Entry, Timetable, TimetableError
+from flight.link.process.timetable import HIGHEST, Entry, Timetable, TimetableError
 from flight.link.process.verification import Report, Sent, Stage
 from flight.link.telemetry.definitions import HEALTH, MODE
 from flight.link.telemetry.packets import LAYOUTS
@@ -102,13 +102,16 @@ class Scheduling:
 
 
 def utc_of(text: str) -> int:
-    """Return the ns since 1970 of a UTC in ISO 8601. Raises CommandError."""
+    """Return the ns since 1970 of a UTC in ISO 8601, before the year 2262. Raises CommandError."""
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:
         raise CommandError(f"{text!r} is no UTC such as 2026-11-23T21:00:00") from error
     time = time.replace(tzinfo=UTC) if time.tzinfo is None else time
-    return round(time.timestamp()) * SECOND_NS
+    utc_ns = round(time.timestamp()) * SECOND_NS
+    if utc_ns > HIGHEST:
+        raise CommandError(f"{text} is beyond {_utc(HIGHEST)}")
+    return utc_ns
 
 
 def text_of(entry: Entry) -> str:

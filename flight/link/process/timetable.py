@@ -13,14 +13,18 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from flight.link.regular_files import read_regular
 from flight.link.security.associations import COPIES, overwrite
 from knightcube.errors import FlightError
 
 MOST_ENTRIES = 32
 LONGEST_COMMAND = 96
 """Bytes of a command in words, with the zero that ends it."""
+HIGHEST = 2**63 - 1
+"""Largest number that a copy may hold; as a UTC in ns it is in the year 2262."""
+_LONGEST_FILE = 1 << 16
 
-_Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
 
 
 class TimetableError(FlightError):
@@ -96,9 +100,10 @@ class Timetable:
 
     def _read(self, name: str) -> _Read:
         try:
-            return _Read(_decode(self._path(name).read_bytes()), present=True)
+            data = read_regular(self._path(name), _LONGEST_FILE)
         except OSError:
-            return _Read(None, present=False)
+            return _Read(None, present=True)
+        return _Read(None if data is None else _decode(data), present=data is not None)
 
     def _path(self, name: str) -> Path:
         return self._folder / f"schedule.{name}"

@@ -44,6 +44,36 @@ def texts(link: BothEnds, counter: int) -> list[str]:
     return [report.text for report in link.reports() if report.counter == counter]
 
 
+@pytest.mark.parametrize(
+    ("at", "words", "problem"),
+    [
+        ("2262-04-12T00:00:00", "ping 1", "2262-04-12T00:00:00 is beyond 2262-04-11T23:47:16Z"),
+        ("9999-12-31T23:59:59-14:00", "ping 1", "is beyond"),
+        ("2099-01-01T00:00:00", "ping 4294967296", "number = 4294967296 is no u4"),
+        ("2099-01-01T00:00:00", "ping -1", "number = -1 is no u4"),
+    ],
+)
+def test_a_number_that_a_file_or_a_packet_does_not_hold_is_refused_when_it_is_scheduled(
+    link: BothEnds, at: str, words: str, problem: str
+) -> None:
+    kept = send(link, Scheduled(in_seconds(link, 60), "ping 7"))
+    counter = send(link, Scheduled(at, words))
+    assert link.stages(counter) == ["accepted", "failed"]
+    assert problem in texts(link, counter)[-1]
+    link.restart()
+    link.turn(61.0)
+    assert link.stages(kept)[-1] == "completed", "the schedule outlives the restart"
+
+
+def test_an_entry_of_another_release_that_fits_no_packet_is_reported_and_not_executed(link: BothEnds) -> None:
+    at_ns = link.clock.utc_ns() + 10**9
+    Timetable(link.sky.folder).add(at_ns, 1, 77, "ping 99999999999")
+    link.restart()
+    link.turn(3.0)
+    assert link.stages(77) == ["failed"]
+    assert link.obeyed == []
+
+
 def test_a_scheduled_command_outlives_a_restart_and_is_executed_once_at_its_time(link: BothEnds) -> None:
     late = send(link, Scheduled(in_seconds(link, 60), "ping 7"))
     soon = send(link, Scheduled(in_seconds(link, 20), "ping 3"))
