@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from flight.link.telemetry.archive import find_runs
@@ -65,7 +67,7 @@ class LogFollower:
         """Return the folder of a run of the archive, of the newest for 0; None where there is none."""
         if number == 0:
             return self._run
-        return next((run for run in find_runs(self.place) if int(run.name.partition("-")[2]) == number), None)
+        return next((run for run in _runs(self.place) if int(run.name.partition("-")[2]) == number), None)
 
     def new(self) -> list[bytes]:
         """Return the packets that came since the last call, 64 kB of them at most."""
@@ -81,16 +83,16 @@ class LogFollower:
         """Turn to the next segment, or to a newer run, where there is one."""
         if self._path is not None:
             number = _number(self._path)
-            later = [path for path in find_segments(self._path.parent, _STEM) if _number(path) > number]
+            later = [path for path in _segments(self._path.parent) if _number(path) > number]
             if later:
                 self._path, self._offset = later[0], 0
                 return
         self._attach()
 
     def _attach(self, *, at_end: bool = False) -> None:
-        runs = find_runs(self.place)
+        runs = _runs(self.place)
         newest = runs[-1] if runs else self.place
-        segments = find_segments(newest, _STEM)
+        segments = _segments(newest)
         if newest == self._run or not segments:
             return
         self._run, self._path, self._offset = newest, segments[0], 0
@@ -99,8 +101,9 @@ class LogFollower:
         identifier = LAYOUTS[RUN.name].identifier.to_bytes(2, "big")
         self.label = next((packet for packet in head if packet[:2] == identifier), b"")
         if at_end:
-            self._path = segments[-1]
-            self._offset = max(0, self._path.stat().st_size - _LOOK_BACK)
+            with suppress(OSError):
+                self._offset = max(0, segments[-1].stat().st_size - _LOOK_BACK)
+                self._path = segments[-1]
 
 
 def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
@@ -119,7 +122,7 @@ def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
 
 def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
     """Return the segments from the one on in which a time may stand."""
-    segments = find_segments(folder, _STEM)
+    segments = _segments(folder)
     while len(segments) > 1:
         first = _PacketStream().add(_read(segments[1], 0)[: 2 * LONGEST_PACKET])
         if first and time_of(first[0]) + _UNORDERED_NS > begin_ns:
@@ -128,16 +131,37 @@ def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
     return segments
 
 
+def _runs(archive: Path) -> list[Path]:
+    """Return the folders of an archive's runs, none of an archive that cannot be read now."""
+    try:
+        return find_runs(archive)
+    except OSError:
+        return []
+
+
+def _segments(folder: Path) -> list[Path]:
+    """Return the segments of a run's flight log, none of a folder that cannot be read now."""
+    try:
+        return find_segments(folder, _STEM)
+    except OSError:
+        return []
+
+
 def _number(path: Path) -> int:
     """Return the number at the end of the name of a segment or a run."""
     return int(path.stem.rpartition("-")[2])
 
 
 def _read(path: Path, offset: int) -> bytes:
-    """Return at most 64 kB of a file; nothing of one that is gone or cannot be read now."""
+    """Return at most 64 kB of a file; nothing of one that is gone or cannot be read now, nor of a FIFO."""
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=_at_once) as file:
             file.seek(offset)
             return file.read(_CHUNK)
     except OSError:
         return b""
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file without waiting, as a FIFO in its place would."""
+    return os.open(path, flags | os.O_NONBLOCK)

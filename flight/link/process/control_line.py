@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -42,17 +43,18 @@ class ControlLine(Generic[T]):
             return f"{AT_MOST} commands wait for their answers already"
         self._count += 1
         path = self._folder / f"answer-{self._count}"
-        line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        line.setblocking(False)
-        try:
-            path.unlink(missing_ok=True)
-            line.bind(str(path))
-            path.chmod(0o660)
-            line.sendto(data, self._target)
-        except OSError as error:
-            line.close()
-            path.unlink(missing_ok=True)
-            return f"no flight listens: {error.strerror or error}"
+        with ExitStack() as stack:
+            try:
+                line = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+                line.setblocking(False)
+                stack.callback(_remove, path)
+                path.unlink(missing_ok=True)
+                line.bind(str(path))
+                path.chmod(0o660)
+                line.sendto(data, self._target)
+            except OSError as error:
+                return f"no flight listens: {error.strerror or error}"
+            stack.pop_all()
         self._waiting.append(_Waiting(command, line, path, now_ns + PATIENCE_NS))
         return ""
 
@@ -80,4 +82,10 @@ class ControlLine(Generic[T]):
 
     def _end(self, waiting: _Waiting[T]) -> None:
         waiting.line.close()
-        waiting.path.unlink(missing_ok=True)
+        _remove(waiting.path)
+
+
+def _remove(path: Path) -> None:
+    """Remove the file of a socket; one that cannot be removed now is bound over later."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)

@@ -29,6 +29,7 @@ _SINGLE = {
 _BURST_S = 0.1
 _WAITING_S = 0.5
 _URGENT = 256
+"""Reports that wait; a newer one displaces the oldest."""
 _FLUSH_NS = 200_000_000
 
 
@@ -71,6 +72,7 @@ class Downlink:
 
     Attributes:
         sent: frames made.
+        displaced: reports that waited for the rate when newer ones took their room.
         played_ns: mission time that the playback has reached.
     """
 
@@ -96,7 +98,7 @@ class Downlink:
         self._urgent: deque[bytes] = deque(maxlen=_URGENT)
         self._queue = LiveQueue(rate * _WAITING_S)
         self._source: Iterator[bytes] | None = None
-        self.sent = 0
+        self.sent = self.displaced = 0
         self.played_ns = 0
 
     @property
@@ -111,6 +113,7 @@ class Downlink:
 
     def report(self, packet: bytes) -> None:
         """Send a packet before all others."""
+        self.displaced += len(self._urgent) == _URGENT
         self._urgent.append(packet)
 
     def live(self, packet: bytes) -> None:

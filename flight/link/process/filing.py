@@ -61,17 +61,17 @@ class Filing:
             raise UsageError(str(error)) from error
 
     def take(self, packet: bytes, now_ns: int) -> None:
-        """Take a unit of a transfer. Raises CommandError for bytes that are none."""
+        """Take a unit of a transfer. Raises CommandError for bytes that are none, or if the disk fails."""
         try:
             self._entity.take(unit_of(packet), now_ns)
-        except (PduError, FileError) as error:
+        except (PduError, FileError, OSError) as error:
             raise CommandError(str(error)) from error
 
     def packet(self, now_ns: int, time_ns: int) -> bytes | None:
         """Return the next packet of a transfer to send down, at mission time `time_ns`; None for none now."""
         try:
             unit = self._entity.unit(now_ns)
-        except FileError as error:
+        except (FileError, OSError) as error:
             self._problem = str(error)
             return None
         return None if unit is None else self._units.pack(unit, time_ns)
@@ -81,7 +81,7 @@ class Filing:
         try:
             self._entity.keep(now_ns)
             self._problem = ""
-        except FileError as error:
+        except (FileError, OSError) as error:
             self._problem = str(error)
         reports = [*self._go_on_checking()]
         if self._problem and self._problem != self._said:

@@ -33,7 +33,7 @@ from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vaul
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.packets import Packer, TelemetryError
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
@@ -43,6 +43,8 @@ _BUSY_NS = SECOND_NS // 250
 _LABEL_NS = 10 * SECOND_NS
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
+_HIGHEST_REPORTED = 2**63 - 1
+"""Largest counter, and largest mission time, that a packet holds. A frame's counter may have 96 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,9 @@ class Station:
         self._refusals = _Few()
         self._received = self._refused_commands = 0
         self._problem = ""
+        self._unpacked, self._unpacked_text = 0, ""
+        self._alive: Callable[[], object] = _nothing
+        self._alive_ns = clock.now_ns()
         self._playback = Playback(self._downlink, log)
         self._scheduling = Scheduling(Timetable(vault.folder))
         self._report(*self._scheduling.beginning())
@@ -97,14 +102,32 @@ class Station:
         """How many files are on their way."""
         return len(self._filing.status())
 
-    def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
-        """Turn until `ended` returns true; complain once of each trouble with sending."""
-        due_ns, complained = self._clock.now_ns(), ""
+    @property
+    def unreported(self) -> int:
+        """Reports that could not be packed, or that newer reports displaced before they were sent."""
+        return self._unpacked + self._downlink.displaced
+
+    def run(
+        self,
+        ended: Callable[[], bool],
+        complain: Callable[[str], object],
+        alive: Callable[[], object],
+    ) -> None:
+        """Turn until `ended` returns true.
+
+        `complain` is called once for each problem with sending, and once a second at most while reports are
+        lost. `alive` is called once a second while the loop turns, also within a turn that takes many frames.
+        """
+        self._alive = alive
+        due_ns, complained, lost, lost_ns = self._clock.now_ns(), "", 0, 0
         while not ended():
             pause_ns = _BUSY_NS if self.turn() else TURN_NS
             if self._problem and self._problem != complained:
                 complain(self._problem)
             complained = self._problem
+            if self.unreported != lost and self._clock.now_ns() - lost_ns >= SECOND_NS:
+                lost, lost_ns = self.unreported, self._clock.now_ns()
+                complain(f"{lost} reports could not be sent: {self._unpacked_text or 'too many at once'}")
             due_ns = max(due_ns + pause_ns, self._clock.now_ns())
             self._clock.sleep_until_ns(due_ns)
         self._control.close()
@@ -116,6 +139,7 @@ class Station:
         for line in self._lines:
             for frame, sender in line.receive():
                 self._take(frame, line, sender, now_ns)
+                self._beat()
         for sent, answer in self._control.answers(now_ns):
             reports = self._verification.answered(sent, answer)
             self._refused_commands += reports[0].stage is Stage.FAILED
@@ -137,7 +161,15 @@ class Station:
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
+        self._beat()
         return self._received > before
+
+    def _beat(self) -> None:
+        """Report once a second that the loop makes progress."""
+        now_ns = self._clock.now_ns()
+        if now_ns >= self._alive_ns:
+            self._alive_ns = now_ns + SECOND_NS
+            self._alive()
 
     def _take(self, frame: bytes, line: Line, sender: Any, now_ns: int) -> None:
         self._received += 1
@@ -145,7 +177,8 @@ class Station:
             admitted = self._gate.admit(frame)
         except RefusedError as error:
             if error.counter is not None and self._refusals.fits(now_ns):
-                self._report(Report(error.spi, error.counter, Stage.REFUSED, "", str(error)))
+                counter = min(error.counter, _HIGHEST_REPORTED)
+                self._report(Report(error.spi, counter, Stage.REFUSED, "", str(error)))
             return
         line.trust(sender, now_ns)
         request = request_of(admitted.data)
@@ -239,20 +272,30 @@ class Station:
             "thinned": self._downlink.thinned,
             "playing": int(self._downlink.playing),
             "played_ns": self._downlink.played_ns,
+            "unreported": self.unreported,
         }
         self._send(LINK, values)
         for progress in self._filing.status():
             self._send(TRANSFER, values_of(progress))
 
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
-        self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
+        """Send a packet of the link; one whose values do not fit is counted and lost."""
+        try:
+            self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
+        except TelemetryError as error:
+            self._unpacked += 1
+            self._unpacked_text = str(error)
 
     def _next_unit(self) -> bytes | None:
         return self._filing.packet(self._clock.now_ns(), self._time_ns())
 
     def _time_ns(self) -> int:
-        """Return the mission time."""
-        return self._mission_ns + self._clock.now_ns() - self._mission_at_ns
+        """Return the mission time, at most what a packet holds: a damaged log may state any."""
+        return min(self._mission_ns + self._clock.now_ns() - self._mission_at_ns, _HIGHEST_REPORTED)
+
+
+def _nothing() -> None:
+    """No-op: nobody watches the loop."""
 
 
 class _Few:

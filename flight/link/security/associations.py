@@ -14,12 +14,13 @@ import stat
 import struct
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
+from flight.link.regular_files import read_regular
 from flight.link.security.sdls import KEY_BYTES
 from flight.link.telemetry.segments import make_lasting
 from knightcube.errors import FlightError, UsageError
@@ -64,12 +65,16 @@ def encode(association: Association) -> bytes:
 
 
 def decode(data: bytes) -> Association | None:
-    """Return the association of a copy, None for anything that `encode` does not produce."""
+    """Return the association of a copy, None for anything that `encode` does not produce.
+
+    A counter beyond `HIGHEST_COUNTER`, which no gate admits and no sealer reserves, makes a copy bad.
+    """
     record, crc = data[: _RECORD.size], data[_RECORD.size :]
     if len(record) != _RECORD.size or zlib.crc32(record).to_bytes(_CRC_BYTES, "big") != crc:
         return None
     magic, spi, generation, unused, key = _RECORD.unpack(record)
-    return Association(spi, generation, unused, key) if magic == _MAGIC else None
+    good = magic == _MAGIC and unused <= HIGHEST_COUNTER
+    return Association(spi, generation, unused, key) if good else None
 
 
 class Vault:
@@ -91,16 +96,15 @@ class Vault:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing meanwhile. Raises FlightError where the folder takes nothing."""
-        try:
-            file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise FlightError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        """Keep other processes from writing meanwhile. Raises FlightError if the folder cannot be written."""
+        with ExitStack() as stack:
+            try:
+                file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+                stack.callback(os.close, file)
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError as error:
+                raise FlightError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
             yield
-        finally:
-            os.close(file)
 
     @contextmanager
     def owned(self) -> Iterator[None]:
@@ -133,12 +137,18 @@ class Vault:
         return sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
 
     def advance(self, association: Association) -> int:
-        """Write both copies unless another process wrote a newer one; return how many are durable."""
-        with self.locked():
-            newest = self.read(association.spi)
-            if newest is not None and newest >= association:
-                return self.copies(association.spi)
-            return self.write(association)
+        """Write both copies unless another process wrote a newer one; return how many are durable.
+
+        A disk that fails, or that is read-only, makes none durable.
+        """
+        try:
+            with self.locked():
+                newest = self.read(association.spi)
+                if newest is not None and newest >= association:
+                    return self.copies(association.spi)
+                return self.write(association)
+        except FlightError:
+            return 0
 
     def remove(self, name: int | str) -> None:
         """Remove an association."""
@@ -152,9 +162,10 @@ class Vault:
         found = []
         for copy in COPIES:
             try:
-                association = decode(self._path(name, copy).read_bytes())
+                data = read_regular(self._path(name, copy), _RECORD.size + _CRC_BYTES)
             except OSError:
                 continue
+            association = None if data is None else decode(data)
             if association is not None and str(association.spi) == str(name).partition("-")[0]:
                 found.append(association)
         return found
@@ -164,7 +175,8 @@ def overwrite(path: Path, data: bytes) -> bool:
     """Write a file in place, durably; return whether that worked."""
     try:
         new = not path.exists()
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        # Without O_NONBLOCK a FIFO in place of the file would be waited for without end.
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         try:
             if os.pwrite(file, data, 0) != len(data):
                 return False

@@ -215,6 +215,8 @@ class Sealer:
             if entry is None:
                 raise FlightError(f"both copies of the counter of SPI {self._spi} are lost: use its reserve")
             reserved = replace(entry, unused=entry.unused + self._block)
+            if reserved.unused > HIGHEST_COUNTER:
+                raise FlightError(f"the counters of SPI {self._spi} are used up: change its key")
             if self._vault.write(reserved, self._name) == 0:
                 raise FlightError(f"the counter of SPI {self._spi} cannot be stored")
         self._next, self._end = entry.unused, reserved.unused

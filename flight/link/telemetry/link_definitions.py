@@ -29,7 +29,9 @@ LINK = Packet(
         counter("thinned", "live packets left out for want of rate; the archive has them"),
         Field("playing", "u1", "-", "the archive is played back", states=NO_YES),
         Field("played_ns", "i8", "ns", "mission time that the playback has reached"),
+        counter("unreported", "reports of the link whose values did not fit, or that newer ones displaced"),
     ),
+    version=2,
 )
 
 VERIFICATION = Packet(
@@ -39,7 +41,7 @@ VERIFICATION = Packet(
     "What became of a command that came by the link",
     (
         Field("spi", "u2", "-", "of its frame"),
-        Field("counter", "i8", "-", "of its frame: with the SPI its identifier"),
+        Field("counter", "i8", "-", "of its frame: with the SPI its identifier; 2^63 - 1 for all beyond"),
         Field("stage", "u1", "-", "how far the command is", states=STAGES),
         Field("name", "S16", "-", "name of the command, empty for none"),
         Field("text", "S128", "-", "its values, or the reason"),

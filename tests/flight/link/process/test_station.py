@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,12 +15,14 @@ from flight.link.commands.codec import CommandPacker, unpack
 from flight.link.commands.errors import CommandError
 from flight.link.commands.values import ChangeMode, Command, Ping, Slew
 from flight.link.modes import Mode
-from flight.link.process import directives
+from flight.link.process import directives, station
 from flight.link.process.directives import NewKey, Play, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK
+from flight.link.security.gate import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, crc16
 from tests.flight.link.process.both_ends import BothEnds
+from tests.flight.link.security.vaults import frame_with
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 
 
@@ -96,6 +101,135 @@ def test_refusals_and_the_highest_counter_stand_in_the_very_first_packet(link: B
     assert len(link.obeyed) == 1, "the restarted link has obeyed the old frame again"
     assert link.status()[["refused_repeated", "refused_crc"]].tolist() == (1, 1)
     assert link.stages(frame_of)[-1] == "refused"
+
+
+COUNTERS = [0, 2**31, 2**32, 2**63 - 1, 2**63, 2**95, 2**96 - 1]
+
+
+@pytest.mark.parametrize("counter", COUNTERS)
+def test_an_authentic_frame_with_any_counter_is_refused_or_obeyed_and_the_link_goes_on(
+    link: BothEnds, counter: int
+) -> None:
+    link.wire.up.append(frame_with(link.ground, counter, packet(Ping(3))))
+    link.turn(1.1)
+    shown = min(counter, 2**63 - 1)
+    assert link.stages(shown) == (["refused"] if counter else ["accepted", "started", "completed"])
+    counts = link.status()[["admitted", "refused_beyond", "unreported"]]
+    assert counts.tolist() == (counter == 0, counter > 0, 0)
+    link.wire.up.append(frame_with(link.ground, 1, packet(Ping(4))))
+    link.turn()
+    assert unpack(link.obeyed[-1]) == Ping(4)
+
+
+@pytest.mark.parametrize("counter", COUNTERS)
+def test_a_counter_that_is_next_is_obeyed_up_to_the_highest(link: BothEnds, counter: int) -> None:
+    entry = link.sky.read(1)
+    assert entry is not None
+    link.sky.write(replace(entry, unused=min(counter, 2**63)))
+    link.restart()
+    for data in (frame_with(link.ground, counter, packet(Ping(3))),) * 2:
+        link.wire.up.append(data)
+    link.turn(1.1)
+    good = counter < 2**63
+    assert len(link.obeyed) == good
+    assert link.status()["highest"][0] == min(counter, 2**63 - 1)
+    assert link.status()[["admitted", "refused_repeated"]].tolist() == (good, good)
+    assert link.stages(min(counter, 2**63 - 1)).count("refused") == 1 + (not good)
+
+
+def test_a_report_that_cannot_be_packed_is_counted_said_and_does_not_end_the_link(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(station, "_HIGHEST_REPORTED", 2**96)
+    said: list[str] = []
+    for _ in range(3):
+        link.wire.up.append(frame_with(link.ground, 2**95, packet(Ping(3))))
+    turns = iter([False] * 60)
+    link.station.run(lambda: next(turns, True), said.append, lambda: None)
+    link.collect()
+    assert link.status()[["refused_beyond", "unreported"]].tolist() == (3, 3)
+    assert [text.partition(" could")[0] for text in said] == ["3 reports"]
+    assert "counter = 39614081257132168796771975168 is no i8" in said[0]
+
+
+def test_reports_that_newer_ones_displace_are_counted(tmp_path: Path) -> None:
+    with closing(BothEnds(tmp_path, rate=100.0)) as link:
+        for _ in range(300):
+            link.terminal.send(b"no packet")
+        link.station.turn()
+        assert link.station.unreported == 300 + 2 - 256, "a refusal each, and two states of the link"
+
+
+def test_a_log_that_states_any_time_does_not_end_the_link(link: BothEnds) -> None:
+    link.record(link.packer.pack(CYCLE_TIMING, 2**63 - 1, plain_contents(CYCLE_TIMING)))
+    link.turn(2.0)
+    counter = link.terminal.send(packet(Ping(1)))
+    link.turn()
+    assert link.stages(counter) == ["accepted", "started", "completed"]
+    assert link.status()["time_ns"] == 2**63 - 1
+
+
+def test_the_loop_shows_once_a_second_that_it_turns_also_while_it_takes_many_frames(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beats: list[int] = []
+    turns = iter([False] * 200)
+    link.station.run(lambda: next(turns, True), str, lambda: beats.append(link.clock.now_ns()))
+    assert len(beats) == 4
+    slow = link.station._gate.admit
+
+    def admit(frame: bytes) -> Admitted:
+        link.clock.advance(500_000_000)  # as a disk that takes long to store a counter
+        return slow(frame)
+
+    monkeypatch.setattr(link.station._gate, "admit", admit)
+    for _ in range(10):
+        link.terminal.send(b"no packet")
+    beats.clear()
+    link.station.turn()
+    assert len(beats) == 5
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC, errno.EIO, errno.EACCES])
+def test_a_disk_that_stores_no_counter_lets_no_frame_in_and_ends_nothing(
+    link: BothEnds, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = link.terminal.send(packet(Ping(1)))
+    link.turn()
+    frame = frame_with(link.ground, first + 1, packet(Ping(2)))
+    plain = os.open
+
+    def fail(path: str | Path, flags: int, mode: int = 0o777) -> int:
+        if flags & (os.O_WRONLY | os.O_RDWR) and Path(path).is_relative_to(link.sky.folder):
+            raise OSError(number, os.strerror(number), str(path))
+        return plain(path, flags, mode)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "open", fail)
+        link.wire.up.append(frame)
+        link.turn(1.1)
+        assert link.stages(first + 1) == ["refused"]
+        assert link.status()["refused_unstored"] == 1
+        assert len(link.obeyed) == 1
+    link.wire.up.append(frame)
+    link.turn()
+    assert [unpack(data) for data in link.obeyed] == [Ping(1), Ping(2)]
+
+
+def test_an_archive_that_cannot_be_listed_for_a_while_ends_nothing(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "glob", fail)
+        play = link.terminal.send(directives.pack(Play(3, 0.0, 1.0), 1))
+        link.turn(2.0)
+        assert link.stages(play) == ["accepted", "failed"]
+    link.record(*timing_packets(3))
+    link.turn(1.0)
+    assert link.of("cycle_timing") == timing_packets(3)
 
 
 def test_live_packets_come_in_order_and_none_is_lost(link: BothEnds) -> None:

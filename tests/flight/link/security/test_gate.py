@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,10 @@ import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flight.link.frames.telecommand import close_frame
-from flight.link.security.associations import COPIES, Vault, decode
+from flight.link.security.associations import COPIES, HIGHEST_COUNTER, Association, Vault, decode, encode
 from flight.link.security.gate import WINDOW, Gate, Refusal, RefusedError
 from knightcube.errors import FlightError, UsageError
-from tests.flight.link.security.vaults import Ground, gate, vault
+from tests.flight.link.security.vaults import Ground, frame_with, gate, vault
 
 KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}
 
@@ -123,6 +124,48 @@ def test_a_counter_that_cannot_be_stored_lets_nothing_in(
         with pytest.raises(FlightError, match="cannot be stored"):
             Ground(ground).frame(b"two")
     assert entrance.admit(frame).data == b"one"
+
+
+def test_a_folder_that_takes_nothing_lets_nothing_in(
+    sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entrance, frame = gate(sky), Ground(ground).frame(b"one")
+
+    def fail(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    for call in ("open", "flock"):
+        with monkeypatch.context() as broken:
+            broken.setattr(os if call == "open" else fcntl, call, fail)
+            assert cause(entrance, frame) is Refusal.UNSTORED
+    assert entrance.admit(frame).data == b"one"
+
+
+def test_the_last_counter_is_2_to_the_63_less_one_both_ways(sky: Vault, ground: Vault) -> None:
+    maker = Ground(ground)
+    for vault_ in (sky, ground):
+        entry = vault_.read(1)
+        assert entry is not None
+        vault_.write(replace(entry, unused=HIGHEST_COUNTER - 1))
+    entrance = gate(sky)
+    assert entrance.admit(maker.frame(b"last")).counter == 2**63 - 1
+    with pytest.raises(FlightError, match="used up: change its key"):
+        maker.frame(b"one more")
+    assert cause(entrance, frame_with(ground, HIGHEST_COUNTER, b"")) is Refusal.BEYOND
+    assert (sky.read(1) or pytest.fail("it was written")).unused == HIGHEST_COUNTER
+    assert decode(encode(Association(1, 1, HIGHEST_COUNTER + 1, bytes(32)))) is None
+
+
+@pytest.mark.timeout(30)
+def test_a_fifo_or_an_endless_file_in_place_of_a_copy_is_a_lost_copy(sky: Vault, tmp_path: Path) -> None:
+    first, second = (tmp_path / "sky" / f"spi-1.{copy}" for copy in COPIES)
+    first.unlink()
+    os.mkfifo(first)
+    assert sky.copies(1) == 1
+    gate(sky)  # tries to make the copy again
+    with second.open("r+b") as file:
+        file.truncate(1 << 40)
+    assert sky.read(1) is None
 
 
 def test_no_counter_is_used_twice_by_senders_that_share_a_folder(ground: Vault) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 from flight.link.frames import telecommand
 from flight.link.security.associations import COMMAND_SPIS, Association, Vault
 from flight.link.security.gate import Gate, Sealer
+from flight.link.security.sdls import OVERHEAD_BYTES, protect
+from flight.link.telemetry.packets import CRC_BYTES
 
 SPACECRAFT = 0x1A5
 
@@ -30,6 +32,16 @@ def parse(frame: bytes) -> tuple[bytes, bytes]:
 def gate(at: Vault) -> Gate:
     """Return the satellite's gate of commands."""
     return Gate(at, COMMAND_SPIS, parse, telecommand.AUTHENTICATED)
+
+
+def frame_with(at: Vault, counter: int, data: bytes, spi: int = 1) -> bytes:
+    """Return an authentic telecommand frame with any counter of 96 bits, which no sealer would reserve."""
+    entry = at.read(spi)
+    assert entry is not None
+    header = telecommand.TelecommandHeader(SPACECRAFT, 0, 0)
+    length = telecommand.HEADER.size + OVERHEAD_BYTES + len(data) + CRC_BYTES
+    mask = telecommand.AUTHENTICATED
+    return telecommand.close_frame(protect(entry.cipher, spi, counter, header.pack(length), mask, data))
 
 
 class Ground:
