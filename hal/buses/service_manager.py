@@ -1,7 +1,8 @@
 """Notifies systemd over its socket (sd_notify(3)): ready, alive, stopping.
 
 Without a service manager - no NOTIFY_SOCKET in the environment - notifications are dropped, as are those that
-cannot be delivered: a notification must never delay or end a flight.
+cannot be delivered: a notification must never delay or end a flight. Only READY is repeated until it is
+delivered: without it the service manager ends the process.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ class ServiceManager:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._line: socket.socket | None = None
+        self._undelivered_ready = ""
         if self._address:
             self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
             self._line.setblocking(False)
@@ -28,8 +30,9 @@ class ServiceManager:
         """The watchdog's time-out; 0 without a watchdog."""
 
     def ready(self, status: str) -> None:
-        """Report that the start is complete."""
-        self._notify(f"READY=1\nSTATUS={status}")
+        """Report that the start is complete; repeated with the watchdog until it is delivered."""
+        self._undelivered_ready = f"READY=1\nSTATUS={status}"
+        self._repeat_ready()
 
     def status(self, status: str) -> None:
         """Report a status line for people."""
@@ -37,6 +40,7 @@ class ServiceManager:
 
     def feed_watchdog(self) -> None:
         """Report that every task makes progress."""
+        self._repeat_ready()
         if self.watchdog_ns:
             self._notify("WATCHDOG=1")
 
@@ -46,6 +50,7 @@ class ServiceManager:
 
     def stopping(self) -> None:
         """Report that the process is stopping."""
+        self._undelivered_ready = ""
         self._notify("STOPPING=1")
 
     def close(self) -> None:
@@ -54,7 +59,14 @@ class ServiceManager:
         if line is not None:
             line.close()
 
-    def _notify(self, message: str) -> None:
+    def _repeat_ready(self) -> None:
+        if self._undelivered_ready and self._notify(self._undelivered_ready):
+            self._undelivered_ready = ""
+
+    def _notify(self, message: str) -> bool:
+        """Send a notification; return whether it was delivered."""
         if self._line is not None:
             with contextlib.suppress(OSError):
                 self._line.sendto(message.encode(), self._address)
+                return True
+        return False

@@ -29,7 +29,7 @@ class Overseer(Protocol):
     """The service manager, as far as the flight uses it."""
 
     def ready(self, status: str) -> None:
-        """Report that the start is complete."""
+        """Report that the start is complete; repeated by `feed_watchdog` until it is delivered."""
 
     def feed_watchdog(self) -> None:
         """Report that every task makes progress."""

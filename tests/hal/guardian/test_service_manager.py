@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -72,4 +73,45 @@ def test_a_manager_that_does_not_read_is_not_waited_for(manager_end: tuple[socke
     service = ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000"}, OWN)
     for _ in range(2000):
         service.feed_watchdog()
+    service.close()
+
+
+def test_a_ready_that_a_full_queue_refused_is_repeated_until_it_is_delivered_once(
+    manager_end: tuple[socket.socket, str],
+) -> None:
+    end, name = manager_end
+    service = ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000"}, OWN)
+    for _ in range(2000):
+        service.feed_watchdog()
+    service.ready("flying")
+    end.setblocking(False)
+    taken = set()
+    with suppress(BlockingIOError):
+        while True:
+            taken.add(end.recv(100))
+    assert taken == {b"WATCHDOG=1"}
+    service.feed_watchdog()
+    service.feed_watchdog()
+    assert [end.recv(100) for _ in range(3)] == [b"READY=1\nSTATUS=flying", b"WATCHDOG=1", b"WATCHDOG=1"]
+    service.close()
+
+
+def test_a_ready_is_repeated_without_a_watchdog_but_not_after_stopping(tmp_path: Path) -> None:
+    name = tmp_path / "late"
+    service = ServiceManager({"NOTIFY_SOCKET": str(name)}, OWN)
+    service.ready("flying")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+        end.bind(str(name))
+        end.setblocking(False)
+        service.feed_watchdog()
+        assert end.recv(100) == b"READY=1\nSTATUS=flying"
+    name.unlink()
+    service.ready("again")
+    service.stopping()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+        end.bind(str(name))
+        end.setblocking(False)
+        service.feed_watchdog()
+        with pytest.raises(BlockingIOError):
+            end.recv(100)
     service.close()
