@@ -139,9 +139,7 @@ class Gate:
         spi = spi_of(protected)
         if spi not in self._open:
             raise RefusedError(Refusal.SPI)
-        entry = self._open[spi]
-        if entry is None:
-            raise RefusedError(Refusal.LOST, spi)
+        entry = self._open[spi] or self._read_again(spi)
         data = unprotect(self._cipher(entry), header, self._mask, protected)
         if data is None:
             entry, data = self._by_next_key(spi, header, protected)
@@ -157,6 +155,14 @@ class Gate:
             self._stored[spi] = used.unused
         self._open[spi] = used
         return Admitted(spi, counter, header, data)
+
+    def _read_again(self, spi: int) -> Association:
+        """Return an association that the disk did not give before. Raises RefusedError if it is lost."""
+        entry = self._vault.read(spi)
+        if entry is None:
+            raise RefusedError(Refusal.LOST, spi)
+        self._open[spi], self._stored[spi] = entry, entry.unused
+        return entry
 
     def _cipher(self, entry: Association) -> AESGCM:
         known = self._ciphers.get((entry.spi, entry.generation))

@@ -126,6 +126,23 @@ def test_a_counter_that_cannot_be_stored_lets_nothing_in(
     assert entrance.admit(frame).data == b"one"
 
 
+def test_a_counter_that_could_not_be_read_at_the_start_is_read_when_a_frame_needs_it(
+    sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = Ground(ground).frame(b"one"), Ground(ground).frame(b"two")
+    gate(sky).admit(first)
+
+    def fail(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "open", fail)
+        entrance = gate(sky)
+        assert cause(entrance, second) is Refusal.LOST
+    assert cause(entrance, first) is Refusal.REPEATED
+    assert entrance.admit(second).data == b"two"
+
+
 def test_a_folder_that_takes_nothing_lets_nothing_in(
     sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
 ) -> None:
