@@ -1,4 +1,4 @@
-"""Tries the start of a flight until it succeeds: on a board nobody is there to start it again.
+"""Tries the start of a flight, or of the link, until it succeeds: on a board nobody can start it again.
 
 A configuration that was read whole and judged wrong ends the start: waiting would not help. Everything else
 may pass: a disk's error, an address or a folder that is not there yet, a bus that another flight holds. After
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class StoppedError(FlightError):
-    """A signal came before the flight could begin."""
+    """A signal came before the flight, or the link, could begin."""
 
 
 class Patience:
@@ -67,7 +67,7 @@ class Patience:
             self._overseer.extend_start(_ATTEMPT_S)
             self._clock.sleep_until_ns(min(now_ns + _MEAL_NS, until_ns))
         if self._interrupted():
-            raise StoppedError(f"stopped before the flight began: {problem}")
+            raise StoppedError(f"stopped before it could begin: {problem}")
 
     def close(self) -> None:
         """Close the line to the service manager. Safe to call twice."""

@@ -27,7 +27,12 @@ Peer = Annotated[
     ),
 ]
 HostPort = Annotated[
-    str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$", description="HOST:PORT, such as 127.0.0.1:5005")
+    str,
+    Meta(
+        # Ports above 65535 are none, and waiting would not make them so.
+        pattern=r"^[^:\s]+:([0-5]?[0-9]{1,4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])$",
+        description="HOST:PORT, such as 127.0.0.1:5005, PORT 65535 at most",
+    ),
 ]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]

@@ -125,6 +125,17 @@ def test_the_watchdog_leaves_room_for_four_meals() -> None:
     assert float(seconds) >= 4 * 0.25, "fed four times a second"
 
 
+def test_the_link_is_watched_restarted_and_does_not_wait_for_the_flight() -> None:
+    """A flight that waits at its start never becomes active: a link ordered after it would never begin."""
+    text = (DEPLOY / "knightcube-link.service").read_text(encoding="utf-8")
+    for line in ("Type=notify", "NotifyAccess=main", "Restart=always", "RestartPreventExitStatus=2"):
+        assert f"{line}\n" in text
+    (seconds,) = re.findall(r"^WatchdogSec=(\d+)$", text, re.MULTILINE)
+    assert float(seconds) >= 20, "fed once a second, or after each frame that a slow disk stores"
+    assert "StartLimitIntervalSec=0\n" in text
+    assert "After=" not in text
+
+
 def test_the_dropin_names_the_devices_and_nothing_of_a_network() -> None:
     text = dropin(TESTBED)
     assert "DeviceAllow=/dev/i2c-1 rw\n" in text

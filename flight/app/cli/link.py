@@ -8,33 +8,56 @@ import signal
 import sys
 import tempfile
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
+from flight.app.patient_start import Patience, StoppedError, patiently
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine
 from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
 from flight.link.process.station import Station, StationSettings
 from flight.link.process.verification import Sent
-from flight.link.security.associations import Vault
+from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.schema.carried import config_path
+from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.reader import parse
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
-from knightcube.errors import UsageError
+from hal.buses.service_manager import ServiceManager
+from knightcube.errors import FlightError, UsageError
 
 _NICE = 10
+
+
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A configuration that was found right: its link, its command socket, and why another file was read."""
+
+    link: Link
+    socket: Path
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A link that is ready to run, and the names of its lines."""
+
+    station: Station
+    names: str
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
         "Connect a flight to its ground by protected frames (`link` in its configuration): live telemetry "
-        "and playback from its log, commands to its socket. A process of its own, at low priority; SIGTERM "
-        "ends it."
+        "and playback from its log, commands to its socket. A process of its own, at low priority. It waits "
+        "for what may come yet, such as keys, an address or a free port, and says so; SIGTERM ends it."
     )
     parser.add_argument("config", type=config_path, metavar="CONFIG", help="the configuration that is flown")
     parser.add_argument(
@@ -48,45 +71,91 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Open the lines and turn until a signal."""
-    # A service keeps the last configuration that flew beside its archive.
-    chosen = accepted_config(options.config, {"STATE_DIRECTORY": str(options.log.absolute().parent)})
-    if chosen.problem:
-        sys.stderr.write(f"flight: {chosen.problem}\n")
-    config = parse(chosen.text, str(chosen.path))
-    if config.link is None or config.commands.socket is None:
-        raise UsageError(f"{chosen.path}: no `link` section: there is nothing to connect")
-    section, clock = config.link, SystemClock()
+    """Open the lines, again and again until that succeeds, and turn until a signal.
+
+    Raises ConfigError only for a configuration that was read whole and judged wrong; after anything else that
+    ends the link its unit starts it again.
+    """
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    with suppress(PermissionError):  # a service's unit has done so, and its sandbox forbids it
+    with suppress(OSError):  # a service's unit has done so, and its sandbox forbids it
         os.nice(_NICE)
-    with ExitStack() as stack:
-        vault = Vault(Path(section.keys))
-        stack.enter_context(vault.owned())
-        lines = _open_lines(section, clock, stack)
-        folder = os.environ.get("RUNTIME_DIRECTORY") or stack.enter_context(
-            tempfile.TemporaryDirectory(prefix="knightcube-")
-        )
-        control: ControlLine[Sent] = ControlLine(Path(config.commands.socket), Path(folder))
-        settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate)
-        station = Station(settings, vault, lines, control, LogFollower(options.log), clock)
-        sys.stderr.write(f"flight: link open on {', '.join(line.name for line in lines)}\n")
-        station.run(ended.is_set, lambda text: sys.stderr.write(f"flight: link: {text}\n"))
+    try:
+        _run(options.config, options.log, ended.is_set)
+    except StoppedError as error:  # by whoever started it
+        _say(str(error))
+    except ConfigError:
+        raise
+    except (UsageError, OSError) as error:
+        raise FlightError(str(error)) from error
     return 0
 
 
+def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
+    """Start the link as soon as nothing prevents it, and run it until `ended` returns true."""
+    with ExitStack() as stack:
+        patience = Patience(ended)
+        stack.callback(patience.close)
+        opened = patiently(partial(_judge, config, log), partial(_open, log), stack, patience)
+        overseer = ServiceManager(os.environ, os.getpid())
+        stack.callback(overseer.close)
+        stack.callback(overseer.stopping)
+        status = f"link open on {opened.names}"
+        _say("; ".join(filter(None, (status, patience.summary()))))
+        overseer.ready(status)
+        opened.station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
+
+
+def _judge(config_path: Path, log: Path) -> _Judged:
+    """Read the configuration, and judge it. Raises UnreadConfigError; ConfigError for a wrong one."""
+    # A service keeps the last configuration that flew beside its archive.
+    chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
+    config = parse(chosen.text, str(chosen.path))
+    if config.link is None or config.commands.socket is None:
+        raise ConfigError(str(chosen.path), "no `link` section: there is nothing to connect")
+    return _Judged(config.link, Path(config.commands.socket), chosen.problem)
+
+
+def _open(log: Path, judged: _Judged, stack: ExitStack) -> _Opened:
+    """Open keys and lines. Raises UsageError, FlightError, DeviceError, OSError for what may pass."""
+    if judged.problem:
+        _say(judged.problem)
+    section, clock = judged.link, SystemClock()
+    vault = Vault(Path(section.keys))
+    if all(vault.read(spi) is None for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)):
+        raise UsageError(f"{section.keys}: no key can be read: mount or copy the satellite's keys there")
+    stack.enter_context(vault.owned())
+    lines = _open_lines(section, clock, stack)
+    folder = os.environ.get("RUNTIME_DIRECTORY") or stack.enter_context(
+        tempfile.TemporaryDirectory(prefix="knightcube-")
+    )
+    control: ControlLine[Sent] = ControlLine(judged.socket, Path(folder))
+    settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate)
+    station = Station(settings, vault, lines, control, LogFollower(log), clock)
+    return _Opened(station, ", ".join(line.name for line in lines))
+
+
 def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Line]:
-    """Open the configured lines. Raises UsageError, DeviceError."""
+    """Open the configured lines; `stack` closes each. Raises UsageError, DeviceError."""
     peers, lines = peer_networks(section), list[Line]()
+
+    def add(line: Line) -> None:
+        stack.callback(line.close)
+        lines.append(line)
+
     if section.udp is not None:
-        lines.append(UdpLine(section.udp, section.telemetry_to, peers))
+        add(UdpLine(section.udp, section.telemetry_to, peers))
     if section.tcp is not None:
-        lines.append(TcpLine(section.tcp, peers))
+        add(TcpLine(section.tcp, peers))
     if section.serial is not None:
         port = PySerialPort(section.serial.device, section.serial.baud, clock, patient=True)
-        lines.append(SerialLine(section.serial.device, port))
-    for line in lines:
-        stack.callback(line.close)
+        add(SerialLine(section.serial.device, port))
     return lines
+
+
+def _say(text: str) -> None:
+    """Write a line on standard error; a disk that takes none does not end the link."""
+    with suppress(OSError):
+        sys.stderr.write(f"flight: {text}\n")
+        sys.stderr.flush()

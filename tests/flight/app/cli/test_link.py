@@ -13,7 +13,6 @@ import threading
 import time
 import tty
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,38 +42,21 @@ from ground.link.terminal import (
 )
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
+from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
+from tests.flight.link.security.vaults import frame_with
 from tests.scenario.flights import CONFIG
-
-ROOT = Path(__file__).resolve().parents[4]
-
-
-def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
-    with ExitStack() as stack:
-        lines = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in kinds]
-        for line in lines:
-            line.bind(("127.0.0.1", 0))
-        return [line.getsockname()[1] for line in lines]
 
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Return the addresses of a link on each kind of line, beside a flight that obeys; and its folder."""
     place = tmp_path_factory.mktemp("link")
-    assert main(["keys", str(place / "keys")]) == 0
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     radio, device = pty.openpty()
     for end in (radio, device):
         tty.setraw(end)
-    section = {
-        "keys": str(place / "keys" / "satellite"),
-        "udp": f"127.0.0.1:{udp}",
-        "tcp": f"127.0.0.1:{tcp}",
-        "serial": {"device": os.ttyname(device)},
-    }
-    config = place / "flight.yaml"
-    text = CONFIG.read_text(encoding="utf-8")
-    commands = json.dumps({"socket": str(place / "commands")})
-    config.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(section)}\n", encoding="utf-8")
+    serial = {"device": os.ttyname(device)}
+    config = write_linked_config(place, udp=f"127.0.0.1:{udp}", tcp=f"127.0.0.1:{tcp}", serial=serial)
     flight, ended = open_unix(place / "commands"), threading.Event()
 
     def obey() -> None:
@@ -122,6 +104,19 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
     assert command(lines, kind, "--json", "ping") == 0
     facts = json.loads(capsys.readouterr().out)
     assert [stage["stage"] for stage in facts["stages"]] == ["accepted", "started", "completed"]
+
+
+def test_authentic_frames_with_any_counter_end_no_process(
+    lines: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A recording of such a frame would end the link after every restart: a refused frame is not stored."""
+    vault = Vault(Path(lines["place"]) / "keys" / "ground")
+    host, _, port = lines["udp"].partition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
+        for counter in (0, 2**31, 2**32, 2**63 - 1, 2**63, 2**95, 2**96 - 1):
+            ground.sendto(frame_with(vault, counter, CommandPacker().pack(Ping(3), 1)), (host, int(port)))
+    assert command(lines, "udp", "ping") == 0
+    assert "completed" in capsys.readouterr().out
 
 
 def test_a_command_is_scheduled_listed_and_deleted(

@@ -1,0 +1,118 @@
+"""Starts the link again and again in one process; in each start other calls of the operating system fail.
+
+Run as `python -m tests.flight.app.cli.failing_starts FOLDER`, in a process of its own: the hook that makes
+calls fail stays for the life of its process. Prints one JSON object a start.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr
+from io import StringIO
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from flight.app.cli import main
+from flight.app.patient_start import Patience
+from flight.link.process.station import Station
+from tests.flight.app.cli.linked_board import write_linked_config
+
+CALLS = frozenset({"open", "os.mkdir", "os.remove", "os.listdir", "os.scandir", "socket.bind"})
+"""Audit events (Python's documentation, "Audit events table"), each raised before its call."""
+ERRORS = (errno.EIO, errno.ENOSPC, errno.ENOENT, errno.EACCES, errno.EROFS)
+NETWORK_ERRORS = (errno.EADDRINUSE, errno.EADDRNOTAVAIL)
+
+
+class Faults:
+    """Makes calls fail while a link starts.
+
+    Attributes:
+        seen: the calls of this start, each with what it is about.
+        waits: how often this start has waited.
+    """
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, str]] = []
+        self.waits = 0
+        self._error_of: Callable[[str, str], int] | None = None
+
+    def start(self, error_of: Callable[[str, str], int]) -> None:
+        """Begin a start; `error_of` returns the error of a call that is to fail, else 0."""
+        self.seen, self.waits, self._error_of = [], 0, error_of
+
+    def end(self) -> None:
+        """Let no more call fail."""
+        self._error_of = None
+
+    def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Make a call fail: the hook of `sys.addaudithook`. Raises OSError."""
+        if self._error_of is None or event not in CALLS:
+            return
+        about = str(arguments[-1] if event == "socket.bind" else arguments[0])
+        self.seen.append((event, about))
+        if error := self._error_of(event, about):
+            raise OSError(error, os.strerror(error), about)
+
+
+def cases(faults: Faults, place: Path) -> Iterator[tuple[str, Callable[[str, str], int]]]:
+    """Yield each start: what fails in it, and the error of a call."""
+    for _ in range(2):  # the first start imports modules
+        yield "nothing", lambda *_: 0
+    calls = list(faults.seen)
+    for number, (event, about) in enumerate(calls, 1):
+        errors = NETWORK_ERRORS if event == "socket.bind" else (ERRORS[number % len(ERRORS)],)
+        for error in errors:
+
+            def once(*_: str, number: int = number, error: int = error) -> int:
+                return error if len(faults.seen) == number else 0
+
+            yield f"call {number}: {event} {about}: {errno.errorcode[error]}", once
+    for error in ERRORS:
+
+        def long(event: str, about: str, error: int = error) -> int:
+            return error if faults.waits < 3 and about.startswith(str(place / "board")) else 0
+
+        yield f"the whole disk for three attempts: {errno.errorcode[error]}", long
+
+
+def run(place: Path) -> None:
+    """Make all starts under `place` and print how each went."""
+    (place / "board").mkdir()
+    config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
+    words = ["link", str(config), "--log", str(place / "board" / "runs")]
+    faults, came_up = Faults(), False
+    turn_until, wait = Station.run, Patience.wait
+
+    def run_shortly(self: Station, *arguments: Any) -> None:
+        nonlocal came_up
+        faults.end()
+        came_up = True
+        self.turn()
+        signal.raise_signal(signal.SIGTERM)
+        turn_until(self, *arguments)
+
+    def count_waits(self: Patience, problem: str, _: float) -> None:
+        faults.waits += 1
+        wait(self, problem, 0.0)
+
+    sys.addaudithook(faults.hook)
+    # The start alone is tried, and without the pauses.
+    with patch.object(Station, "run", run_shortly), patch.object(Patience, "wait", count_waits):
+        for name, error_of in cases(faults, place):
+            came_up = False
+            faults.start(error_of)
+            with redirect_stderr(StringIO()) as said:
+                status = main(words)
+            faults.end()
+            facts = {"fails": name, "status": status, "came_up": came_up, "waits": faults.waits}
+            sys.stdout.write(json.dumps({**facts, "said": said.getvalue()}) + "\n")
+
+
+if __name__ == "__main__":
+    run(Path(sys.argv[1]))

@@ -1,0 +1,34 @@
+"""A board with a link: keys, and a configuration whose `link` section names its lines."""
+
+from __future__ import annotations
+
+import json
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from ground.link.keys import make_keys
+from tests.scenario.flights import CONFIG
+
+ROOT = Path(__file__).resolve().parents[4]
+
+
+def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
+    """Return a free port of the loopback address for each kind of socket."""
+    with ExitStack() as stack:
+        lines = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in kinds]
+        for line in lines:
+            line.bind(("127.0.0.1", 0))
+        return [line.getsockname()[1] for line in lines]
+
+
+def write_linked_config(place: Path, **lines: Any) -> Path:
+    """Make keys under `place`; return the configuration of a board with these lines, beside them."""
+    make_keys(place / "keys")
+    section = {"keys": str(place / "keys" / "satellite"), **lines}
+    commands = json.dumps({"socket": str(place / "commands")})
+    config = place / "flight.yaml"
+    text = CONFIG.read_text(encoding="utf-8")
+    config.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(section)}\n", encoding="utf-8")
+    return config

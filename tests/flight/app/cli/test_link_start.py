@@ -1,0 +1,189 @@
+"""The link waits for what may pass and comes up; only a configuration judged wrong ends it for good."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from flight.link.security.associations import Vault
+from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
+
+_LONGEST_S = 120.0
+
+
+class Service:
+    """A link process, and the service manager's end of its line."""
+
+    def __init__(self, place: Path, config: Path) -> None:
+        self.line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.line.bind(str(place / "notify"))
+        self.line.settimeout(_LONGEST_S)
+        environment = {**os.environ, "NOTIFY_SOCKET": str(place / "notify"), "WATCHDOG_USEC": "30000000"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "flight", "link", str(config), "--log", str(place)],
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+            env=environment,
+        )
+
+    def says(self, words: str) -> str:
+        """Return the next line on standard error, which must have these words."""
+        assert self.process.stderr is not None
+        line = self.process.stderr.readline()
+        assert words in line
+        return line
+
+    def notifies(self, word: str) -> None:
+        """Wait until the service manager is notified of this."""
+        while word not in self.line.recv(4096).decode():
+            pass
+
+    def silent(self, seconds: float) -> bool:
+        """Return whether the service manager is notified of nothing for this time."""
+        self.line.settimeout(0.0)
+        while True:
+            try:
+                self.line.recv(4096)
+            except BlockingIOError:
+                break
+        self.line.settimeout(seconds)
+        try:
+            self.line.recv(4096)
+        except TimeoutError:
+            return True
+        return False
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.communicate()
+        self.line.close()
+
+
+@pytest.fixture
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a short name: sockets are in it."""
+    return tmp_path_factory.mktemp("s")
+
+
+@pytest.fixture
+def start(place: Path) -> Iterator[Callable[[Path], Service]]:
+    begun: list[Service] = []
+
+    def begin(config: Path) -> Service:
+        begun.append(Service(place, config))
+        return begun[-1]
+
+    yield begin
+    for service in begun:
+        service.close()
+
+
+def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_each_step(
+    place: Path, start: Callable[[Path], Service]
+) -> None:
+    (port,) = free_ports([socket.SOCK_DGRAM])
+    config = write_linked_config(place, udp=f"127.0.0.1:{port}")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        service = start(config)
+        service.says(f"cannot begin yet: link.udp: 127.0.0.1:{port} cannot be listened to")
+        service.notifies("STATUS=waiting to begin")
+        service.notifies("EXTEND_TIMEOUT_USEC=")
+    while "link open on UDP" not in (line := service.says("")):
+        assert "cannot begin yet" in line
+    assert "begun at try" in line
+    service.notifies("READY=1")
+    for _ in range(2):
+        service.notifies("WATCHDOG=1")
+    service.process.send_signal(signal.SIGSTOP)
+    assert service.silent(3.0), "the watchdog is fed though the loop stands still"
+    service.process.send_signal(signal.SIGCONT)
+    service.notifies("WATCHDOG=1")
+    service.process.terminate()
+    service.notifies("STOPPING=1")
+    assert service.process.wait(_LONGEST_S) == 0
+
+
+def test_what_is_not_there_yet_is_waited_for_in_turn(place: Path, start: Callable[[Path], Service]) -> None:
+    """The configuration, then the keys, whose folder is empty until they are mounted, then an old process."""
+    whole = write_linked_config(place, udp="127.0.0.1:0")
+    config = place / "later.yaml"
+    keys, away = place / "keys" / "satellite", place / "away"
+    keys.rename(away)
+    service = start(config)
+    service.says("no such file")
+    whole.rename(config)
+    while "no such folder" not in (line := service.says("cannot begin yet")):
+        assert "no such file" in line
+    keys.mkdir()
+    while "no key can be read" not in (line := service.says("cannot begin yet")):
+        assert "no such folder" in line
+    with Vault(away).owned():
+        keys.rmdir()
+        away.rename(keys)
+        while "another link process has these counters" not in (line := service.says("cannot begin yet")):
+            assert "no such folder" in line or "no key can be read" in line
+    while "link open on UDP" not in (line := service.says("")):
+        assert "cannot begin yet" in line
+    service.process.terminate()
+    assert service.process.wait(_LONGEST_S) == 0
+
+
+def test_an_address_that_is_not_there_is_waited_for_until_a_signal(
+    place: Path, start: Callable[[Path], Service]
+) -> None:
+    config = write_linked_config(place, tcp="203.0.113.7:5010")
+    service = start(config)
+    service.says("link.tcp: 203.0.113.7:5010 cannot be listened to")
+    service.says("tried again in 0.4 s")
+    service.process.terminate()
+    assert service.process.wait(_LONGEST_S) == 0
+    assert service.process.stderr is not None
+    assert "stopped before it could begin: link.tcp" in service.process.stderr.read()
+
+
+def test_each_call_of_a_start_fails_once_and_the_whole_disk_for_a_while(tmp_path: Path) -> None:
+    """As the campaign `start` does it with a flight; waits are without pauses here."""
+    words = [sys.executable, "-m", "tests.flight.app.cli.failing_starts", str(tmp_path)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT, timeout=_LONGEST_S)
+    starts = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [one for one in starts if one["status"] != 0 or not one["came_up"]] == []
+    for call in ("open", "os.mkdir", "os.scandir", "socket.bind"):
+        assert any(call in one["fails"] for one in starts), "the starts have other calls than before"
+    for word in ("EADDRINUSE", "EADDRNOTAVAIL", "satellite/owner: ", "transfers: "):
+        assert any(one["waits"] == 1 for one in starts if word in one["fails"]), word
+    waits = [one["waits"] for one in starts if one["fails"].startswith("the whole disk")]
+    assert waits == [3] * 5
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda text: text.replace("link:", "lnik:"), "`lnik` is an unknown key"),
+        (lambda text: text.replace("127.0.0.1:0", "127.0.0.1:65536"), "expected HOST:PORT"),
+        (lambda text: text.replace('"udp"', '"spacecraft": 2000, "udp"'), "`link.spacecraft`"),
+        (lambda text: text[: text.index("link:")], "no `link` section"),
+        (lambda text: text + "\n]", "is not YAML"),
+    ],
+)
+def test_a_configuration_judged_wrong_ends_the_link_with_status_2(
+    place: Path, change: Callable[[str], str], problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = write_linked_config(place, udp="127.0.0.1:0")
+    config.write_text(change(config.read_text(encoding="utf-8")), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "flight", "link", str(config), "--log", str(place)],
+        stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False, timeout=_LONGEST_S,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert problem in done.stderr
