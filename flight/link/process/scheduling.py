@@ -102,7 +102,7 @@ class Scheduling:
 
 
 def utc_of(text: str) -> int:
-    """Return the ns since 1970 of a UTC in ISO 8601, before the year 2262. Raises CommandError."""
+    """Return the ns since 1970 of a UTC in ISO 8601, up to 2262-04-11. Raises CommandError."""
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:

@@ -106,6 +106,7 @@ def test_a_port_that_is_taken_is_waited_for_and_the_service_manager_learns_of_ea
     for _ in range(2):
         service.notifies("WATCHDOG=1")
     service.process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, service.process.pid, os.WSTOPPED)
     assert service.silent(3.0), "the watchdog is fed though the loop stands still"
     service.process.send_signal(signal.SIGCONT)
     service.notifies("WATCHDOG=1")
