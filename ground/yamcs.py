@@ -5,11 +5,16 @@ Both listen on loopback alone. No data link of Yamcs can send the gateway's toke
 folder holds the source of one that can, `GatewayLink.java`, to be compiled once. Packets are archived by
 mission time and sequence count; commands are verified by the packet `verification`, whose packet identifier
 and sequence count are those of the command. Files come and go by Yamcs's own CFDP service.
+
+Yamcs asks for a password, because without one it obeys the request of any web page in a browser on the same
+machine.
 """
 
 from __future__ import annotations
 
 import argparse
+import secrets
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -29,6 +34,7 @@ KEYS = Path("keys/ground")
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
 """Yamcs's service for files, and its buckets, which are folders: of those that came and of those that go."""
 _LOOPBACK = "127.0.0.1"
+_SECRET_BYTES = 16
 
 _SERVER = """\
 services:
@@ -38,8 +44,15 @@ instances: [{instance}]
 buckets: [{{name: {down}, path: {folder}/{down}}}, {{name: {up}, path: {folder}/{up}}}]
 dataDir: {data}
 cacheDir: {data}/cache
-secretKey: {instance}
+secretKey: {secret}
 """
+
+_SECURITY = """\
+enabled: true
+authModules: [{class: org.yamcs.security.YamlAuthModule}]
+"""
+USERS, USER = "etc/users.yaml", "admin"
+"""File with the password, and the user, whom Yamcs gives a password known to all if the file has none."""
 
 _INSTANCE = """\
 services:
@@ -172,7 +185,13 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = K
     host, port = host_port(gateway)
     buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
-        host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data", folder=folder, **buckets
+        host=_LOOPBACK,
+        http=http_port,
+        instance=INSTANCE,
+        data=folder / "data",
+        folder=folder,
+        secret=secrets.token_hex(_SECRET_BYTES),
+        **buckets,
     )
     instance = _INSTANCE.format(
         gateway_host=host,
@@ -191,6 +210,8 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = K
     header = f"{UP:04X}C0000000{VERSION:02X}" + "00" * (SECONDARY_BYTES - 1)
     return {
         "etc/yamcs.yaml": server,
+        "etc/security.yaml": _SECURITY,
+        USERS: f'{USER}: {{password: "{secrets.token_hex(_SECRET_BYTES)}", superuser: true}}\n',
         "etc/files.sql": _STREAMS.format(before=before, down=DOWN, space=SPACE, header=header),
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
@@ -216,6 +237,8 @@ def write(
         for name, text in contents.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch(mode=0o600)
+            path.chmod(0o600)
             path.write_text(text, encoding="utf-8")
         for name in ("data", DOWN_BUCKET, UP_BUCKET):
             (folder / name).mkdir(exist_ok=True)
@@ -239,6 +262,7 @@ def main() -> None:
     parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
     options = parser.parse_args()
     write(options.folder, options.gateway, options.http, options.epoch, options.keys)
+    sys.stdout.write(f"Yamcs asks for user and password: {USER}, and the one in {options.folder / USERS}\n")
 
 
 if __name__ == "__main__":

@@ -6,13 +6,17 @@
 from __future__ import annotations
 
 import json
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import pytest
 
-from ground.yamcs import files, main
+from ground.xtce import SPACE
+from ground.yamcs import INSTANCE, USER, files, main, write
+from tests.studies.interop.linked_flight import free_port
 from tests.studies.interop.yamcs import PLANS, fly
-from tests.studies.interop.yamcs_server import missing
+from tests.studies.interop.yamcs_server import basic, missing, serving
 
 
 def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,6 +24,29 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
     main()
     written = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert written == set(files(tmp_path, "127.0.0.1:1", 1, "2026-11-23T12:00:00"))
+    assert {path.stat().st_mode & 0o077 for path in tmp_path.rglob("*") if path.is_file()} == {0}, "passwords"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+def test_yamcs_does_not_obey_a_web_page_that_has_no_password(tmp_path: Path) -> None:
+    """A browser sends a page's text/plain to any port of loopback; Yamcs reads it as a command."""
+    http = free_port()
+    write(tmp_path, f"127.0.0.1:{free_port()}", http)
+    with serving(tmp_path, http) as server:
+        url = f"{server.url}/processors/{INSTANCE}/realtime/commands/{SPACE}/ping"
+        found = []
+        for credentials in ({}, {"Authorization": basic(USER)}, {"Authorization": server.credentials}):
+            headers = {"Content-Type": "text/plain", "Origin": "http://evil.example", **credentials}
+            request = urllib.request.Request(url, b'{"args": {"number": "3"}}', headers)
+            opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+            try:
+                with opener.open(request, timeout=60.0) as answer:
+                    found.append(answer.status)
+            except urllib.error.HTTPError as error:
+                error.close()
+                found.append(error.code)
+    assert found == [401, 401, 200]
 
 
 @pytest.mark.slow

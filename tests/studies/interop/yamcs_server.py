@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
 import json
+import re
 import shutil
 import subprocess
 import time
@@ -17,7 +19,7 @@ from typing import Any
 from urllib.parse import quote
 
 from ground.xtce import SPACE
-from ground.yamcs import INSTANCE, LINK_SOURCE
+from ground.yamcs import INSTANCE, LINK_SOURCE, USER, USERS
 
 _BUNDLE = "fprime_yamcs_bundle"
 _START_S = 120.0
@@ -72,7 +74,7 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
     with log.open("w") as out:
         process = subprocess.Popen(words(folder), stdout=out, stderr=subprocess.STDOUT)
     try:
-        server = Yamcs(f"http://127.0.0.1:{http_port}/api", process, log)
+        server = Yamcs(f"http://127.0.0.1:{http_port}/api", process, log, _credentials(folder))
         server.wait()
         yield server
     finally:
@@ -84,6 +86,17 @@ def serving(folder: Path, http_port: int) -> Iterator[Yamcs]:
             process.wait()
 
 
+def basic(password: str) -> str:
+    """Return the header by which the user states a password."""
+    return "Basic " + base64.b64encode(f"{USER}:{password}".encode()).decode()
+
+
+def _credentials(folder: Path) -> str:
+    found = re.search(r'password: "(\w+)"', (folder / USERS).read_text(encoding="utf-8"))
+    assert found is not None
+    return basic(found[1])
+
+
 @dataclass(frozen=True)
 class Yamcs:
     """A running Yamcs."""
@@ -91,6 +104,7 @@ class Yamcs:
     url: str
     process: subprocess.Popen[bytes]
     log: Path
+    credentials: str
 
     def wait(self) -> None:
         """Wait until the instance runs. Raises RuntimeError with the end of its log where it does not."""
@@ -111,7 +125,8 @@ class Yamcs:
     def raw(self, path: str, body: dict[str, Any] | None = None) -> bytes:
         """Return the bytes of an answer."""
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, data, {"Content-Type": "application/json"})
+        headers = {"Content-Type": "application/json", "Authorization": self.credentials}
+        request = urllib.request.Request(self.url + path, data, headers)
         opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         with opener.open(request, timeout=_LONGEST_S) as answer:
             return bytes(answer.read())
