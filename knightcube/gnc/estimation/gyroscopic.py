@@ -12,10 +12,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import cross_matrices
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 
 _FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
 """Axes of the six products: xx, yy, zz, yz, zx, xy."""
@@ -63,8 +63,9 @@ def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
     drawn = moments * (1.0 + errors.moments * generator.uniform(-1.0, 1.0, (_DRAWS, 3)))
     drawn = drawn[2.0 * drawn.max(axis=1) < drawn.sum(axis=1)]
     count = len(drawn)
-    turned = expm(cross_matrices(errors.axes * generator.uniform(-1.0, 1.0, (count, 3)))) @ axes
-    tensors = np.einsum("nij,nj,nkj->nik", turned, drawn, turned)
+    turns = from_rotation_vector(errors.axes * generator.uniform(-1.0, 1.0, (count, 3)))
+    principal = attitude_matrix(turns) @ axes
+    tensors = np.einsum("nij,nj,nkj->nik", principal, drawn, principal)
     gyro = errors.gyro_alignment * generator.uniform(-1.0, 1.0, (count, 3, 3))
     gyro[:, range(3), range(3)] = 1.0 + errors.gyro_scale * generator.uniform(-1.0, 1.0, (count, 3))
     back = np.linalg.inv(gyro)
