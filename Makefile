@@ -62,14 +62,14 @@ lint: $(READY)  ## style
 types: $(READY) ## strict types
 	$(VENV)/bin/mypy
 
-arrows: $(READY) ## the architecture's import arrows
+arrows: $(READY) ## which package may import which
 	$(VENV)/bin/lint-imports --no-cache
 
 docs: $(READY)  ## the documentation site, strict, into build/site
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
 	$(RUN) -m tests.docs.built_site build/site
 
-house: $(READY) ## rooms, floors, arrows and sizes, drawn from the source
+house: $(READY) ## packages, layers, imports and sizes, drawn from the source
 	$(RUN) -m tests.studies.house
 
 unit: $(READY)  ## the tests, on all cores

@@ -1,7 +1,7 @@
 """A FITS header of world coordinates: tangent plane with polynomials for the distortion (TAN-SIP).
 
 Calabretta & Greisen 2002, section 5.1.3; Shupe et al. 2005 (SIP). FITS counts pixels from 1, and rows as they
-stand in the file. Written by hand: sixty lines against a library of the size of this house.
+stand in the file. Written by hand: sixty lines against a library larger than this repository.
 """
 
 from __future__ import annotations
