@@ -70,7 +70,7 @@ def draw_comparison(first: Run, second: Run, folder: Path) -> Path:
     for ax, label, title in zip(
         axes,
         ("$q_2$", "rate, mrad/s", "power, mW"),
-        ("Attitude", "Rate", "Average coil power so far"),
+        ("Attitude", "Rate", "Average supply power of the coils so far"),
         strict=True,
     ):
         panels.style(ax, label, title, "" if ax is not axes[-1] else "mission time, s")

@@ -108,40 +108,41 @@ def current(ax: Axes, scene: Scene) -> None:
 
 
 def power(ax: Axes, scene: Scene) -> None:
-    """Draw R I^2 with its average so far and the thesis's 0.10 W (Sease Figure 5.11)."""
+    """Draw the supply power V |I| and its average so far beside the thesis's 0.10 W (Sease Figure 5.11)."""
     found = scene.power
     if found is None:
         return
     time, spans = found.time, found.spans
-    average = np.cumsum(found.power * spans) / np.cumsum(spans)
-    ax.fill_between(time, found.power, step="post", color=BLUE, alpha=0.35, linewidth=0.0)
-    ax.step(time, found.power, where="post", color=BLUE, linewidth=0.7, label="$R I^2$")
+    average = np.cumsum(found.supply * spans) / np.cumsum(spans)
+    heat = found.energy / found.duration
+    ax.fill_between(time, found.supply, step="post", color=BLUE, alpha=0.35, linewidth=0.0)
+    ax.step(time, found.supply, where="post", color=BLUE, linewidth=0.7, label="supply, $V |I|$")
     ax.plot(
         time + spans,
         average,
         color=BLACK,
         linewidth=1.6,
-        label=f"average so far, {1e3 * average[-1]:.1f} mW at the end",
+        label=f"average so far, at last {1e3 * average[-1]:.1f} mW (heat {1e3 * heat:.1f} mW)",
     )
     ax.axhline(
         limits.AVERAGE_POWER_LIMIT_W,
         color=VERMILLION,
         linewidth=1.2,
         linestyle=(0, (5, 2)),
-        label="the thesis's average, 0.10 W",
+        label="thesis, 0.10 W",
     )
     ax.set_ylim(bottom=0.0)
-    style(ax, "power, W", "Coil power")
+    style(ax, "power, W", "Power from the coils' supply")
     legend(ax)
 
 
 def compared(axes: Sequence[Axes], scene: Scene, name: str, colour: str) -> None:
-    """Draw q2, the rate and the average power so far of one run of several into three axes."""
+    """Draw q2, the rate and the average supply power so far of one run of several into three axes."""
     flown, power = scene.flown, scene.power
     axes[0].plot(flown.time, flown.q2, color=colour, linewidth=1.4, label=name)
     axes[1].plot(flown.time, 1e3 * flown.rate, color=colour, linewidth=1.0, label=name)
     if power is not None:
-        average = np.cumsum(power.power * power.spans) / np.cumsum(power.spans)
+        average = np.cumsum(power.supply * power.spans) / np.cumsum(power.spans)
         axes[2].plot(power.time + power.spans, 1e3 * average, color=colour, linewidth=1.4, label=name)
 
 

@@ -119,7 +119,7 @@ def _mean_power(power: CoilPower | None, begin: float, end: float) -> float:
         return math.nan
     inside = (power.time >= begin) & (power.time < end)
     spans = power.spans[inside]
-    return float(power.power[inside] @ spans / spans.sum()) if inside.any() else math.nan
+    return float(power.heat[inside] @ spans / spans.sum()) if inside.any() else math.nan
 
 
 def _rms(values: FloatArray) -> float:

@@ -26,20 +26,24 @@ class Attitude:
 
 @dataclass(frozen=True)
 class CoilPower:
-    """What the coils consumed.
+    """Power that the coils' supply delivered, and heat in the coils.
+
+    The bridges chop the supply, which delivers V |I|: V is the supply voltage at the coils, I the mean
+    current of a PWM period. The thesis's 0.10 W is a supply power and is compared with V |I|. R I^2, the
+    thesis's cost function, is smaller at every current below the largest.
 
     Attributes:
         time: (n,) s, the beginning of each interval; the last one ends at `end`.
         end: s.
-        power: (n,) W, mean of R I^2 over each interval, I the mean of the PWM period.
-        supply: (n,) W, mean of V |I| likewise.
+        supply: (n,) W, mean of V |I| over each interval.
+        heat: (n,) W, mean of R I^2 over each interval.
         source: "truth", or "written" for the currents on the wire.
     """
 
     time: FloatArray
     end: float
-    power: FloatArray
     supply: FloatArray
+    heat: FloatArray
     source: str
 
     @property
@@ -50,7 +54,7 @@ class CoilPower:
     @property
     def energy(self) -> float:
         """The integral of R I^2, J."""
-        return float(self.power @ self.spans)
+        return float(self.heat @ self.spans)
 
     @property
     def duration(self) -> float:
@@ -100,9 +104,9 @@ def _true_power(truth: PacketArray) -> CoilPower | None:
     if len(time) < 2 or not np.all(np.diff(time) > 0.0):
         return None
     spans = np.diff(time)
-    power = np.diff(truth["energy"]) / spans
+    heat = np.diff(truth["energy"]) / spans
     supply = np.diff(truth["supply_energy"]) / spans
-    return CoilPower(time[:-1], float(time[-1]), power, supply, "truth")
+    return CoilPower(time[:-1], float(time[-1]), supply, heat, "truth")
 
 
 def _written_power(control: PacketArray, run: PacketArray) -> CoilPower | None:
@@ -112,6 +116,6 @@ def _written_power(control: PacketArray, run: PacketArray) -> CoilPower | None:
         return None
     resistance = np.nan_to_num(run["coil_resistance"][0].astype(float))
     current = control["current_written"][:-1].astype(float)
-    power = current**2 @ resistance
+    heat = current**2 @ resistance
     supply = float(run["supply_voltage"][0]) * np.sum(np.abs(current), axis=1)
-    return CoilPower(time[:-1], float(time[-1]), power, supply, "written")
+    return CoilPower(time[:-1], float(time[-1]), supply, heat, "written")

@@ -217,11 +217,12 @@ def _power(power: Object, compared: bool) -> list[str]:
     average, peak = thesis if compared else ("", "")
     return [
         f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
-        f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW{average}",
-        f"  peak R I^2      {number(power['peak_w'], 3)} W{peak}",
-        f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average at the coils, "
-        f"{number(power['bus_average_w'], 1, 1e3)} mW at the bus (monitor, once a second)",
-        f"  energy          {number(power['energy_j'], 3)} J",
+        f"  supply, V |I|   {number(power['supply_average_w'], 1, 1e3)} mW on average at the coils{average}",
+        f"                  {number(power['bus_average_w'], 1, 1e3)} mW on average at the bus "
+        "(monitor, once a second)",
+        f"                  {number(power['supply_peak_w'], 3)} W at most{peak}",
+        f"  heat, R I^2     {number(power['average_w'], 3, 1e3)} mW on average, "
+        f"{number(power['peak_w'], 3)} W at most, {number(power['energy_j'], 3)} J in all",
         f"  largest current {', '.join(largest)}",
     ]
 

@@ -65,7 +65,7 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any])
     assert max(step["overshoot_percent"] for step in steps) < 20.0
     assert max(step["rise_s"] for step in steps[1:]) < 8.0
     assert max(step["settling_s"] for step in steps) < 30.0
-    assert summary["power"]["average_w"] < 0.10
+    assert summary["power"]["bus_average_w"] < 0.10
 
 
 @pytest.mark.slow

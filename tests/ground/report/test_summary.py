@@ -66,21 +66,30 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
         "overshoot": (20.0, "%"),
         "rise time": (8.0, "s"),
         "settling time": (30.0, "s"),
-        "average power": (0.10, "W"),
+        "average supply power": (0.10, "W"),
         "largest current": (0.148, "A"),
     }
     assert {row["verdict"] for row in rows.values()} == {"pass"}
     assert rows["overshoot"]["worst"] == pytest.approx(OVERSHOOT, abs=0.05)
 
 
-def test_power_is_the_mean_of_r_i_squared_from_the_true_energy(full: Run) -> None:
+def test_supply_power_is_v_i_and_heat_r_i_squared_from_the_true_energies(full: Run) -> None:
     """A tenth of the time at 0.1 A."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
     assert power["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
     assert power["peak_w"] == pytest.approx(RESISTANCE * CURRENT**2, rel=1e-6)
     assert power["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
+    assert power["supply_peak_w"] == pytest.approx(VOLTAGE * CURRENT, rel=1e-6)
     assert power["peak_current_a"] == CURRENT
+
+
+def test_the_thesis_s_power_is_compared_with_the_supply_power(full: Run) -> None:
+    summary = summarise(full)
+    rows = {row["quantity"]: row for row in summary["thesis"]}
+    assert rows["average supply power"]["worst"] == summary["power"]["supply_average_w"]
+    (line,) = [line for line in format_report(summary).splitlines() if "on the order of 100 mW" in line]
+    assert line.split()[:3] == ["supply,", "V", "|I|"]
 
 
 def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) -> None:
@@ -121,7 +130,7 @@ def test_a_run_without_targets_has_no_steps_and_unknown_verdicts(tmp_path: Path)
     assert summary["steps"] == []
     verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
     assert verdicts["rise time"] == verdicts["overshoot"] == "unknown"
-    assert verdicts["average power"] == "pass"
+    assert verdicts["average supply power"] == "pass"
     assert "no target packets: no steps to judge" in summary["notes"]
 
 
@@ -176,13 +185,14 @@ def test_a_figure_beyond_the_thesis_is_a_miss(tmp_path: Path) -> None:
     for i in range(100):
         log.write(
             packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0, 0), current=(0.2, 0, 0),
-                        energy=0.11 * 0.025 * i, supply_energy=0.0)
+                        energy=0.01 * 0.025 * i,
+                        supply_energy=0.11 * 0.025 * i)
         )  # fmt: skip
     log.close()
     make_run(tmp_path, Recipe(duration=2.0, truth=False))
     rows = {row["quantity"]: row for row in summarise(read_run(tmp_path))["thesis"]}
-    assert rows["average power"]["verdict"] == "miss"
-    assert rows["average power"]["worst"] == pytest.approx(0.11)
+    assert rows["average supply power"]["verdict"] == "miss"
+    assert rows["average supply power"]["worst"] == pytest.approx(0.11)
 
 
 def test_a_run_without_its_identity_is_still_reported(tmp_path: Path) -> None:
@@ -271,7 +281,7 @@ def test_the_summary_is_strict_json(tmp_path: Path, changes: dict[str, object]) 
 def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     text = format_report(summarise(full))
     assert "3  -0.100 -> +0.000" in text
-    for row in ("steady-state error", "overshoot", "rise time", "settling time", "average power"):
+    for row in ("steady-state error", "overshoot", "rise time", "settling time", "average supply power"):
         (line,) = [line for line in text.splitlines() if line.strip().startswith(row)]
         assert line.endswith("pass")
     assert "planner: 3 jobs (done 3)" in text

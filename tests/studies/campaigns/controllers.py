@@ -189,8 +189,8 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     floor = clairvoyant_power(this_loop(), demo_world())
     facts: dict[str, Any] = {"clairvoyant_w": floor, "controllers": {}}
     head = "".join(f"{label:>14}" for _, label in FIGURES)
-    lines = [f"{'':22}{'R I^2, mW':>11}{'V |I|, mW':>11}{'over floor':>12}{head}{'on its testbed':>16}"]
-    lines.append(f"{'clairvoyant optimum':22}{1e3 * floor:11.2f}{'-':>11}{1.0:12.3f}")
+    lines = [f"{'':22}{'R I^2, mW':>11}{'V |I|, mW':>11}{'thesis, V |I|':>15}{'over floor':>12}{head}"]
+    lines.append(f"{'clairvoyant optimum':22}{1e3 * floor:11.2f}{'-':>11}{'-':>15}{1.0:12.3f}")
     for name in CONTROLLERS:
         own = [result for result in results if result["controller"] == name]
         power = float(np.mean([result["power_w"] for result in own]))
@@ -204,9 +204,9 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             **{key: value if np.isfinite(value) else None for key, value in worst.items()},
         }
         figures = "".join(f"{worst[key]:14.3f}" for key, _ in FIGURES)
-        thesis = f"{1e3 * THESIS_W[name]:13.0f} mW" if name in THESIS_W else f"{'-':>16}"
+        thesis = f"{1e3 * THESIS_W[name]:15.0f}" if name in THESIS_W else f"{'-':>15}"
         lines.append(
-            f"{name:22}{1e3 * power:11.2f}{1e3 * supply:11.2f}{power / floor:12.3f}{figures}{thesis}"
+            f"{name:22}{1e3 * power:11.2f}{1e3 * supply:11.2f}{thesis}{power / floor:12.3f}{figures}"
         )
     picture = _draw(facts, folder / "controllers.png")
     return Summary("\n".join(lines) + "\n", facts, (picture,))
@@ -223,7 +223,7 @@ def _draw(facts: dict[str, Any], path: Path) -> Path:
         if found["settling_s"] is not None:
             axes.plot(found["settling_s"], 1e3 * found["power_w"], "o", label=name)
     axes.set_xlabel("settling time, worst step (s)")
-    axes.set_ylabel("average coil power (mW)")
+    axes.set_ylabel("average heat in the coils, $R I^2$ (mW)")
     axes.set_ylim(bottom=0.0)
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=110)
