@@ -1,4 +1,4 @@
-"""`coils-off`: the coils zeroed without the flight software, where it last reached them or by the unit."""
+"""`coils-off`: the coils zeroed without the flight software, where it last reached them and by the unit."""
 
 from __future__ import annotations
 
@@ -6,12 +6,19 @@ import os
 import shutil
 import stat
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL
+from hal.buses import smbus_byte
+from hal.drivers.pca9685 import ALL_LED_OFF_H, AUTO_INCREMENT, CHANNELS, FULL, LED0_ON_L, MODE1
 from hal.guardian.client import CoilReach
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus
+from sim_hal.emulators.pca9685 import EmulatedPca9685
+from sim_hal.serving.i2c_server import I2cServer
+from sim_hal.serving.preload import library
 from tests.deploy.scripts import DEPLOY
 
 
@@ -30,20 +37,35 @@ class Tools:
         )
         tool.chmod(0o755)
 
-    def run(self, **environment: str) -> tuple[int, list[str], str]:
-        done = subprocess.run(
+    def emulate(self, bus: Path) -> None:
+        """Have python3 open the bus served at a socket as /dev/i2c-7; there is no i2cset."""
+        shutil.copy(Path(smbus_byte.__file__), self.folder)
+        self.put("i2cset", 1)
+        (self.folder / "bin/python3").write_text(
+            f"#!/bin/sh\nexport LD_PRELOAD={library()} KNIGHTCUBE_I2C={bus} KNIGHTCUBE_I2C_BUS=7\n"
+            f'exec {sys.executable} "$@"\n',
+            encoding="utf-8",
+        )
+        (self.folder / "bin/python3").chmod(0o755)
+
+    def start(self, **environment: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
             [str(self.folder / "coils-off")],
             env={
                 "PATH": f"{self.folder}/bin:{os.environ['PATH']}",
                 "STATE_DIRECTORY": str(self.folder),
                 **environment,
             },
-            capture_output=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             text=True,
-            check=False,
         )
+
+    def run(self, **environment: str) -> tuple[int, list[str], str]:
+        with self.start(**environment) as process:
+            said = process.communicate(timeout=60)[1]
         calls = (self.folder / "calls").read_text(encoding="utf-8").splitlines()
-        return done.returncode, calls, done.stderr
+        return process.returncode, calls, said
 
 
 @pytest.fixture
@@ -74,29 +96,107 @@ def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
     assert "the coils may be driven" in output
 
 
-def test_the_bus_and_address_last_flown_count_more_than_the_units(tools: Tools) -> None:
+def test_the_units_address_and_the_one_last_flown_are_both_written(tools: Tools) -> None:
     tools.put("i2cset", 0)
-    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")[1][-1].startswith(
-        "i2cset -y 3 0x41 "
-    )
     CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
-    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")[1][-1].startswith("i2cset -y 7 0x42 ")
+    status, calls, said = tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")
+    assert (status, said) == (0, "")
+    assert sorted(calls) == ["i2cset -y 3 0x41 0xfd 0x10 b", "i2cset -y 7 0x42 0xfd 0x10 b"]
 
 
-def test_a_note_of_another_board_is_followed_by_the_units_word(tools: Tools) -> None:
-    """The bus of the note is not there: the chip is found where the unit says, in the very first try."""
+def test_an_address_that_the_unit_and_the_note_share_is_written_once(tools: Tools) -> None:
+    tools.put("i2cset", 0)
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-3", 0x41).note(tools.folder)
+    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")[1] == [
+        "i2cset -y 3 0x41 0xfd 0x10 b"
+    ]
+
+
+def test_an_address_that_hangs_keeps_the_other_from_nothing(tools: Tools) -> None:
     (tools.folder / "bin/i2cset").write_text(
-        f'#!/bin/sh\necho "$*" >>"{tools.folder}/calls"\n[ "$2" = 3 ]\n', encoding="utf-8"
+        f'#!/bin/sh\necho "$3" >>"{tools.folder}/calls"\n'
+        f'[ "$3" = 0x42 ] || exit 0\nuntil [ -e "{tools.folder}/end" ]; do sleep 0.02; done\n',
+        encoding="utf-8",
     )
     (tools.folder / "bin/i2cset").chmod(0o755)
-    tools.put("python3", 1)
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
-    status, calls, _ = tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")
-    assert status == 0
-    assert [call.split()[:3] for call in calls if not call.startswith("python3")] == [
-        ["-y", "7", "0x42"],
-        ["-y", "3", "0x41"],
-    ]
+    for hanging, other in (("note", "unit"), ("unit", "note")):
+        addresses = {hanging: 0x42, other: 0x41}
+        CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", addresses["note"]).note(tools.folder)
+        with tools.start(KNIGHTCUBE_PWM=f"0x{addresses['unit']:02x}") as process:
+            calls = tools.folder / "calls"
+            while not calls.exists() or sorted(calls.read_text(encoding="ascii").split()) != ["0x41", "0x42"]:
+                assert process.poll() is None
+                time.sleep(0.01)
+            (tools.folder / "end").touch()
+            assert process.wait(60) == 0
+        for name in ("end", "calls"):
+            (tools.folder / name).unlink()
+
+
+class Chips:
+    """Two PWM chips that drive all their channels, on an emulated bus which programs open as /dev/i2c-7."""
+
+    ADDRESSES = (0x40, 0x41)
+
+    def __init__(self, folder: Path) -> None:
+        self._chips = [EmulatedPca9685(address, time.monotonic_ns) for address in self.ADDRESSES]
+        for chip in self._chips:
+            chip.write(chip.address, bytes([MODE1, AUTO_INCREMENT]))
+            chip.write(chip.address, bytes([LED0_ON_L, *[0, FULL, 0, 0] * CHANNELS]))
+        self.bus = EmulatedI2cBus(self._chips)
+        self.server = I2cServer(self.bus, folder / "bus.sock")
+
+    def driving(self) -> list[int]:
+        """Return the addresses of the chips of which an output is on."""
+        return [chip.address for chip in self._chips if any(map(chip.duty, range(CHANNELS)))]
+
+
+@pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler builds the preload library"
+)
+@pytest.mark.parametrize(
+    ("note", "unit", "refusals", "left", "status"),
+    [
+        (0x40, 0x41, 0, [], 0),
+        (0x41, 0x40, 0, [], 0),
+        (0x40, 0x42, 0, [0x41], 0),
+        (0x42, 0x41, 0, [0x40], 0),
+        (0x40, 0x41, 3, [], 0),
+        (0x41, 0x40, 3, [], 0),
+        (0x42, 0x43, 0, [0x40, 0x41], 1),
+    ],
+)
+def test_of_the_known_addresses_each_that_acknowledges_is_off_whatever_another_does(
+    tools: Tools, note: int, unit: int, refusals: int, left: list[int], status: int
+) -> None:
+    """A chip may refuse its first bytes; an address without a chip never acknowledges."""
+    chips = Chips(tools.folder)
+    assert chips.driving() == list(chips.ADDRESSES)
+    if refusals:
+        chips.bus.nack(0x41, refusals)
+    tools.emulate(tools.folder / "bus.sock")
+    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", note).note(tools.folder)
+    process = tools.start(KNIGHTCUBE_I2C="/dev/i2c-7", KNIGHTCUBE_PWM=f"0x{unit:02x}")
+    while process.poll() is None:
+        chips.server.serve(0.02)
+    chips.server.close()
+    said = process.communicate()[1]
+    assert chips.driving() == left
+    assert process.returncode == status
+    for address in (note, unit):
+        absent = address not in chips.ADDRESSES
+        assert (f"the PWM chip at 0x{address:02x} on /dev/i2c-7 does not answer" in said) == absent
+
+
+@pytest.mark.parametrize("kind", ["FIFO", "sparse"])
+def test_a_note_without_an_end_keeps_nothing_from_the_units_address(tools: Tools, kind: str) -> None:
+    tools.put("i2cset", 0)
+    if kind == "FIFO":
+        os.mkfifo(tools.folder / "coils")
+    else:
+        (tools.folder / "coils").touch()
+        os.truncate(tools.folder / "coils", 1 << 40)
+    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")[1] == ["i2cset -y 3 0x40 0xfd 0x10 b"]
 
 
 @pytest.mark.parametrize("half", ["", "/dev/i2c-7", "/dev/i2c-7 0x", "\0\0\0\0", "7 0x42\n"])
