@@ -1,9 +1,9 @@
-"""Chooses the release that flies, and becomes it: `releases.py fly CONFIG ...`, run by `fly`.
+"""Chooses the release that flies: `releases.py choose`, run by `fly`, prints its name and the reason.
 
 Releases stand side by side in /opt/knightcube/releases; `current` and `previous` are links to two of them.
 The current release flies, unless it is damaged and the previous one is whole, or it is new and `UNCLEAN`
 starts ended before it was proven: then the previous release flies, and reports why. A flight proves its
-release by flying for a minute. Nothing here may keep a board from flying: whatever fails, one is started.
+release by flying for a minute. `fly` chooses a release itself if this program fails.
 
 `releases.py verify` reads every file of both releases. Standard library only: any Python runs it.
 """
@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -24,7 +25,8 @@ UNCLEAN = 3
 MANIFEST, TRIALS = "manifest", "releases.json"
 DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
 """What reading a record raises that holds anything: another shape, `Infinity`, a deep nest."""
-NAME, NOTE = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE"
+LARGEST_RECORD, LARGEST_MANIFEST = 1 << 16, 1 << 24
+"""Bytes of the largest files that are read."""
 _OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|sim_hal)/")
 
 
@@ -52,13 +54,14 @@ def damage(release: Path, thorough: bool = False) -> str:
     Our own files are read, those of libraries only compared in size unless `thorough`.
     """
     try:
-        first, _, rest = (release / MANIFEST).read_text(encoding="utf-8").partition("\n")
+        first, _, rest = _text(release / MANIFEST, LARGEST_MANIFEST).partition("\n")
         if hashlib.sha256(rest.encode()).hexdigest() != first:
             return "its manifest is damaged"
         for line in rest.splitlines():
             expected, size, name = line.split(" ", 2)
             path = release / name
-            if path.stat().st_size != int(size):
+            found = path.stat()
+            if not stat.S_ISREG(found.st_mode) or found.st_size != int(size):
                 return f"{name} has another size"
             if (thorough or _OURS.match(name)) and _sum(path) != expected:
                 return f"{name} is damaged"
@@ -70,6 +73,19 @@ def damage(release: Path, thorough: bool = False) -> str:
 def _sum(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _text(path: Path, largest: int) -> str:
+    """Return the text of a file.
+
+    Raises OSError for a FIFO, which would never end, and for a file of more than `largest` bytes, such as a
+    sparse one, which would fill the memory. Raises ValueError for text that is not UTF-8.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), encoding="utf-8") as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode) or found.st_size > largest:
+            raise OSError(f"{path} is not a regular file of at most {largest} bytes")
+        return file.read()
 
 
 def linked(prefix: Path, link: str) -> Path | None:
@@ -90,7 +106,7 @@ class Trials:
         self.proven: list[str] = []
         # Whatever stands in the file, the flight starts: a damaged count is no count.
         with suppress(OSError, *DAMAGED):
-            kept = json.loads(self._path.read_text(encoding="utf-8"))
+            kept = json.loads(_text(self._path, LARGEST_RECORD))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
             self.proven = [str(name) for name in kept["proven"]]
             self.starts = starts
@@ -106,6 +122,7 @@ class Trials:
         self.starts[release.name] = min(self.starts.get(release.name, 0) + 1, UNCLEAN)
         with suppress(OSError):
             beside = self._path.with_suffix(".part")
+            beside.unlink(missing_ok=True)  # a FIFO of this name would block the next line
             with beside.open("w", encoding="utf-8") as file:
                 json.dump({"starts": self.starts, "proven": self.proven}, file)
                 file.flush()
@@ -113,51 +130,45 @@ class Trials:
             beside.replace(self._path)
 
 
-def choose(prefix: Path, trials: Trials) -> tuple[list[Path], str]:
-    """Return the releases to try, the best first, and the reason where the current one is not the first."""
-    found = [release for link in ("current", "previous") if (release := linked(prefix, link)) is not None]
+def choose(prefix: Path, trials: Trials) -> tuple[Path | None, str]:
+    """Return the release that flies, and why where it is not the current one or is damaged."""
+    current, previous = linked(prefix, "current"), linked(prefix, "previous")
+    found = [release for release in (current, previous) if release is not None]
     if not found:
-        return [], ""
-    current, reasons = found[0], []
-    if len(found) > 1 and trials.failed(current) and not trials.failed(found[1]):
-        reasons.append(f"release {current.name} ended {UNCLEAN} times before it was proven")
+        return None, ""
+    reasons = [] if current is not None else ["the link current names no complete release"]
+    if len(found) > 1 and trials.failed(found[0]) and not trials.failed(found[1]):
+        reasons.append(f"release {found[0].name} ended {UNCLEAN} times before it was proven")
         found.reverse()
-    for number, release in enumerate(found):
+    chosen = found[0]
+    for release in found:
         if not (problem := damage(release)):
-            found.insert(0, found.pop(number))
+            chosen = release
             break
         reasons.append(f"release {release.name}: {problem}")
-    return found, "; ".join([*reasons, f"{found[0].name} flies"]) if reasons else ""
+    return chosen, "; ".join([*reasons, f"{chosen.name} flies"]) if reasons else ""
 
 
-def fly(prefix: Path, arguments: list[str], environment: Mapping[str, str]) -> int:
-    """Become the flight; return only where no release can be started."""
-    state = Path(environment.get("STATE_DIRECTORY", "/var/lib/knightcube").split(":")[0])
-    trials = Trials(state)
-    try:
-        releases, note = choose(prefix, trials)
-        if releases:
-            trials.count(releases[0])
-    except Exception as error:  # noqa: BLE001 - whatever is wrong here, the current release flies
-        releases, note = [], f"the choice of a release failed: {error}"
-    if note:
-        sys.stderr.write(f"fly: {note}\n")
-    for release in (*releases, prefix / "current", prefix / "previous"):
-        python = str(release / "venv/bin/python")
-        words = {NAME: release.name, NOTE: note}
-        with suppress(OSError):
-            os.execve(python, [python, "-m", "flight", "run", *arguments], {**environment, **words})
-    sys.stderr.write(f"fly: no release in {prefix} can be started\n")
-    return 1
+def answer(prefix: Path, environment: Mapping[str, str]) -> int:
+    """Print the name of the release that flies and the reason, then count the start; return 1 without one."""
+    trials = Trials(Path(environment.get("STATE_DIRECTORY", "/var/lib/knightcube").split(":")[0]))
+    release, note = choose(prefix, trials)
+    if release is None:
+        return 1
+    # Printed before the count, which waits for the disk: `fly` may end this process at any time.
+    sys.stdout.write(f"{release.name} {note}\n")
+    sys.stdout.flush()
+    trials.count(release)
+    return 0
 
 
 def main(words: list[str]) -> int:
-    """Fly, or verify both releases; 2 for wrong use."""
+    """Choose a release, or verify both; return the exit status, 2 for wrong use."""
     prefix = Path(__file__).resolve().parent.parent
-    if words[:1] == ["fly"]:
-        return fly(prefix, words[1:], os.environ)
+    if words == ["choose"]:
+        return answer(prefix, os.environ)
     if words != ["verify"]:
-        sys.stderr.write("usage: releases.py fly CONFIG [OPTIONS] | releases.py verify\n")
+        sys.stderr.write("usage: releases.py choose | releases.py verify\n")
         return 2
     problems = 0
     for link in ("current", "previous"):

@@ -1,7 +1,7 @@
 """The release that a board flies: proves it after a minute of flight, and reports why another one was left.
 
-`deploy/releases.py` chooses the release before any of this runs, counts its starts in the same file of the
-state folder, and passes its name and its reasons in the environment.
+`deploy/releases.py` chooses the release before any of this runs and counts its starts in the same file of the
+state folder; `deploy/fly` passes the name of the release and the reasons in the environment.
 """
 
 from __future__ import annotations
@@ -63,6 +63,6 @@ class Release:
 def _proven(path: Path) -> list[str]:
     """Return the releases that were proven; none where the file is missing or damaged."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
-        kept: dict[str, Any] = json.loads(path.read_bytes())
+        kept: dict[str, Any] = json.loads(LinuxFiles().read(path) or b"")
         return [str(name) for name in kept["proven"]]
     return []

@@ -154,19 +154,18 @@ def _devices_closed() -> bool:
 
 
 def _broken(service: Service) -> dict[str, Any]:
-    """Take the release away: the safe state takes over; give it back: the safe state tries the flight."""
+    """Take the releases away: the safe state takes over; give them back: the safe state tries the flight."""
     systemctl("reset-failed", SERVICE)
     systemctl("start", SERVICE)
     wait(service.driven, 20.0)
-    current = Path("/opt/knightcube/current")
-    release = current.readlink()
-    current.unlink()
+    releases = Path("/opt/knightcube/releases")
+    away = releases.rename(releases.with_name("away"))
     systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE)
     wait(lambda: service.show("ActiveState") == "failed", 20.0)
     safe = "knightcube-safe.service"
     wait(lambda: service.show("ActiveState", safe) == "activating", 10.0)
     wait(lambda: not service.driven(), 10.0)
-    current.symlink_to(release)
+    away.rename(releases)
     wait(service.driven, 90.0)
     ended = service.show("ActiveState", safe) != "activating"
     systemctl("stop", SERVICE)

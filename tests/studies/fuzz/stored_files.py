@@ -149,16 +149,16 @@ def releases() -> DoorTarget:
     def enter(files: Files, whole: bool) -> str:
         place = folder.fill(files)
         found, note = chooser.choose(place, chooser.Trials(place))
-        if len(found) != len(names):
-            raise Finding("a release was given up")
-        sound = [release for release in found if _sound(place, release, written)]
-        if sound and found[0] not in sound:
+        if found is None:
+            raise Finding("no release was chosen")
+        sound = [name for name in names if _sound(place, place / "releases" / name, written)]
+        if sound and found.name not in sound:
             raise Finding("a damaged release flies, a whole one does not")
-        if whole and (note or found[0].name != names[1]):
+        if whole and (note or found.name != names[1]):
             raise Finding(f"the release flies that should not: {note}")
-        flown = Release({"KNIGHTCUBE_RELEASE": found[0].name, "STATE_DIRECTORY": str(place)})
+        flown = Release({"KNIGHTCUBE_RELEASE": found.name, "STATE_DIRECTORY": str(place)})
         flown.prove()
-        if found[0].name not in chooser.Trials(place).proven:
+        if found.name not in chooser.Trials(place).proven:
             raise Finding("a release that has flown is not proven")
         return "noted" if note else "accepted"
 

@@ -1,0 +1,331 @@
+"""`fly`: a whole release flies whatever is wrong with releases.py, its record or the current release."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.app.release import TRIALS
+from tests.deploy.boards import FakeBoard
+from tests.deploy.scripts import DEPLOY, ROOT, script
+
+releases = script("releases")
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"
+)
+
+SPARSE = 1 << 40
+FLIPS, SEED = 40, 20261123
+
+
+@pytest.fixture(scope="module")
+def updated(tmp_path_factory: pytest.TempPathFactory) -> FakeBoard:
+    board = FakeBoard(tmp_path_factory.mktemp("board") / "root")
+    board.install("old")
+    board.install("new")
+    return board
+
+
+@pytest.fixture
+def board(updated: FakeBoard, tmp_path: Path) -> FakeBoard:
+    """Return a copy of a board whose current release flies as "new" and whose previous one as "old"."""
+    shutil.copytree(updated.root, tmp_path / "root", symlinks=True)
+    (tmp_path / "root/state").mkdir()
+    return FakeBoard(tmp_path / "root")
+
+
+def _chooser(board: FakeBoard) -> Path:
+    return board.prefix / "bin/releases.py"
+
+
+def _python(board: FakeBoard, link: str) -> Path:
+    return board.prefix / link / "venv/bin/python"
+
+
+def _replace(path: Path, content: str | bytes) -> None:
+    """Put another file of the same size, or a longer one, in a file's place."""
+    size = path.stat().st_size
+    path.unlink()
+    path.write_bytes((content if isinstance(content, bytes) else content.encode()).ljust(size, b"\n"))
+    path.chmod(0o755)
+
+
+def _fifo(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def _folder(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+def _sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, SPARSE)
+
+
+def _text(content: str) -> Callable[[Path], None]:
+    return lambda path: void(path.write_text(content, encoding="utf-8"))
+
+
+def void(_: object) -> None:
+    """Return nothing."""
+
+
+CHOOSERS: dict[str, Callable[[Path], None]] = {
+    "missing": Path.unlink,
+    "empty": _text(""),
+    "a folder": _folder,
+    "a FIFO": _fifo,
+    "not Python": _text("def choose(:\n"),
+    "other bytes": lambda path: void(path.write_bytes(bytes(range(256)))),
+    "raises": _text("raise RuntimeError"),
+    "fails without a word": _text("raise SystemExit(1)"),
+    "killed": _text("import os\nos.kill(os.getpid(), 11)"),
+    "loops without end": _text("while True: pass"),
+    "waits, deaf to SIGTERM": _text(
+        "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\ntime.sleep(600)"
+    ),
+    "prints without end": _text("while True: print('0.1.0')"),
+    "names no release": _text("print('0.1.0+7 ')"),
+    "names a path": _text("print('../../../tmp ')"),
+    "names the folder": _text("print('. ')"),
+    "names a pattern": _text("print('* ')"),
+    "names a folder that is no release": _text("print('0.1.0+2/venv ')"),
+}
+
+
+@pytest.mark.parametrize("damage", CHOOSERS.values(), ids=CHOOSERS)
+def test_without_a_usable_answer_of_releases_py_the_current_release_flies_and_says_so(
+    board: FakeBoard, damage: Callable[[Path], None]
+) -> None:
+    damage(_chooser(board))
+    label, said = board.fly()
+    assert label == "new"
+    assert re.search(r"^fly: release 0\.1\.0\+2 flies \(whole\): releases\.py answered '.*', not", said, re.M)
+
+
+def test_an_answer_counts_although_releases_py_does_not_end(board: FakeBoard) -> None:
+    """The count of the start waits for a disk, which may hang."""
+    _chooser(board).write_text(
+        "import time\nprint('0.1.0+1 as asked', flush=True)\ntime.sleep(600)", encoding="ascii"
+    )
+    label, said = board.fly()
+    assert (label, "flies (whole): as asked" in said) == ("old", True)
+
+
+RECORDS: dict[str, Callable[[Path], None]] = {
+    "a FIFO": _fifo,
+    "sparse": _sparse,
+    "a folder": Path.mkdir,
+    "truncated": _text('{"starts": {"0.1.0+2": 2}, "prov'),
+    "other bytes": lambda path: void(path.write_bytes(bytes(range(256)))),
+    "a FIFO for its next version": lambda path: _fifo(path.with_suffix(".part")),
+}
+
+
+@pytest.mark.parametrize("damage", RECORDS.values(), ids=RECORDS)
+def test_a_damaged_record_keeps_releases_py_from_nothing(
+    board: FakeBoard, damage: Callable[[Path], None]
+) -> None:
+    damage(board.root / "state" / TRIALS)
+    assert board.fly() == ("new", "")
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        pytest.param(_sparse, "is not a regular file of at most", id="sparse"),
+        pytest.param(_fifo, "the link current names no complete release; 0.1.0+1 flies", id="a FIFO"),
+        pytest.param(Path.unlink, "the link current names no complete release; 0.1.0+1 flies", id="missing"),
+    ],
+)
+def test_a_release_whose_manifest_cannot_be_read_gives_way_and_the_reason_is_given(
+    board: FakeBoard, damage: Callable[[Path], None], reason: str
+) -> None:
+    damage(board.prefix / "current/manifest")
+    label, said = board.fly()
+    assert label == "old"
+    assert reason in said
+
+
+PYTHONS: dict[str, Callable[[Path], None]] = {
+    "missing": Path.unlink,
+    "a folder": _folder,
+    "not executable": lambda path: path.chmod(0o644),
+    "another machine's": lambda path: _replace(path, b"\x7fELF\2\1\1" + bytes(100)),
+    "without its interpreter": lambda path: _replace(path, "#!/nowhere/python\n"),
+    "fails": lambda path: _replace(path, "#!/bin/sh\nexit 1\n"),
+    "crashes": lambda path: _replace(path, "#!/bin/sh\nkill -SEGV $$\n"),
+    "hangs": lambda path: _replace(path, "#!/bin/sh\nexec sleep 600\n"),
+    "cannot import the flight": lambda path: _replace(
+        path, path.read_text().replace('*"import flight"*) ;;', '*"import flight"*) exit 1 ;;')
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("chooser", ["healthy", "missing"])
+@pytest.mark.parametrize("damage", PYTHONS.values(), ids=PYTHONS)
+def test_a_release_that_cannot_start_gives_way_to_the_other(
+    board: FakeBoard, damage: Callable[[Path], None], chooser: str
+) -> None:
+    damage(_python(board, "current"))
+    if chooser == "missing":
+        _chooser(board).unlink()
+    label, said = board.fly()
+    assert label == "old"
+    assert "fly: release 0.1.0+1 flies (whole): " in said
+
+
+def test_a_proven_release_that_no_longer_starts_gives_way_too(board: FakeBoard) -> None:
+    """Starts of a proven release are not counted."""
+    (board.root / "state" / TRIALS).write_text('{"starts": {}, "proven": ["0.1.0+2"]}', encoding="ascii")
+    PYTHONS["cannot import the flight"](_python(board, "current"))
+    assert [board.fly()[0] for _ in range(4)] == ["old"] * 4
+
+
+def _hurt(board: FakeBoard, link: str) -> None:
+    (board.prefix / link / "venv/lib/python3/site-packages/flight/label").write_text("hurt", encoding="ascii")
+
+
+def test_without_releases_py_a_damaged_release_gives_way_but_flies_where_none_is_whole(
+    board: FakeBoard,
+) -> None:
+    _chooser(board).unlink()
+    _hurt(board, "current")
+    assert board.fly()[0] == "old"
+    _hurt(board, "previous")
+    label, said = board.fly()
+    assert label == "hurt"
+    assert "fly: release 0.1.0+2 flies (imports): " in said
+    for link in ("current", "previous"):
+        PYTHONS["cannot import the flight"](_python(board, link))
+    label, said = board.fly()
+    assert label == "hurt"
+    assert "fly: release 0.1.0+2 flies (runs): " in said
+
+
+def test_without_releases_py_a_damaged_manifest_gives_way(board: FakeBoard) -> None:
+    _chooser(board).unlink()
+    manifest = board.prefix / "current/manifest"
+    manifest.write_text(manifest.read_text(encoding="ascii").replace("label", "lapel"), encoding="ascii")
+    assert board.fly()[0] == "old"
+
+
+def test_without_releases_py_the_release_flies_that_an_operator_rolled_back_to(board: FakeBoard) -> None:
+    words = [*board.words("new")[:2], "--rollback"]
+    subprocess.run(words, env=board.environment(), capture_output=True, check=True)
+    _chooser(board).unlink()
+    assert board.fly()[0] == "old"
+
+
+def test_without_its_links_the_release_with_the_highest_number_flies(board: FakeBoard) -> None:
+    for link in ("current", "previous"):
+        (board.prefix / link).unlink()
+    releases = board.prefix / "releases"
+    (releases / "0.1.0+1").rename(releases / "0.1.0+10")
+    (releases / "0.1.0+2").rename(releases / "0.1.0+9")
+    assert board.fly()[0] == "old"
+    (board.prefix / "current").symlink_to("releases/0.1.0+9")
+    assert board.fly()[0] == "new"
+
+
+def test_without_any_release_it_ends_with_one_line_and_status_1(board: FakeBoard) -> None:
+    shutil.rmtree(board.prefix / "releases")
+    label, said = board.fly()
+    assert label == ""
+    assert said.splitlines()[-1] == f"fly: no release below {board.prefix}/releases can be started"
+
+
+def _start(board: FakeBoard) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [str(board.prefix / "bin/fly"), "/etc/knightcube/flight.yaml", "--archive", "/a b"],
+        env={**os.environ, "STATE_DIRECTORY": str(board.root / "state")},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("chooser", "note"),
+    [
+        ("healthy", ""),
+        ("missing", "releases.py answered '', not the name of a release that starts; 0.1.0+2 flies"),
+    ],
+)
+def test_the_flight_is_the_process_that_systemd_started(board: FakeBoard, chooser: str, note: str) -> None:
+    """Type=notify, the watchdog and SIGTERM go by the main process."""
+    python = _python(board, "current")
+    flight = 'echo "$$ $6 $KNIGHTCUBE_RELEASE $KNIGHTCUBE_RELEASE_NOTE"; exec sleep 600'
+    ordinary = 'echo "flies $(cat "$packages/flight/label")"'
+    _replace(python, python.read_text(encoding="utf-8").replace(ordinary, flight))
+    release = (board.prefix / "current").resolve()
+    (release / "manifest").write_text(releases.manifest_text(release), encoding="ascii")
+    if chooser == "missing":
+        _chooser(board).unlink()
+    with _start(board) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == -signal.SIGTERM
+    assert line == f"{process.pid} /a b 0.1.0+2 {note}\n"
+
+
+def test_sigterm_ends_the_choice(board: FakeBoard, tmp_path: Path) -> None:
+    _chooser(board).write_text(
+        f"import time\nopen({str(tmp_path / 'begun')!r}, 'w').close()\ntime.sleep(2)\n", encoding="utf-8"
+    )
+    with _start(board) as process:
+        while not (tmp_path / "begun").exists():
+            assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.communicate(timeout=60)[0] == ""
+    assert process.returncode == -signal.SIGTERM
+
+
+def _flips(content: bytes, count: int) -> list[bytes]:
+    """Return copies of a content, each with one flipped bit."""
+    places = np.random.default_rng(SEED).choice(8 * len(content), count, replace=False)
+    flipped = []
+    for place in places.tolist():
+        copy = bytearray(content)
+        copy[place // 8] ^= 1 << place % 8
+        flipped.append(bytes(copy))
+    return flipped
+
+
+def test_a_whole_release_flies_after_any_flipped_bit_of_releases_py(board: FakeBoard) -> None:
+    whole = _chooser(board).read_bytes()
+    flown = []
+    for damaged in _flips(whole, FLIPS):
+        _chooser(board).write_bytes(damaged)
+        (board.root / "state" / TRIALS).unlink(missing_ok=True)
+        flown.append(board.fly()[0])
+    assert set(flown) <= {"new", "old"}
+
+
+def test_a_whole_release_flies_after_any_flipped_bit_of_the_record(board: FakeBoard) -> None:
+    whole = b'{"starts": {"0.1.0+2": 2}, "proven": ["0.1.0+1"]}'
+    flown = []
+    for damaged in _flips(whole, FLIPS):
+        (board.root / "state" / TRIALS).write_bytes(damaged)
+        flown.append(board.fly()[0])
+    assert set(flown) <= {"new", "old"}
+
+
+def test_what_fly_imports_as_a_trial_is_what_the_installer_imports() -> None:
+    (trial,) = re.findall(r"'(import flight\..*)'", (DEPLOY / "fly").read_text(encoding="utf-8"))
+    assert f'"{trial}"' in (DEPLOY / "build_release.py").read_text(encoding="utf-8")
+    subprocess.run([sys.executable, "-c", trial], cwd=ROOT, check=True)
