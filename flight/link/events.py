@@ -172,7 +172,7 @@ RELEASE_LEFT = EventKind(
     79,
     "release-left",
     _FAULT,
-    "the current release is damaged or did not start: the text names the one that flies",
+    "the current release or releases.py is damaged or did not start: the text names the one that flies",
 )
 COMMANDED = EventKind(80, "commanded", _TOLD, "a command was obeyed")
 COMMAND_REFUSED = EventKind(81, "command-refused", _WARNED, "a command was not obeyed, with the reason")
