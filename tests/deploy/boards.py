@@ -82,6 +82,6 @@ class FakeBoard:
         state.mkdir(exist_ok=True)
         words = [str(self.prefix / "bin/fly"), "/etc/knightcube/flight.yaml"]
         own = {**os.environ, "STATE_DIRECTORY": str(state)}
-        done = subprocess.run(words, env=own, capture_output=True, text=True, check=False)
+        done = subprocess.run(words, env=own, cwd=state, capture_output=True, text=True, check=False)
         complaints = re.sub(r"fly: release \S+ flies \(whole\): releases.py chose it\n", "", done.stderr)
         return done.stdout.removeprefix("flies ").strip(), complaints
