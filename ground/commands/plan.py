@@ -16,9 +16,7 @@ from flight.schema.carried import config_path
 from ground.commands import plan_orbit
 from ground.commands.options import finite, positive
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 
 _DEFAULT_CONFIG = "step_demo"

@@ -21,13 +21,11 @@ from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.sun import DAY
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_ends import Boresight
 from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
-from knightcube.gnc.guidance.three_axes.slew_order import LEAD, OrderedSlew, SlewOrder, plan_order
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
-from knightcube.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
+from knightcube.gnc.guidance.three_axes.slew_plan import LEAD, OrderedSlew, SlewOrder, SlewStatus, plan_order
+from knightcube.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES, BoresightEnd
 
 BODIES = ("sun", "earth", "moon")
 STRETCH = 3.0
@@ -204,7 +202,7 @@ def _facts(made: OrderedSlew, order: SlewOrder, at: datetime, solved_s: float) -
             cone.name.lower(): math.degrees(clear)
             for cone, clear in zip(task.cones, plan.clearance, strict=True)
         },
-        "roll_free": isinstance(task.end(plan.horizon), Boresight),
+        "roll_free": isinstance(task.end(plan.horizon), BoresightEnd),
         "steps": plan.steps,
         "processor_s": solved_s,
     }

@@ -12,8 +12,14 @@ from ground.telemetry.reader import Run
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_velocity
 from knightcube.errors import UsageError
-from knightcube.gnc.tracking.first_orbit import LEAST_SIGHTINGS, ArcError, Bearings, FirstOrbit, first_orbit
-from knightcube.gnc.tracking.free_fall import smoothed
+from knightcube.gnc.tracking.first_orbit import (
+    LEAST_SIGHTINGS,
+    ArcError,
+    Bearings,
+    FirstOrbit,
+    first_orbit,
+    smoothed,
+)
 
 _UNIX_EPOCH = 2_440_587.5
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
     from knightcube.gnc.guidance.one_axis.vmc import Plan
-    from knightcube.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
+    from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder
 
 __all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_report", "summarise"]
 

@@ -13,7 +13,7 @@ from ground.report.sensing import covariance_matrices, mean_rates, with_rate
 from ground.report.signals import Attitude, CoilPower, coil_power, estimated_attitude, seconds, true_attitude
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.lgl import lgl_rule
+from knightcube.gnc.guidance.one_axis.path import lgl_rule
 
 
 @dataclass(frozen=True)

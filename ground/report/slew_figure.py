@@ -15,10 +15,9 @@ from ground.report import panels
 from ground.report.figures import DPI
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.guidance.three_axes.slew_cones import Cone
 from knightcube.gnc.guidance.three_axes.slew_model import shown
-from knightcube.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
+from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
+from knightcube.gnc.guidance.three_axes.slew_task import Cone
 
 SIZE = (10.9, 12.6)
 _CONES = {"Sun": panels.ORANGE, "Earth": panels.GREEN, "Moon": panels.GREY}

@@ -13,7 +13,7 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep
 from ground.telemetry.reader import Run
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
-from knightcube.gnc.control.three_axes import astray
+from knightcube.gnc.control.three_axes import pointing_law
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import modes_of
@@ -60,7 +60,7 @@ def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
     faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "yz"]
     config, section = slewing(105.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(astray, "PATIENCE", PATIENCE)
+        patch.setattr(pointing_law, "PATIENCE", PATIENCE)
         return fly(config, tmp_path_factory.mktemp("crippled"), section=section)
 
 

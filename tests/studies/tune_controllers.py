@@ -20,11 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from knightcube.gnc.control.one_axis.controller import Controller
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.control.one_axis.lq_tracker import AngleController
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import angle_of
-from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
-from knightcube.reference.control.pid import PidController, PidGains
+from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD
 
 TRUE = replace(BELIEVED, stiffness=1e-5, damping=2e-6)
@@ -53,12 +52,12 @@ class Flown:
         return 1e3 * self.power + _PENALTY * (slow + 100.0 * over)
 
 
-def fly(controller: Controller) -> Flown:
+def fly(controller: AngleController) -> Flown:
     """Fly the steps with perfect measurements."""
     (angle, rate), current, energy = RELEASE, 0.0, 0.0
     slowest = furthest = 0.0
     for q2 in TARGETS:
-        wanted = Sample(angle_of(q2), 0.0, 0.0)
+        wanted = PathSample(angle_of(q2), 0.0, 0.0)
         size = wanted.angle - angle
         errors = []
         for _ in range(round(STEP / PERIOD)):
@@ -75,19 +74,19 @@ def fly(controller: Controller) -> Flown:
     return Flown(energy / (STEP * len(TARGETS)), slowest, furthest)
 
 
-def pid(x: Sequence[float]) -> Controller:
+def pid(x: Sequence[float]) -> AngleController:
     """Return the PID controller of four variables."""
     proportional, integral, derivative = np.exp(x[:3]).tolist()
     weight = 1.0 / (1.0 + math.exp(-x[3]))
-    return PidController(BELIEVED, PERIOD, PidGains(proportional, integral, derivative), weight)
+    return PidController(BELIEVED, PERIOD, PidSettings(proportional, integral, derivative), weight)
 
 
-def adaptive(x: Sequence[float]) -> Controller:
+def adaptive(x: Sequence[float]) -> AngleController:
     """Return the adaptive controller of three variables."""
     return AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(*np.exp(x).tolist()))
 
 
-STARTS: dict[str, tuple[Callable[[Sequence[float]], Controller], tuple[tuple[float, ...], ...]]] = {
+STARTS: dict[str, tuple[Callable[[Sequence[float]], AngleController], tuple[tuple[float, ...], ...]]] = {
     "pid": (pid, ((math.log(1.7), math.log(0.44), math.log(2.3), -2.0), (-0.7, -2.4, 0.0, -1.5))),
     "adaptive": (adaptive, ((0.0, 2.3, -0.58), (-0.5, 1.0, -0.5), (0.5, 3.0, -0.7))),
 }

@@ -45,15 +45,15 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
+from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, FieldDetumblerSettings
+from knightcube.gnc.control.three_axes.pointing_job import SlewRequest
 from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
-from knightcube.gnc.control.three_axes.slew_table import SlewWish
-from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 from knightcube.vision.sun.strings import SolarStrings
 
 _BELOW = 0.8
@@ -150,12 +150,12 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, _slew(config))
 
 
-def _slew(config: OrbitConfig) -> SlewWish:
+def _slew(config: OrbitConfig) -> SlewRequest:
     """Return how slews are wanted; without a star camera the pointing axis keeps the cones."""
     section, camera = config.pointing, config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
-    return SlewWish(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
+    return SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
@@ -246,8 +246,8 @@ def _seeker(config: OrbitConfig, services: Services) -> StringSeeker | None:
     if section is None:
         return None
     axis = np.array(config.pointing.axis)
-    seeking = Seeking(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
-    seeker = SunSeeker(_pauses(config), seeking)
+    seeking = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
+    seeker = SunAcquisition(_pauses(config), seeking)
     return StringSeeker(seeker, _strings(section), craft.dipole_per_ampere, services.events)
 
 
@@ -272,7 +272,7 @@ def _detumbler(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surround
         torque_walk=section.torque_noise,
         gyro_sigma=config.estimation.bias_start,
     )
-    braking = FieldBraking(
+    braking = FieldDetumblerSettings(
         limit=_limit(config),
         horizon=section.horizon,
         replan=section.replan,

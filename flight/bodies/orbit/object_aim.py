@@ -18,10 +18,10 @@ from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob, Sight
+from knightcube.gnc.control.three_axes.pointing_job import ObjectDirection, PointingJob
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 from knightcube.gnc.tracking.tracker import Track
 
 EFFORT = 0.25
@@ -97,11 +97,13 @@ class ObjectAim:
             place = self._searched(job.quaternion)
             # Another axis would make it cheap to turn the boresight away.
             weights = replace(job.weights, roll=ROLL, axis=boresight)
-            return replace(job, axes=axes, weights=weights, slew=None, sight=Sight(place, np.zeros(3), 0.0))
+            return replace(
+                job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
+            )
         line = track.line
         weights = replace(job.weights, dipole=EFFORT * self._limit, roll=ROLL, rate=RATE, axis=boresight)
         since = (line.time_ns - job.origin_ns) / SECOND_NS
-        sight = Sight(line.direction, line.velocity, since)
+        sight = ObjectDirection(line.direction, line.velocity, since)
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:

@@ -8,10 +8,9 @@ import numpy as np
 
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.three_axes.astray import Astray
-from knightcube.gnc.control.three_axes.pointing import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import Reference
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 
@@ -25,7 +24,7 @@ class PathPoint:
     seconds: float
 
     @property
-    def motion(self) -> Reference:
+    def motion(self) -> AttitudeReference:
         """The wanted motion."""
         return self.law.reference(self.seconds)
 
@@ -56,7 +55,7 @@ class PointingPaths:
         self._origin_ns = 0
         self._arrival_ns: int | None = None
         self.off = 0.0
-        self.astray = Astray()
+        self.astray = PathRecovery()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
         """Fly a table, or its part that is slow enough; return why it is refused, empty when it is flown."""

@@ -23,12 +23,11 @@ from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.three_axes.pointing_job import STEADY, PointingJob
+from knightcube.gnc.control.three_axes.pointing_job import STEADY, PointingJob, SlewRequest
 from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
-from knightcube.gnc.control.three_axes.slew_table import SlewWish
 from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 
 AGAIN_NS = 10_000_000_000
 """After a plan that failed, or while no orbit is known, the next is asked for after this time."""
@@ -46,7 +45,7 @@ class PlannedCraft:
     axes: BodyAxes
     weights: PointingWeights
     limit: float
-    slew: SlewWish
+    slew: SlewRequest
 
 
 class PointingPlanner:
@@ -130,7 +129,7 @@ class PointingPlanner:
             self._wanted, self._job, self._count = False, job, job.number
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
-    def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewWish | None:
+    def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
         """Return how a slew to a goal is wanted; None for a body on a path to it.
 
         A path leaves its goal for a time where it meets torques along the field: no reason for a slew.

@@ -10,7 +10,7 @@ from flight.loop.control_output import CoilCommand
 from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.readings import StringReading
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.three_axes.sun_seeker import SunSeeker
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition
 from knightcube.vision.sun.strings import SolarStrings, coarse_sun
 
 
@@ -18,7 +18,7 @@ class StringSeeker:
     """Commands the seeker's dipole and says whether it has a Sun; implements `flight.loop.body.Brake`."""
 
     def __init__(
-        self, seeker: SunSeeker, strings: SolarStrings, dipole_per_ampere: float, log: EventLog
+        self, seeker: SunAcquisition, strings: SolarStrings, dipole_per_ampere: float, log: EventLog
     ) -> None:
         """Take n A of each coil, m^2."""
         self._seeker, self._strings = seeker, strings

@@ -1,6 +1,6 @@
 """The tracker of a satellite: the pointing law along its path, and the pauses of the coils.
 
-Far off its path the body is held still instead (`knightcube.gnc.control.three_axes.astray`).
+Far off its path the body is held still instead (`knightcube.gnc.control.three_axes.pointing_law`).
 
 The coils pause at the begin of each window, so that the magnetometer is read without their field; then one
 dipole, computed at the pause's end, is held. It is raised by what the pause takes from its mean.
@@ -17,7 +17,7 @@ from flight.loop.control_output import CoilCommand
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.astray import damping_dipole
+from knightcube.gnc.control.three_axes.pointing_law import damping_dipole
 from knightcube.gnc.estimation.estimate import Estimate
 
 _NOTHING: FloatArray = np.zeros(3)

@@ -30,15 +30,19 @@ from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
-from knightcube.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
+from knightcube.gnc.control.detumble import (
+    Detumbler,
+    DetumblerSettings,
+    WindowSchedule,
+    share_in_turning_field,
+)
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.filter_settings import FilterSettings, slow_prior
 from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
 from knightcube.gnc.guidance.one_axis import job as plan_job
-from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuidance
+from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import NODES
 
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
@@ -53,7 +57,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     reader = ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
     settings = planning_settings(config)
     rules = AcceptanceRules(late_after=config.guidance.late_after)
-    guidance = Guidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
+    guidance = PathGuidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
     planning = Planning(plant, settings, guidance, reader, services)
     steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
     dipole = dipole_per_ampere(config)
@@ -153,7 +157,7 @@ def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:
     turning = section.field_turn > 0.0
     share = share_in_turning_field(section.field_turn, schedule) if turning else section.share
     dipole = dipole_per_ampere(config)
-    braking = Braking(plant.inertia, dipole, plant.current_limit, share)
+    braking = DetumblerSettings(plant.inertia, dipole, plant.current_limit, share)
     return BdotBrake(Detumbler(schedule, braking), dipole)
 
 

@@ -35,7 +35,7 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.filter_settings import FilterSettings
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.estimation.slow_prior import SlowPrior
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 
 AHEAD = 20.0
@@ -149,7 +149,7 @@ class CageTracker:
         self._field = field
         self._dipole = dipole
 
-    def command(self, estimate: Estimate, reference: Sample) -> CoilCommand:
+    def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
         """Return the command that makes the torque, of the least current."""
         wanted = self._inner.command(estimate, reference)
         angle = self._read(estimate).angle

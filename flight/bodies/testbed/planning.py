@@ -23,11 +23,10 @@ from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.guidance.one_axis.guidance import Guidance
+from knightcube.gnc.guidance.one_axis.guidance import PathGuidance
 from knightcube.gnc.guidance.one_axis.job import PlanJob
 from knightcube.gnc.guidance.one_axis.path import FARTHEST
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
+from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, angle_of, q2_of
 from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 
 _AGAIN_NS = 1_000_000_000
@@ -77,7 +76,7 @@ class Planning:
         self,
         plant: SingleAxisPlant,
         settings: PlanningSettings,
-        guidance: Guidance,
+        guidance: PathGuidance,
         reader: ThreadReader,
         services: Services,
     ) -> None:

@@ -13,9 +13,8 @@ from flight.bodies.testbed.thread_law import ThreadLaw, law_of
 from flight.loop.control_output import COMMANDED, KEPT, Target
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.guidance.one_axis.guidance import Guidance
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.plant import angle_of
+from knightcube.gnc.guidance.one_axis.guidance import PathGuidance
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 
@@ -32,7 +31,7 @@ class ThreadTargets:
     """Implements `flight.loop.body.Targets`."""
 
     def __init__(
-        self, steps: Sequence[TimedStep], reader: ThreadReader, guidance: Guidance, planning: Planning
+        self, steps: Sequence[TimedStep], reader: ThreadReader, guidance: PathGuidance, planning: Planning
     ) -> None:
         """Take the configured steps in order of time; the first is at 0."""
         self._steps = [Target(i, ThreadLaw(step.q2, step.rate)) for i, step in enumerate(steps)]

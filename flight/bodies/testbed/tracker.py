@@ -7,14 +7,12 @@ import numpy as np
 from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.loop.control_output import CoilCommand
 from flight.schema.testbed import Control, Identification
-from knightcube.gnc.control.one_axis.controller import Controller
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from knightcube.gnc.control.one_axis.lq_tracker import LqTracker
+from knightcube.gnc.control.one_axis.lq_tracker import AngleController, LqTracker
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
-from knightcube.reference.control.pid import PidController, PidGains
+from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 
 
 def controller_of(
@@ -22,7 +20,7 @@ def controller_of(
     plant: SingleAxisPlant,
     period: float,
     identification: Identification,
-) -> Controller:
+) -> AngleController:
     """Return the controller of `plant` that `section` chooses, called every `period` s."""
     if section.tracker == "excitation":
         move = identification
@@ -32,9 +30,9 @@ def controller_of(
     if section.tracker == "pid":
         free = section.gains
         gains = (
-            PidGains.placed(section.bandwidth)
+            PidSettings.placed(section.bandwidth)
             if free is None
-            else PidGains(free.proportional, free.integral, free.derivative)
+            else PidSettings(free.proportional, free.integral, free.derivative)
         )
         return PidController(plant, period, gains, section.target_weight)
     if section.tracker == "adaptive":
@@ -48,12 +46,12 @@ def controller_of(
 class ThreadTracker:
     """Implements `flight.loop.body.Tracker` with the coil on body x (Sease 5.4)."""
 
-    def __init__(self, controller: Controller, reader: ThreadReader, dipole_per_ampere: float) -> None:
+    def __init__(self, controller: AngleController, reader: ThreadReader, dipole_per_ampere: float) -> None:
         self._controller = controller
         self._read = reader.read
         self._dipole = dipole_per_ampere
 
-    def command(self, estimate: Estimate, reference: Sample) -> CoilCommand:
+    def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
         """Return the command that keeps the body on the reference."""
         now = self._read(estimate)
         wanted = self._controller.command(reference, now.angle, now.rate, now.disturbance)

@@ -11,7 +11,7 @@ from flight.link.modes import COMMANDABLE, Mode
 from flight.link.parameters import FIELDS as PARAMETERS
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Layout, compile_layouts
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal
 
 _MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Limits, Packet, counter
 from flight.link.telemetry.states import MODES, NO_YES, STEERING
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 
 MAX_NODES = 40
 """Room for the nodes of a path."""

@@ -12,8 +12,7 @@ from flight.link.telemetry.vision_definitions import MOST_SIGHTINGS
 from flight.loop.body import Body
 from flight.loop.services import Services
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.tracking.sightings import Sightings
-from knightcube.gnc.tracking.tracker import Track, Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, Track, TrackSettings
 from knightcube.vision.objects.sighted import Sighted
 
 _UNKNOWN = [math.nan] * 3
@@ -24,7 +23,7 @@ class ObjectTracking:
 
     def __init__(self, settings: TrackSettings, body: Body, services: Services) -> None:
         self._body = body
-        self._tracker = Tracker(settings)
+        self._tracker = ObjectTracker(settings)
         self._recorder = services.recorder
         self._events = services.events
 
@@ -32,7 +31,7 @@ class ObjectTracking:
         """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
         self._record_sightings(sequence, middle_ns, sighted, now_ns)
         orbit = self._body.place(middle_ns)
-        frame = Sightings(
+        frame = FrameSightings(
             middle_ns,
             sighted.directions,
             sighted.covariance,

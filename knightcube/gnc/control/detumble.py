@@ -63,7 +63,7 @@ class WindowSchedule:
 
 
 @dataclass(frozen=True, slots=True)
-class Braking:
+class DetumblerSettings:
     """The law's constants.
 
     Attributes:
@@ -100,7 +100,9 @@ def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
     return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
 
 
-def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_time: float) -> FloatArray:
+def braking_current(
+    braking: DetumblerSettings, rate: FloatArray, field: FloatArray, act_time: float
+) -> FloatArray:
     """Return currents (3,) A that brake `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
 
     All three are scaled by one factor when a coil would exceed its limit, to preserve the direction.
@@ -117,7 +119,7 @@ def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_t
 class Detumbler:
     """Runs the windows: takes each magnetometer sample and returns currents each cycle."""
 
-    def __init__(self, schedule: WindowSchedule, braking: Braking) -> None:
+    def __init__(self, schedule: WindowSchedule, braking: DetumblerSettings) -> None:
         self._schedule = schedule
         self._braking = braking
         self._begun_ns = 0

@@ -1,19 +1,20 @@
-"""A first orbit of an object from directions alone, seen from a known orbit: all sightings at once.
+"""A first orbit of an object from directions alone, observed from a known orbit, by all sightings at once.
 
-The unknowns are the direction, the velocity over the distance, and the logarithm of the distance, at the
-middle of the arc. Sightings of a pass give the first five well and the distance badly: free fall beside the
-observer looks alike at every distance but for the bend of gravity. So the distance is scanned (as over the
-admissible region of Milani et al., Celestial Mechanics 90, 2004). For each the other five are fitted by
-Gauss-Newton; then the best is refined in all six. The interval of distances whose chi-square is within 95 %
-of the best says whether the arc suffices. Gauss's method has the same distance with the noise of three
-sightings.
+The unknowns are the direction, the velocity divided by the distance, and the logarithm of the distance, at
+the middle of the arc. Sightings of one pass determine the first five well and the distance badly: free fall
+close to the observer looks the same at every distance apart from the curvature by gravity. The distance is
+therefore scanned (as over the admissible region of Milani et al., Celestial Mechanics 90, 2004). For each
+distance the other five unknowns are fitted by Gauss-Newton, and the best fit is refined in all six. The
+interval of distances whose chi-square is within the 95 % bound of the minimum shows whether the arc suffices.
+Gauss's method gives the same distance with the noise of three sightings.
 
-Forces: a spherical Earth and J2. Directions are those in which a star at rest would be: the light's way
-shifts an object by its velocity about the Sun.
+Forces: a spherical Earth and J2. Directions are those in which a star at rest would appear: light time and
+aberration shift an object by its velocity relative to the Sun.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -22,10 +23,71 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.chi_square import bound
 from knightcube.astro.directions import tangent_basis
-from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
 from knightcube.errors import FlightError
-from knightcube.gnc.tracking.free_fall import around
+
+_LONGEST_STEP = 10.0
+_SMOOTHING_ROUNDS = 3
+_STATE_STEPS = np.repeat([1.0, 1e-3], 3)
+"""Of differences: m, m/s."""
+
+
+def smoothed(
+    times: FloatArray, states: FloatArray, sigma: FloatArray, middle: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the orbit nearest to measured places: states (n, 6), and the covariance (6, 6) at one of them.
+
+    `sigma` (n,) m of an axis of each place. The velocities only begin the search.
+    """
+    state = states[middle]
+    covariance = np.eye(6)
+    weights = np.repeat(1.0 / sigma, 3)
+    for _ in range(_SMOOTHING_ROUNDS):
+        shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STATE_STEPS), -np.diag(_STATE_STEPS)])
+        flown = around(state + shifts, times, middle)[..., :3]
+        off = (flown[:, 0] - states[:, :3]).ravel() * weights
+        slope = (flown[:, 1:7] - flown[:, 7:]) / (2.0 * _STATE_STEPS[:, None])
+        jacobian = np.swapaxes(slope, 1, 2).reshape(-1, 6) * weights[:, None]
+        scaled = jacobian / np.linalg.norm(jacobian, axis=0)
+        size = np.linalg.norm(jacobian, axis=0)
+        covariance = np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
+        state = state - covariance @ (jacobian.T @ off)
+    return around(state[None], times, middle)[:, 0], covariance
+
+
+def around(start: FloatArray, times: FloatArray, middle: int) -> FloatArray:
+    """Return states (n, k, 6) at rising times (n,) s of those (k, 6) at `times[middle]`."""
+    ahead, behind = trajectories(start, times[middle:]), trajectories(start, times[middle::-1])
+    return np.concatenate([behind[:0:-1], ahead])
+
+
+def trajectories(start: FloatArray, times: FloatArray) -> FloatArray:
+    """Return states (n, k, 6) at times (n,) s, rising or falling, of those (k, 6) at the first."""
+    found = [start]
+    for before, after in itertools.pairwise(times):
+        steps = max(1, math.ceil(abs(after - before) / _LONGEST_STEP))
+        state, step = found[-1], (after - before) / steps
+        for _ in range(steps):
+            a = _flow(state)
+            b = _flow(state + 0.5 * step * a)
+            c = _flow(state + 0.5 * step * b)
+            d = _flow(state + step * c)
+            state = state + step / 6.0 * (a + 2.0 * (b + c) + d)
+        found.append(state)
+    return np.array(found)
+
+
+def _flow(state: FloatArray) -> FloatArray:
+    """Return velocity and acceleration (k, 6)."""
+    place = state[:, :3]
+    # No orbit is deep in the Earth: a hypothesis that is must not be flung out.
+    square = np.maximum(np.sum(place**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
+    flat = 1.5 * J2 * EARTH_RADIUS**2 / square
+    tilt = 5.0 * place[:, 2:] ** 2 / square
+    scale = 1.0 + flat * (np.array([1.0, 1.0, 3.0]) - tilt)
+    return np.hstack([state[:, 3:], -GRAVITATIONAL_PARAMETER / square**1.5 * scale * place])
+
 
 LEAST_SIGHTINGS = 6
 RATIO = 1.5
@@ -96,7 +158,7 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
     count = len(seen.times)
     if count < LEAST_SIGHTINGS:
         raise ArcError(f"{count} sightings: an orbit needs {LEAST_SIGHTINGS} or more")
-    fit = _Fit(seen)
+    fit = _ArcFit(seen)
     logarithms = np.linspace(math.log(_NEAREST), math.log(_FARTHEST), _GRID)
     inner, _ = _within(logarithms, fit.chi_square(fit.scan(logarithms)))
     step = logarithms[1] - logarithms[0]
@@ -157,7 +219,7 @@ def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -
     return text + f"; an orbit is given where the ends are within a factor of {RATIO:g}"
 
 
-class _Fit:
+class _ArcFit:
     """The least squares of some sightings; unknowns (k, 6) of k hypotheses at once."""
 
     def __init__(self, seen: Bearings) -> None:

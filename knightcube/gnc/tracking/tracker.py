@@ -1,12 +1,25 @@
-"""Tracks of several objects over frames: association, start, coasting and end.
+"""Tracks of several objects over frames, and the filter of the line of sight to one object.
 
-Sightings go to the tracks in order of their chi-square, each to one track at most (greedy nearest neighbour;
-Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, 6.4). What is left starts tentative
-tracks. A track is confirmed after m sightings in n frames if its rate is not that of a star; until then two
-tracks may hold on to one sighting no longer than n frames. A confirmed track coasts while it is not seen.
+The filter uses directions alone. Its state is the relative position and velocity divided by the present
+range: y, a unit vector, and z. Without forces z is constant and y moves on a straight line, so that a pass at
+any rate is linear except for the measurement. The range divides out and is reset to one after each step.
+These are the modified polar coordinates of Aidala and Hammel (IEEE Trans. Automatic Control 28, 1983) in
+vectors. The component of z across the line is the angular rate v, the component along it s = (range rate) /
+range, and the angular acceleration is -2 s v.
 
-The attitude's error is common to the sightings of a frame. Each track alone sees it as an error of its own,
-so its covariance stays honest; the gate between two tracks that are seen together is only the wider for it.
+Observer and object fall about the Earth. The gravity gradient at the observer's position, if known, gives
+their relative acceleration to first order in the distance over the orbit's radius.
+
+Process noise: the tides of two low orbits, which rotate with the line, are modelled as white accelerations of
+density `wander`, and their residual after the gradient as density `left`. The range component also follows
+motions that are not straight lines, such as an object on a great circle at a constant rate, whose s would
+change by rate^2: a density of (`bend` rate^2)^2 / rate.
+
+Sightings are assigned to tracks in order of their chi-square, each to at most one track (greedy nearest
+neighbour; Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999, 6.4). Unassigned
+sightings start tentative tracks. A track is confirmed after m sightings in n frames if its rate is not that
+of a star. Until then, two tracks may share a sighting for at most n frames. A confirmed track coasts while
+its object is not visible.
 """
 
 from __future__ import annotations
@@ -18,9 +31,178 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.chi_square import bound
-from knightcube.astro.directions import cross_matrices
-from knightcube.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, tides, update
-from knightcube.gnc.tracking.sightings import Sightings
+from knightcube.astro.directions import cross_matrices, tangent_basis
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSightings:
+    """The n objects, or what may be one, of a frame at one instant.
+
+    Attributes:
+        time_ns: of mid-exposure.
+        directions: (n, 3) unit vectors, ICRS, free of the aberration of the stars.
+        covariance: (n, 3, 3) rad^2 of the places in the image, ICRS axes; without the attitude's.
+        magnitudes: (n,) by the frame's stars; NaN when unknown.
+        attitude: (3, 3) rad^2, of the small turn, ICRS axes, that is common to all directions of the frame.
+        observer: (3,) m from the Earth's centre, ICRS; None on the ground, or where it is not known.
+    """
+
+    time_ns: int
+    directions: FloatArray
+    covariance: FloatArray
+    magnitudes: FloatArray
+    attitude: FloatArray
+    observer: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """What is believed of the objects' motion.
+
+    Attributes:
+        rate: rad/s, standard deviation of each component before the second sighting.
+        closing: 1/s, the same of (range rate) / range.
+        wander: 1/s^3, density of scaled accelerations. Tides in low orbit reach 1.5 n^2 = 1.8e-6 1/s^2; the
+            density is the one whose errors of place and rate are as large as their covariance says in passes
+            of 0.05 to 0.6 deg/s at up to 5,000 km.
+        left: 1/s^3, the same where the gravity gradient is known, from the same passes.
+        bend: part of rate^2 by which the closing rate changes otherwise than on a straight line.
+    """
+
+    rate: float = 0.01
+    closing: float = 0.01
+    wander: float = 1.6e-12
+    left: float = 4e-13
+    bend: float = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineOfSightState:
+    """A line of sight and its motion at one time.
+
+    Attributes:
+        time_ns: of the state.
+        direction: (3,) unit vector, ICRS.
+        velocity: (3,) 1/s, z: of its parts, across the line is the angular rate, along it the closing rate.
+        covariance: (6, 6) of direction and velocity; nothing along the direction.
+    """
+
+    time_ns: int
+    direction: FloatArray
+    velocity: FloatArray
+    covariance: FloatArray
+
+    @property
+    def rate(self) -> FloatArray:
+        """How the direction changes (3,), rad/s, at right angles to it."""
+        return self.velocity - (self.velocity @ self.direction) * self.direction
+
+    @property
+    def acceleration(self) -> FloatArray:
+        """How the rate changes (3,), rad/s^2, at right angles to the direction."""
+        return -2.0 * float(self.velocity @ self.direction) * self.rate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectionInnovation:
+    """A direction against the predicted one: residual (2,) rad, its covariance and chi-square."""
+
+    residual: FloatArray
+    covariance: FloatArray
+    observation: FloatArray
+    chi_square: float
+
+
+def begin(
+    time_ns: int, direction: FloatArray, covariance: FloatArray, motion: MotionModel
+) -> LineOfSightState:
+    """Return the line of sight after one sighting of `covariance` (3, 3) rad^2; its rate is unknown."""
+    along = np.outer(direction, direction)
+    across = np.eye(3) - along
+    start = np.zeros((6, 6))
+    start[:3, :3] = across @ covariance @ across
+    start[3:, 3:] = motion.rate**2 * across + motion.closing**2 * along
+    return LineOfSightState(time_ns, direction, np.zeros(3), start)
+
+
+def tides(observer: FloatArray) -> FloatArray:
+    """Return the gravity gradient (3, 3) 1/s^2 at an observer's place (3,) m from the Earth's centre, ICRS.
+
+    What falls beside the observer is accelerated against it by this times its place, to first order.
+    """
+    distance = float(np.linalg.norm(observer))
+    up = observer / distance
+    return np.asarray(GRAVITATIONAL_PARAMETER / distance**3 * (3.0 * np.outer(up, up) - np.eye(3)))
+
+
+def predict(
+    state: LineOfSightState, time_ns: int, motion: MotionModel, tide: FloatArray | None = None
+) -> LineOfSightState:
+    """Return the line of sight at another time, not before its own; `tide` (3, 3) 1/s^2 where it is known."""
+    step = (time_ns - state.time_ns) * 1e-9
+    if step == 0.0:
+        return state
+    if step < 0.0:
+        raise ValueError(f"time_ns = {time_ns}: give one from {state.time_ns} on")
+    transition = np.eye(6)
+    transition[:3, 3:] = step * np.eye(3)
+    if tide is not None:
+        transition[:3, :3] += 0.5 * step**2 * tide
+        transition[3:, :3] = step * tide
+    spread = transition @ state.covariance @ transition.T + _noise(state, step, motion, tide is not None)
+    moved = transition @ np.concatenate([state.direction, state.velocity])
+    return _at_unit_range(time_ns, moved[:3], moved[3:], spread)
+
+
+def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
+    """Return a direction (3,), of `covariance` (3, 3) rad^2, against the state at the same time."""
+    basis = tangent_basis(state.direction)
+    residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
+    observation = np.hstack([basis, np.zeros((2, 3))])
+    expected = observation @ state.covariance @ observation.T + basis @ covariance @ basis.T
+    return DirectionInnovation(
+        residual, expected, observation, float(residual @ np.linalg.solve(expected, residual))
+    )
+
+
+def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
+    """Return the state with a sighting (3,), of `covariance` (3, 3) rad^2, at the same time."""
+    seen = compare(state, direction, covariance)
+    gain = np.linalg.solve(seen.covariance, seen.observation @ state.covariance).T
+    change = gain @ seen.residual
+    kept = np.eye(6) - gain @ seen.observation
+    basis = tangent_basis(state.direction)
+    noise = basis @ covariance @ basis.T
+    spread = kept @ state.covariance @ kept.T + gain @ noise @ gain.T
+    place, velocity = state.direction + change[:3], state.velocity + change[3:]
+    return _at_unit_range(state.time_ns, place, velocity, spread)
+
+
+def _at_unit_range(
+    time_ns: int, place: FloatArray, velocity: FloatArray, covariance: FloatArray
+) -> LineOfSightState:
+    """Return the state divided by its range, |place|."""
+    size = float(np.linalg.norm(place))
+    direction, scaled = place / size, velocity / size
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = (np.eye(3) - np.outer(direction, direction)) / size
+    jacobian[3:, :3] = -np.outer(scaled, direction) / size
+    jacobian[3:, 3:] = np.eye(3) / size
+    spread = jacobian @ covariance @ jacobian.T
+    return LineOfSightState(time_ns, direction, scaled, 0.5 * (spread + spread.T))
+
+
+def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
+    """Return the covariance (6, 6) of white accelerations over `step` s; `known`: the gradient is."""
+    along = np.outer(state.direction, state.direction)
+    rate = float(np.linalg.norm(state.rate))
+    wander = motion.left if known else motion.wander
+    density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
+    return np.block(
+        [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
+    )
+
 
 _UNSEEN = np.full(3, np.nan)
 _ALIKE = 2.0
@@ -44,7 +226,7 @@ class TrackSettings:
         brightness: magnitudes, standard deviation between sightings of one object.
     """
 
-    motion: Motion = field(default_factory=Motion)
+    motion: MotionModel = field(default_factory=MotionModel)
     needed: int = 4
     within: int = 6
     missed: float = 1e-4
@@ -73,7 +255,7 @@ class Track:
     """
 
     number: int
-    line: LineOfSight
+    line: LineOfSightState
     seen_ns: int
     sightings: int
     frames: int
@@ -95,7 +277,7 @@ class Track:
         return bool(self.history & 1)
 
 
-class Tracker:
+class ObjectTracker:
     """Owns the tracks."""
 
     def __init__(self, settings: TrackSettings) -> None:
@@ -109,7 +291,7 @@ class Tracker:
         """The confirmed tracks, the oldest first."""
         return tuple(sorted((t for t in self._tracks if t.confirmed), key=lambda track: track.number))
 
-    def predicted(self, number: int, time_ns: int) -> LineOfSight | None:
+    def predicted(self, number: int, time_ns: int) -> LineOfSightState | None:
         """Return the line of sight to the confirmed track of a number; None when it has ended."""
         for track in self._tracks:
             if track.number == number > 0 and time_ns >= track.line.time_ns:
@@ -120,7 +302,7 @@ class Tracker:
         """Forget all tracks."""
         self._tracks = []
 
-    def ingest(self, frame: Sightings) -> tuple[list[Track], list[Track]]:
+    def ingest(self, frame: FrameSightings) -> tuple[list[Track], list[Track]]:
         """Accept a frame, not older than the last; return the tracks confirmed by it, and those it ended.
 
         A frame older than the last raises ValueError.
@@ -148,7 +330,7 @@ class Tracker:
         self._tracks = alive
         return confirmed, ended
 
-    def _associated(self, tracks: list[Track], frame: Sightings, spread: FloatArray) -> dict[int, int]:
+    def _associated(self, tracks: list[Track], frame: FrameSightings, spread: FloatArray) -> dict[int, int]:
         """Return the sighting of each track that has one."""
         pairs = []
         for index, track in enumerate(tracks):
@@ -171,7 +353,7 @@ class Tracker:
                 used.add(chosen)
         return taken
 
-    def _seen(self, track: Track, frame: Sightings, number: int, spread: FloatArray) -> Track:
+    def _seen(self, track: Track, frame: FrameSightings, number: int, spread: FloatArray) -> Track:
         seen = compare(track.line, frame.directions[number], spread[number])
         count = track.sightings + 1
         mean, sigma = _brightness(track, float(frame.magnitudes[number]), min(count, self._settings.within))
@@ -217,7 +399,7 @@ class Tracker:
         sigma = math.sqrt(max(float(along @ track.line.covariance[3:, 3:] @ along), 0.0))
         return rate > self._settings.least_rate and rate > self._settings.moving * sigma
 
-    def _started(self, frame: Sightings, spread: FloatArray, used: set[int], room: int) -> list[Track]:
+    def _started(self, frame: FrameSightings, spread: FloatArray, used: set[int], room: int) -> list[Track]:
         """Return a tentative track for each sighting that no track took, the brightest if room is short."""
         free = [number for number in range(len(frame.directions)) if number not in used]
         free.sort(key=lambda number: float(np.nan_to_num(frame.magnitudes[number], nan=99.0)))
@@ -255,7 +437,7 @@ def _sigma(covariance: FloatArray) -> float:
     return math.sqrt(0.5 * float(np.trace(covariance)))
 
 
-def _with_attitude(frame: Sightings) -> FloatArray:
+def _with_attitude(frame: FrameSightings) -> FloatArray:
     """Return the covariance (n, 3, 3) of the directions with the attitude's share."""
     cross = cross_matrices(frame.directions)
     return np.asarray(frame.covariance + cross @ frame.attitude @ cross.transpose(0, 2, 1))

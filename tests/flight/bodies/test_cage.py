@@ -18,7 +18,7 @@ from flight.schema.testbed import Cage, TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from sim_hal.clock import SimClock
 from sim_hal.lockstep import utc_ns
 from sim_hal.settings import Simulation
@@ -104,7 +104,7 @@ def test_two_coils_make_the_torque_that_was_wanted_of_one_in_any_field_with_less
         field = 1.1 * config.plant.field * np.array([np.sin(direction), 0.0, np.cos(direction)])
         fixed: Any = _Fixed(field, angle, 0.1)
         estimate: Any = type("Now", (), {"time_ns": 0})
-        found = CageTracker(fixed, fixed, plant, fixed, dipole).command(estimate, Sample(0.0, 0.0, 0.0))
+        found = CageTracker(fixed, fixed, plant, fixed, dipole).command(estimate, PathSample(0.0, 0.0, 0.0))
         torque = np.cross(dipole * found.currents, attitude_matrix(about_axis_y(angle)) @ field)
         assert torque[1] == pytest.approx(plant.torque_constant * 0.1 * np.cos(angle), rel=1e-9)
         assert not found.saturated

@@ -17,7 +17,7 @@ from ground.identification.record import FieldMeasurement, Record, read_record
 from ground.identification.scale import AbsolutePlant
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 from tests.scenario import flights
@@ -121,7 +121,7 @@ def fly_bare(
     count = round(duration / PERIOD)
     time, angle, rate, current = (np.zeros(count) for _ in range(4))
     uniform = noise * rng.uniform(-1.0, 1.0, (count, 3))
-    rest = Sample(0.0, 0.0, 0.0)
+    rest = PathSample(0.0, 0.0, 0.0)
     testbed.advance_to(1)
     for k in range(count):
         testbed.advance_to(round(k * PERIOD * 1e9))

@@ -28,15 +28,18 @@ from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import from_rotation_vector, multiply, normalise
 from knightcube.errors import PlanningError
 from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob
-from knightcube.gnc.control.three_axes.slew_table import RESERVE, SlewWish, slew
+from knightcube.gnc.control.three_axes.pointing_job import RESERVE, PointingJob, SlewRequest, slew
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_ends import EndLaw, Whole
-from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
-from knightcube.gnc.guidance.three_axes.slew_path import SlewPath
+from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
-from knightcube.gnc.guidance.three_axes.slew_sky import along, cones
-from knightcube.gnc.guidance.three_axes.slew_task import LEAST_TIME, SlewTask
+from knightcube.gnc.guidance.three_axes.slew_task import (
+    LEAST_TIME,
+    AttitudeEnd,
+    EndLaw,
+    SlewTask,
+    along,
+    cones,
+)
 from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
     FILE,
     flown,
@@ -71,7 +74,7 @@ def orbit(name: str) -> Ephemeris:
     return predict(OrbitState(_DATE, np.array([radius, 0.0, 0.0]), velocity, 0.0), 2.0 * _REVOLUTION)
 
 
-def _whenever(end: Whole) -> EndLaw:
+def _whenever(end: AttitudeEnd) -> EndLaw:
     return lambda _: end
 
 
@@ -89,7 +92,7 @@ def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTa
         q = normalise(rng.normal(size=4))
         angle = rng.uniform(30.0, 180.0)
         turn = np.radians(angle) * normalise(rng.normal(size=3))
-        target = Whole(multiply(from_rotation_vector(turn), q), np.zeros(3))
+        target = AttitudeEnd(multiply(from_rotation_vector(turn), q), np.zeros(3))
         path = orbit(name)
         kept = cones(path, begin, STAR_CAMERA, sun=0.4, earth=0.15, moon=0.2) if with_cones else ()
         task = SlewTask(
@@ -199,7 +202,7 @@ def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
     craft = {"1U": "knightcube", "3U": "cubesat_3u"}[name[:2]]
     place = task.along(np.array([0.0, 1.0])).position
     end = task.end(task.horizon)
-    assert isinstance(end, Whole)
+    assert isinstance(end, AttitudeEnd)
     x, y, z, w = end.quaternion.tolist()
     angles = {"sun": 0.4, "earth": 0.15, "moon": 0.2}
     return PointingJob(
@@ -214,7 +217,7 @@ def _job(name: str, task: SlewTask, draw: FloatArray) -> PointingJob:
         task.rate,
         TORQUE[craft][0] * draw,
         float(task.craft.limit.mean()) / RESERVE,
-        SlewWish(task.horizon, task.craft.weights, np.zeros(3), STAR_CAMERA, angles),
+        SlewRequest(task.horizon, task.craft.weights, np.zeros(3), STAR_CAMERA, angles),
     )
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from tests.knightcube.gnc.guidance.oracle import solve
 from tests.knightcube.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems

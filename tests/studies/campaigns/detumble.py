@@ -22,7 +22,7 @@ from knightcube.astro.earth.field_ahead import FieldAhead
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
+from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, FieldDetumblerSettings
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -146,7 +146,7 @@ class _Law:
         noise = FieldRateSettings(
             inertia=flight.inertia, field_sigma=FIELD_SIGMA, torque_walk=TORQUE_WALK[craft]
         )
-        braking = FieldBraking(limit=flight.limit, horizon=HORIZON[craft])
+        braking = FieldDetumblerSettings(limit=flight.limit, horizon=HORIZON[craft])
         self._instants = braking.instants
         self._field = FieldAhead()
         self._law = FieldDetumbler(SCHEDULE, braking, noise, self._expected)

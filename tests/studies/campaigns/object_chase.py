@@ -1,8 +1,8 @@
 """One flight of campaign `object-flights`: a craft that looks for an object and follows it.
 
 The flight is that of `orbit_pointing_flight`: filter, planner's job and pointing law. What is pointed to is
-decided by the flight's own `ObjectAim` from the flight's own `Tracker`. A frame each two seconds gives an
-attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn.
+decided by the flight's own `ObjectAim` from the flight's own `ObjectTracker`. A frame each two seconds gives
+an attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn.
 The object falls on an orbit of its own, integrated by DOP853.
 """
 
@@ -24,8 +24,7 @@ from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_job import PointingJob
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.tracking.sightings import Sightings
-from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
 from sim_hal.worlds.free_body.section import TipOff
 from tests.studies.campaigns.first_orbits import circular, flow
 from tests.studies.campaigns.free_flight import FreeFlight
@@ -75,8 +74,8 @@ class ObjectChase(PointingFlight):
         self.fields: list[FloatArray] = []
         self._aim = ObjectAim(Sensor(BORESIGHT, FIELD), self.flight.limit, EventLog(self._tell))
         self._aim.aim(PointingTarget(Goal.OBJECT))
-        self._tracker = Tracker(TrackSettings())
-        self._frame: Sightings | None = None
+        self._tracker = ObjectTracker(TrackSettings())
+        self._frame: FrameSightings | None = None
         self._table: tuple[PointingTable, PointingJob, float] | None = None
 
     def fly(self) -> None:
@@ -190,7 +189,7 @@ class ObjectChase(PointingFlight):
             [time, off, float(rate @ BORESIGHT), float(np.linalg.norm(rate)), followed, float(seen)]
         )
 
-    def _sightings(self, true: FloatArray, claim: float, seen: bool) -> Sightings:
+    def _sightings(self, true: FloatArray, claim: float, seen: bool) -> FrameSightings:
         """Return a frame with the object, or without."""
         draw, magnitude = self._draw, self._wanted["magnitude"]
         basis, error = tangent_basis(true), SIGHTING[magnitude][0]
@@ -200,7 +199,7 @@ class ObjectChase(PointingFlight):
         direction /= np.linalg.norm(direction)
         spread = (PIXEL * claim) ** 2 * basis.T @ basis
         shown = slice(0, 1 if seen else 0)
-        return Sightings(
+        return FrameSightings(
             self.flight.time_ns,
             direction[None][shown],
             spread[None][shown],

@@ -25,9 +25,7 @@ from knightcube.astro.quaternion import (
     from_rotation_vector,
     multiply,
 )
-from knightcube.gnc.tracking.line_of_sight import LineOfSight
-from knightcube.gnc.tracking.sightings import Sightings
-from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import FrameSightings, LineOfSightState, ObjectTracker, TrackSettings
 from knightcube.vision.camera.knowledge import EXACT
 from knightcube.vision.camera.pinhole import Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
@@ -79,14 +77,14 @@ def run(case: Case) -> Result:
     rate = math.radians(float(np.exp(rng.uniform(math.log(SLOWEST), math.log(FASTEST)))))
     times = _times(case, rng)
     flown = a_pass(rng, rate, times, rng.uniform(0.0, times[-1]))
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     frames, nees = [], []
     for number, frame in enumerate(_frames(flown, case.parameters["still"], rng)):
         sighted = frame.sighted(magnitude, rng)
         frames.append(frame.judged(sighted, magnitude))
         if sighted is not None:
             seen = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
-            tracker.ingest(Sightings(round(frame.time * 1e9), *seen, observer=frame.observer))
+            tracker.ingest(FrameSightings(round(frame.time * 1e9), *seen, observer=frame.observer))
             if number % JUDGED == JUDGED - 1:
                 nees += [_nees(track.line, frame) for track in tracker.objects if _is_own(track.line, frame)]
     # A frame without an attitude leaves the tracks where they were before it.
@@ -199,12 +197,12 @@ class _Frame:
         return math.sqrt(0.5 * float(np.trace(np.linalg.inv(known[4:, 4:])[:2, :2])))
 
 
-def _is_own(line: LineOfSight, frame: _Frame) -> bool:
+def _is_own(line: LineOfSightState, frame: _Frame) -> bool:
     """Return whether a track is the object's."""
     return bool(np.linalg.norm(line.direction - frame.place) < OWN_TRACK)
 
 
-def _nees(line: LineOfSight, frame: _Frame) -> list[float]:
+def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
     """Return the squared errors of direction and rate over their covariance, two degrees of freedom each."""
     basis = tangent_basis(line.direction)
     found = []

@@ -2,7 +2,7 @@
 
 The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
 pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
-held still (`knightcube.gnc.control.three_axes.astray`). The coils
+held still (`knightcube.gnc.control.three_axes.pointing_law`). The coils
 pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
 Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
 lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
@@ -27,17 +27,14 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.astray import Astray, damping_dipole
-from knightcube.gnc.control.three_axes.pointing import PointingLaw
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
+from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw, damping_dipole
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
-from knightcube.gnc.control.three_axes.slew_table import SlewWish
 from knightcube.gnc.estimation.free_filter import FreeFilter
 from knightcube.gnc.estimation.free_motion import GYRO, TURN, Around
 from knightcube.gnc.estimation.free_settings import FreeFilterSettings
-from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.free_flight import (
     FIELD_NOISE,
@@ -117,7 +114,7 @@ class PointingFlight:
         self._begun, self._ahead_begun, self._arrives = 0.0, -AHEAD, 0.0
         self._ahead: Ephemeris = held.ephemeris(0.0)
         self._stars: FloatArray | None = None
-        self._astray = Astray()
+        self._astray = PathRecovery()
         self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
@@ -239,10 +236,10 @@ class PointingFlight:
         self._fly(table, time)
         self._arrives = time if table.slew is None else time + pointing_job.LEAD + table.slew.horizon
 
-    def _wish(self, time: float) -> SlewWish:
+    def _wish(self, time: float) -> SlewRequest:
         """Return how a slew is wanted at a time."""
         craft, lit = self._wanted["craft"], self._around(time).sunlit
-        return SlewWish(SLEW[craft], np.full(3, WATTS[craft]), self._filter.residual_dipole(lit), CAMERA)
+        return SlewRequest(SLEW[craft], np.full(3, WATTS[craft]), self._filter.residual_dipole(lit), CAMERA)
 
     def _fly(self, table: PointingTable, time: float) -> None:
         """Fly a table from now on if it is finite, as the flight does. Raises LookupError without any."""

@@ -27,9 +27,9 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
 from knightcube.gnc.estimation.free_motion import Around
-from knightcube.gnc.guidance.three_axes.attitude_law import References, references
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_path import SlewPath
+from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, PointingFlight
 
@@ -65,7 +65,7 @@ class SlewFlight(PointingFlight):
         super().__init__({**wanted, "law": "whole", "target": _inertial(start)}, seed)
         self._slews_by, self._slews = wanted["law"], False
         self._from: tuple[float, FloatArray] | None = None
-        self._about: References | None = None
+        self._about: AttitudeReferences | None = None
 
     def fly(self) -> tuple[float, float, float]:
         """Fly hold and slew: deg off the target at the end, heat J, and that of the planned path.
@@ -111,7 +111,7 @@ class SlewFlight(PointingFlight):
             self._fly(self._along_axis(self._about), time)
         return table.slew
 
-    def _one_axis(self, quaternion: FloatArray, turn: FloatArray) -> References:
+    def _one_axis(self, quaternion: FloatArray, turn: FloatArray) -> AttitudeReferences:
         """Return the turn about one axis, in times since its begin."""
 
         def law(_: object, times: FloatArray) -> FloatArray:
@@ -121,7 +121,7 @@ class SlewFlight(PointingFlight):
 
         return references(law, self._ahead, np.arange(2.0, self.horizon + TAIL, KNOT))
 
-    def _along_axis(self, about: References) -> PointingTable:
+    def _along_axis(self, about: AttitudeReferences) -> PointingTable:
         """Return the table of the turn about one axis."""
         ahead = self.flight.ephemeris(self.horizon + TAIL + 60.0)
         field, position = ahead.field_at(about.times), ahead.position_at(about.times)

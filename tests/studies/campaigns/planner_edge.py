@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from tests.knightcube.gnc.guidance.oracle import solve
 from tests.knightcube.gnc.guidance.problems import KNIGHTCUBE, Problem
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

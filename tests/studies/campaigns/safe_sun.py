@@ -19,7 +19,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.sun.strings import SolarStrings, coarse_sun
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
@@ -67,8 +67,10 @@ class SafeFlight:
         self._strings = SolarStrings()
         gains = GAIN_ERROR * self._draws.standard_normal(len(self._strings.peaks))
         self._light = SolarStringsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
-        seeking = Seeking(inertia=np.diag(self._flight.inertia), axis=AXIS, limit=self._flight.limit)
-        self.law = SunSeeker(SCHEDULE, seeking)
+        seeking = SunAcquisitionSettings(
+            inertia=np.diag(self._flight.inertia), axis=AXIS, limit=self._flight.limit
+        )
+        self.law = SunAcquisition(SCHEDULE, seeking)
         self.notes: list[tuple[float, float, float, float]] = []
 
     def window(self, seconds: float) -> None:

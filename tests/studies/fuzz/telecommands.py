@@ -24,7 +24,7 @@ from flight.link.commands.values import (
 )
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.parameters import FIELDS
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.logs import ccitt, hostile

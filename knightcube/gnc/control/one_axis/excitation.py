@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from knightcube.errors import UsageError
-from knightcube.gnc.control.one_axis.controller import CoilCommand, attitude_error
-from knightcube.gnc.control.one_axis.lq_tracker import LqTracker
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.control.one_axis.lq_tracker import CurrentCommand, LqTracker, attitude_error
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 
 _REST_ANGLE = 0.03
@@ -96,19 +95,21 @@ class ExcitationController:
         """Whether the tracker failed to bring the body to rest."""
         return self._phase is _Phase.GIVEN_UP
 
-    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+    def command(
+        self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
+    ) -> CurrentCommand:
         """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
 
         `wanted` is the rest position between manoeuvres. Raises UsageError when an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if self._phase is _Phase.GIVEN_UP:
-            return CoilCommand.without_authority(error)
+            return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
             if pulse is not None and self._has_room(angle, rate):
                 self._elapsed += self._period
-                return CoilCommand.within(self._limit, pulse.share * self._limit, error)
+                return CurrentCommand.within(self._limit, pulse.share * self._limit, error)
             self._come_to_rest()
         self._wait(error, rate)
         return self._tracker.command(wanted, angle, rate, disturbance)

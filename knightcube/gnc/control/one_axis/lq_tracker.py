@@ -10,25 +10,86 @@ e'' = v is solved for w' and the plant model gives the current; v = -K (e', e) w
 equation.
 
 Two things go beyond the thesis; `as_in_thesis` restores its loop. First, the estimated disturbance is fed
-forward: the estimator integrates the acceleration that the model did not predict, so that a constant torque
-leaves no offset, and it knows the current that was written, limits included, so that nothing winds up while
-the coil saturates. Second, an error is reduced no faster than the coil can brake: at the rate s e,
-s = K_e / K_e', up to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which constant braking A
-leads to that distance (the proximate time-optimal servo, Workman 1987, here with a continuous slope too).
-A linear law overshoots there.
+forward. The estimator integrates the acceleration that the model did not predict, so that a constant torque
+leaves no offset. It knows the current that was written, limits included, so that nothing winds up while
+the coil saturates. Second, an error is reduced no faster than the coil can decelerate: at the rate s e,
+s = K_e / K_e', up to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which a constant
+deceleration A leads to that distance (the proximate time-optimal servo, Workman 1987, here with a continuous
+slope too). A linear law overshoots there.
 
 e is monotone in d only up to 90 degrees. Beyond `largest_error` d is clamped, its sign kept, so that the
 demand stays bounded and does not weaken as sin(d) falls again.
+
+`CurrentCommand` and `AngleController` are the inputs and outputs that all controllers of the angle share.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Protocol
 
 from knightcube.errors import UsageError
-from knightcube.gnc.control.one_axis.controller import CoilCommand, attitude_error
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentCommand:
+    """A controller's command to the coil.
+
+    Attributes:
+        current: A, within the limit.
+        demanded: A, before the limit; zero without authority.
+        saturated: the limit was applied.
+        authority: cos(theta) was large enough to make a torque; when False the current is zero.
+        error: theta_p - theta in rad, as measured, in [-pi, pi].
+        held: the error exceeded the largest allowed and was clamped to it.
+    """
+
+    current: float
+    demanded: float
+    saturated: bool
+    authority: bool
+    error: float
+    held: bool = False
+
+    @classmethod
+    def within(cls, limit: float, demanded: float, error: float, held: bool = False) -> CurrentCommand:
+        """Return the command for `demanded` A, limited to +-`limit` A."""
+        current = min(max(demanded, -limit), limit)
+        return cls(current, demanded, current != demanded, True, error, held)
+
+    @classmethod
+    def without_authority(cls, error: float) -> CurrentCommand:
+        """Return the zero command for an angle at which no current turns the body."""
+        return cls(0.0, 0.0, False, False, error)
+
+
+class AngleController(Protocol):
+    """Computes a coil current from the commanded and the estimated motion, once per control cycle."""
+
+    def command(
+        self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
+    ) -> CurrentCommand:
+        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
+
+        Raises UsageError when an input is not finite.
+        """
+
+    def reset(self) -> None:
+        """Clear integrated state, after the coils were off or the state was lost."""
+
+
+def attitude_error(wanted: PathSample, angle: float, rate: float, disturbance: float) -> float:
+    """Return theta_p - theta in [-pi, pi], rad; raises UsageError when an input is not finite."""
+    total = wanted.angle + wanted.rate + wanted.acceleration + angle + rate + disturbance
+    if not math.isfinite(total):
+        raise UsageError(
+            f"controller input is not finite: {wanted}, angle {angle}, rate {rate}, disturbance {disturbance}"
+        )
+    return math.remainder(wanted.angle - angle, 2.0 * math.pi)
+
 
 LARGEST_ERROR = 1.0
 LEAST_AUTHORITY = 0.05
@@ -72,14 +133,16 @@ class LqTracker:
         self._strength = plant.torque_constant * plant.current_limit / plant.inertia
         self.rate_gain, self.error_gain = lq_gains(state_weight, input_weight)
 
-    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+    def command(
+        self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
+    ) -> CurrentCommand:
         """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
 
         Raises UsageError when an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if abs(math.cos(angle)) < self._least_authority:
-            return CoilCommand.without_authority(error)
+            return CurrentCommand.without_authority(error)
         held = abs(error) > self._largest_error
         used = math.copysign(self._largest_error, error) if held else error
         sine, cosine = math.sin(used), math.cos(used)
@@ -92,7 +155,7 @@ class LqTracker:
             v = -self.rate_gain * (cosine * lag + approach)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine - disturbance
         demanded = self._plant.current(angle, rate, acceleration)
-        return CoilCommand.within(self._plant.current_limit, demanded, error, held)
+        return CurrentCommand.within(self._plant.current_limit, demanded, error, held)
 
     def _braking(self, wanted_angle: float, angle: float, disturbance: float) -> float:
         """Return the deceleration available between here and the path, rad/s^2."""

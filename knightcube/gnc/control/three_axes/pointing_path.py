@@ -1,15 +1,28 @@
-"""The path of pointing: how a body gets from where it is into its attitude law, and stays there.
+"""The path of pointing: the optimal motion of a body from its attitude into its attitude law, by LQ sweeps.
 
-The path is the optimum of one criterion, turn against the law and dipole, over the field and the torques
-expected, with the whole motion of the body and the limit of its coils. It is found by iterative
-linear-quadratic sweeps (Li & Todorov 2004, ICINCO; Tassa, Erez & Todorov 2012, IROS): each sweeps about the
-last motion, and flies what it found. Coils make no torque along the field, so motions that begin far off
-would tumble. The first sweeps may have such a torque, at a price that rises until none is left.
+The errors x are the small rotation and the rate error of the body relative to a motion, in the motion's axes.
+With the field b(t) expected in these axes,
+
+    turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
+
+where G is the stiffness of the gravity gradient and f the torque that the motion needs and that no other
+source provides. Riccati's equation is integrated backwards with its affine part s, cost-to-go
+x^T S x / 2 + s^T x (Psiaki 2001, J. Guid. Control Dyn. 24(2), with the preview added). The dipole is
+m = -(K x + k), held over a step. Each affine part has columns of its own, and k is linear in them. There may
+be controls besides the dipole.
+
+The path minimises one criterion, rotation error relative to the law plus dipole, over the field and the
+torques expected, with the full motion of the body and the limit of its coils. It is found by iterative
+linear-quadratic sweeps (Li & Todorov 2004, ICINCO; Tassa, Erez & Todorov 2012, IROS). Each iteration
+linearises about the last motion and simulates the result. Coils make no torque along the field, so motions
+that begin far off the law would tumble. The first sweeps therefore allow such a torque, at a cost that rises
+until the torque vanishes.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,8 +40,155 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import PlanningError
-from knightcube.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised, sweep
-from knightcube.gnc.guidance.three_axes.attitude_law import References
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+
+_EYE3: FloatArray = np.eye(3)
+_EYE6: FloatArray = np.eye(6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearErrorModel:
+    """The motion of the errors over n steps.
+
+    Attributes:
+        transition: (n, 6, 6).
+        by_control: (n, 6, controls), of `linearised` by A m^2 of each coil.
+        by_torque: (n, 6, 3), by N m.
+        missing: (n, 3) N m, f: the torque that the motion takes besides gravity's.
+        field: (n, 3) T in the motion's axes.
+    """
+
+    transition: FloatArray
+    by_control: FloatArray
+    by_torque: FloatArray
+    missing: FloatArray
+    field: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepCost:
+    """The cost of n steps: x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u.
+
+    Attributes:
+        state: (n, 6, 6).
+        control: (n, controls).
+        state_slope, control_slope: (n, 6, columns) and (n, controls, columns).
+    """
+
+    state: FloatArray
+    control: FloatArray
+    state_slope: FloatArray
+    control_slope: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostToGo:
+    """The cost-to-go: `square` (6, 6) S and `slope` (6, columns) s."""
+
+    square: FloatArray
+    slope: FloatArray
+
+
+def linearised(
+    references: AttitudeReferences,
+    inertia: FloatArray,
+    field: FloatArray,
+    position: FloatArray,
+    dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> LinearErrorModel:
+    """Return the motion of the errors about references; `field` (n, 3) T, `position` (n, 3) m, ICRS.
+
+    `dipole` (n, 3) A m^2 is held in body axes meanwhile: an error turns the field that it acts on. Likewise
+    of each `pressed`: a constant (3,) of the body, N m, and the direction (n, 3) ICRS, with which it makes a
+    torque.
+    """
+    rate, inverse = references.rate, np.linalg.inv(inertia)
+    slopes, shown, up = acceleration_slopes(
+        references.quaternion, rate, inertia, field, position, dipole, pressed
+    )
+    flow = np.zeros((len(rate), 6, 6))
+    flow[:, :3, :3], flow[:, :3, 3:], flow[:, 3:] = -cross_matrices(rate), _EYE3, slopes
+    dt = float(references.times[1] - references.times[0])
+    transition, pushed = _discrete(flow, dt)
+    by_torque = pushed @ inverse
+    momentum = rate @ inertia.T
+    missing = references.acceleration @ inertia.T + np.cross(rate, momentum) - _gradient(inertia, up)[0]
+    return LinearErrorModel(transition, -by_torque @ cross_matrices(shown), by_torque, missing, shown)
+
+
+def acceleration_slopes(
+    quaternion: FloatArray,
+    rate: FloatArray,
+    inertia: FloatArray,
+    field: FloatArray,
+    position: FloatArray,
+    dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how the accelerations change with turn and rate (n, 3, 6), and field and place in body axes.
+
+    Of attitudes (n, 4) and rates (n, 3) rad/s; the rest as in `linearised`.
+    """
+    turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
+    shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
+    slopes = np.empty((len(rate), 3, 6))
+    by_turn = _gradient(inertia, up)[1]
+    if dipole is not None:
+        by_turn = by_turn + cross_matrices(dipole) @ cross_matrices(shown)
+    for constant, direction in pressed:
+        met = cross_matrices(np.einsum("nij,nj->ni", turned, direction))
+        by_turn = by_turn + cross_matrices(constant[None]) @ met
+    slopes[:, :, :3] = inverse @ by_turn
+    slopes[:, :, 3:] = inverse @ (cross_matrices(rate @ inertia.T) - cross_matrices(rate) @ inertia)
+    return slopes, shown, up
+
+
+def sweep(
+    linear: LinearErrorModel, affine: FloatArray, cost: SweepCost, end: CostToGo
+) -> tuple[FloatArray, FloatArray, CostToGo]:
+    """Return K (n, controls, 6), k (n, controls, columns) and the cost-to-go at the begin.
+
+    `affine` (n, 6, columns) is what the errors are moved by; `end` is the cost-to-go after the steps. Takes
+    0.1 ms a step.
+    """
+    (count, controls), columns = cost.control.shape, affine.shape[2]
+    gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
+    square, slope = end.square, end.slope
+    for k in range(count - 1, -1, -1):
+        push, drive = linear.by_control[k], linear.transition[k]
+        pushed = square @ push
+        spread = push.T @ pushed
+        spread.reshape(-1)[:: controls + 1] += cost.control[k]
+        ahead = slope + square @ affine[k]
+        sides = np.concatenate([pushed.T @ drive, push.T @ ahead + cost.control_slope[k]], axis=1)
+        found = np.linalg.solve(spread, sides)
+        gain[k], steady[k] = found[:, :6], found[:, 6:]
+        slope = drive.T @ ahead - sides[:, :6].T @ found[:, 6:] + cost.state_slope[k]
+        square = drive.T @ square @ drive - sides[:, :6].T @ found[:, :6] + cost.state[k]
+        square = 0.5 * (square + square.T)
+    return gain, steady, CostToGo(square, slope)
+
+
+def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return gravity's torque (n, 3) and how it changes with the turn (n, 3, 3); `up` (n, 3) m, body axes."""
+    radius = np.linalg.norm(up, axis=1)
+    down = -up / radius[:, None]
+    strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
+    stiff = down @ inertia.T
+    crossed = cross_matrices(down)
+    stiffness = strength[:, None, None] * ((crossed @ inertia - cross_matrices(stiff)) @ crossed)
+    return strength[:, None] * np.cross(down, stiff), stiffness
+
+
+def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return exp(F dt) (n, 6, 6) and its integral's rate columns (n, 6, 3), to the third order."""
+    first = flow * dt
+    second = first @ first
+    transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
+    integral = dt * (_EYE6 + 0.5 * first + second / 6.0)
+    return transition, integral[:, :, 3:]
+
 
 RISES = (4.0, 2.0, 10.0)
 """Factors from price to price, tried in turn until a path settles: they lead to different optima."""
@@ -51,7 +211,7 @@ RUN_AWAY = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
+class PathConditions:
     """What is expected at the n + 1 instants of a path.
 
     Attributes:
@@ -63,7 +223,7 @@ class Expected:
         limit: A m^2 of each coil.
     """
 
-    wanted: References
+    wanted: AttitudeReferences
     field: FloatArray
     position: FloatArray
     pressures: Pressures
@@ -92,7 +252,7 @@ class Expected:
         air, light = self.pressures.air[:count], self.pressures.light[:count]
         return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
 
-    def until(self, count: int) -> Expected:
+    def until(self, count: int) -> PathConditions:
         """Return what is expected at the first `count` instants."""
         field, position, pressures = self.field[:count], self.position[:count], self.pressures.until(count)
         return replace(
@@ -140,7 +300,7 @@ class Expected:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Criterion:
+class PathCriterion:
     """What a step costs.
 
     Attributes:
@@ -154,13 +314,13 @@ class Criterion:
 
     state: FloatArray
     dipole: float
-    end: ToGo
+    end: CostToGo
     shape: FloatArray
     fastest: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class PlannedMotion:
     """A motion: attitudes (n + 1, 4), rates (n + 1, 3) rad/s, and controls (n, 4) held over the steps.
 
     A control is a dipole, A m^2, body axes, and a torque along the field, N m.
@@ -170,27 +330,29 @@ class Motion:
     rate: FloatArray
     control: FloatArray
 
-    def references(self, times: FloatArray) -> References:
+    def references(self, times: FloatArray) -> AttitudeReferences:
         """Return the motion as references at its times (n + 1,) s."""
         rises = np.diff(self.rate, axis=0) / (times[1] - times[0])
-        return References(times, self.quaternion, self.rate, np.concatenate([rises, rises[-1:]]))
+        return AttitudeReferences(times, self.quaternion, self.rate, np.concatenate([rises, rises[-1:]]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Gains:
+class MotionGains:
     """Gains K (n, 4, 6) about a motion, and k (n, 4, columns): what betters it, and by each size."""
 
     gain: FloatArray
     steady: FloatArray
 
 
-def best_path(expected: Expected, begun: References, criterion: Criterion) -> tuple[Motion, Gains]:
+def best_path(
+    expected: PathConditions, begun: AttitudeReferences, criterion: PathCriterion
+) -> tuple[PlannedMotion, MotionGains]:
     """Return the path from the begin of `begun` (n + 1,) and its gains; `begun` leads into the law.
 
     Coils need not manage `begun`. Takes 0.3 ms an instant and sweep. Raises PlanningError where the body
     turns by too much in a step to be followed.
     """
-    rest = Motion(begun.quaternion, begun.rate, np.zeros((len(begun.times) - 1, 4)))
+    rest = PlannedMotion(begun.quaternion, begun.rate, np.zeros((len(begun.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
     near = float(_counted(expected.wanted, first, criterion).max()) < NEAR
     best, least = first, math.inf
@@ -208,13 +370,13 @@ def best_path(expected: Expected, begun: References, criterion: Criterion) -> tu
     return best, _swept(expected, best, criterion, PROHIBITIVE)
 
 
-def _first(expected: Expected, rest: Motion, gains: Gains) -> Motion:
+def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
     """Return the motion that the sweeps begin with: under gains, or without control where those drive it out.
 
     The torque along the field has no limit, so that far from `rest` the gains may turn the body by several
     revolutions in a step.
     """
-    nothing = Gains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
+    nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
     for tried in (gains, nothing):
         if (first := fly(expected, rest, tried, 1.0)) is not None:
             return first
@@ -222,7 +384,9 @@ def _first(expected: Expected, rest: Motion, gains: Gains) -> Motion:
     raise PlanningError(f"no path: from {fastest:.1f} deg/s on the body turns by too much in a step")
 
 
-def _bettered(expected: Expected, motion: Motion, criterion: Criterion, price: float) -> Motion:
+def _bettered(
+    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, price: float
+) -> PlannedMotion:
     """Return the best motion near a flown one at a price of torques along the field."""
     cost = _cost(expected, motion, criterion, price)
     enough = SAVED[price == PROHIBITIVE]
@@ -239,7 +403,9 @@ def _bettered(expected: Expected, motion: Motion, criterion: Criterion, price: f
     return motion
 
 
-def fly(expected: Expected, motion: Motion, gains: Gains, share: float) -> Motion | None:
+def fly(
+    expected: PathConditions, motion: PlannedMotion, gains: MotionGains, share: float
+) -> PlannedMotion | None:
     """Return the motion from the same begin with a share of the change that was found, and feedback.
 
     None where it runs away: far from `motion` the torques along the field, which have no limit, drive it out.
@@ -259,12 +425,16 @@ def fly(expected: Expected, motion: Motion, gains: Gains, share: float) -> Motio
         w = w + step * expected.acceleration(k, half, middle, u)
         q = multiply(from_rotation_vector(step * middle), q)
         quaternion[k + 1], rate[k + 1], flown[k] = q, w, u
-    return Motion(quaternion, rate, flown) if np.abs(w).max() < RUN_AWAY else None
+    return PlannedMotion(quaternion, rate, flown) if np.abs(w).max() < RUN_AWAY else None
 
 
 def _swept(
-    expected: Expected, motion: Motion, criterion: Criterion, price: float, given: bool = False
-) -> Gains:
+    expected: PathConditions,
+    motion: PlannedMotion,
+    criterion: PathCriterion,
+    price: float,
+    given: bool = False,
+) -> MotionGains:
     """Return the gains about a motion; one that is `given` takes torques that its controls do not make."""
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
@@ -296,13 +466,13 @@ def _swept(
     slope[:, 0] += turned[-1] @ end.square @ astray[-1]
     slope[3:, 0] += steep[-1]
     square[3:, 3:] += curved[-1]
-    last = ToGo(square, slope)
-    cost = Cost(states, control, state_slope, control_slope)
+    last = CostToGo(square, slope)
+    cost = SweepCost(states, control, state_slope, control_slope)
     gain, steady, _ = sweep(linear, affine, cost, last)
-    return Gains(gain, steady)
+    return MotionGains(gain, steady)
 
 
-def _cost(expected: Expected, motion: Motion, criterion: Criterion, price: float) -> float:
+def _cost(expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, price: float) -> float:
     """Return what a motion costs, with the cost-to-go after it."""
     astray, end = off(expected.wanted, motion), criterion.end
     strength = np.linalg.norm(expected.field[:-1], axis=1)
@@ -325,20 +495,20 @@ def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, F
     return price * excess[:, None] * along, price * curved
 
 
-def off(wanted: References, motion: Motion) -> FloatArray:
+def off(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
     """Return the turn and the rate (n + 1, 6) of a motion against the law."""
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     return np.concatenate([turn, motion.rate - wanted.rate], axis=1)
 
 
-def _counted(wanted: References, motion: Motion, criterion: Criterion) -> FloatArray:
+def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
     """Return the turn (n + 1,) rad against the law as it counts: one about a cheap axis by its price."""
     turn, price = off(wanted, motion)[:, :3], criterion.state[:3, :3]
     squares = np.einsum("ni,ij,nj->n", turn, price, turn)
     return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(price)[-1]))
 
 
-def bends(wanted: References, motion: Motion) -> FloatArray:
+def bends(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
     """Return how the turn against the law changes with a small turn of the body, (n + 1, 6, 6).
 
     The inverse of the left Jacobian of the rotation group, with the signs of this house's quaternions.

@@ -1,26 +1,272 @@
-"""The table of the pointing law: a path, and gains along it.
+"""The table of the pointing law: the best motion over the revolution ahead, and gains along it.
 
-The path is the begin of the best course of the whole revolution (`pointing_course`). Where none is found, or
-the coils do not suffice for it, it is the best path (`pointing_path`), beyond whose end the law itself is the
-path: a sweep over a revolution of preview gives what an error at the end would cost (`pointing_sweep`).
+The motion is found by multiple shooting. It is improved by linear-quadratic steps about itself, each as long
+as it improves a merit function: the cost plus the weighted defects (Nocedal & Wright 2006, Numerical
+Optimization, algorithm 18.3). Unlike the sweeps of `pointing_path`, the intermediate motions need not be
+feasible: the state to which the equations of motion propagate each instant is compared with the next instant,
+and the next step removes the defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not
+grow along a revolution, in which a body that coils cannot hold about the field rotates far about its pointing
+axis. A step takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the derivative is
+that of the discrete step: the derivative of the continuous motion would lead a body that rotates by degrees
+in a step to motions that no step improves.
+
+If no such motion is found, or the coils do not suffice for it, the table holds the best path of
+`pointing_path`. Beyond the end of that path the law itself is the path: a sweep over a revolution of preview
+gives the cost of an error at the end.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_matrices
 from knightcube.astro.earth.disturbance import AIR, LIGHT, Pressures, shapes
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from knightcube.errors import UsageError
-from knightcube.gnc.control.three_axes.pointing_course import best_course
-from knightcube.gnc.control.three_axes.pointing_path import Criterion, Expected, best_path
-from knightcube.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised, sweep
-from knightcube.gnc.guidance.three_axes.attitude_law import References
-from knightcube.gnc.guidance.three_axes.slew_path import SlewPath
+from knightcube.gnc.control.three_axes.pointing_path import (
+    CostToGo,
+    LinearErrorModel,
+    MotionGains,
+    PathConditions,
+    PathCriterion,
+    PlannedMotion,
+    SweepCost,
+    acceleration_slopes,
+    bends,
+    best_path,
+    linearised,
+    off,
+    sweep,
+)
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
+
+_TURN, _RATE, _DIPOLE, _TORQUE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+_EYE: FloatArray = np.eye(3)
+
+
+def carried(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
+    """Return the attitudes (n, 4) and rates (n, 3) rad/s to which the steps lead."""
+    step, count = expected.step, len(motion.control)
+    half, middle = _halfway(expected, motion)
+    there = multiply(from_rotation_vector(step * middle), motion.quaternion[:count])
+    return there, motion.rate[:count] + step * expected.accelerations(half, middle, motion.control)
+
+
+def missed(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
+    """Return by how much (n, 6) each instant's turn and rate are carried past those of the next instant."""
+    there, speed = carried(expected, motion)
+    turn = to_rotation_vector(multiply(there, conjugate(motion.quaternion[1:])))
+    return np.concatenate([turn, speed - motion.rate[1:]], axis=1)
+
+
+def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorModel:
+    """Return how the state after each step changes with that before it, dipole and torque."""
+    step, count = expected.step, len(motion.control)
+    q, w, dipole = motion.quaternion[:count], motion.rate[:count], motion.control
+    half, middle = _halfway(expected, motion)
+    inverse, around = expected.inverse, (expected.inertia, expected.field[:count], expected.position[:count])
+    pressed = expected.pressed(count)
+    first, shown, _ = acceleration_slopes(q, w, *around, dipole, pressed)
+    second, seen, _ = acceleration_slopes(half, middle, *around, dipole, pressed)
+
+    begun = np.concatenate([first, _pushes(inverse, shown)], axis=2)
+    rate = 0.5 * step * begun
+    rate[:, :, _RATE] += _EYE
+    turn = np.zeros((count, 3, 12))
+    turn[:, :, _TURN] = attitude_matrix(from_rotation_vector(0.5 * step * w))
+    turn[:, :, _RATE] = 0.5 * step * _turned(0.5 * step * w)
+    change = np.empty((count, 6, 12))
+    change[:, 3:] = step * (second[:, :, :3] @ turn + second[:, :, 3:] @ rate)
+    change[:, 3:, 6:] += step * _pushes(inverse, seen)
+    change[:, 3:, _RATE] += _EYE
+    change[:, :3] = step * _turned(step * middle) @ rate
+    change[:, :3, _TURN] += attitude_matrix(from_rotation_vector(step * middle))
+    return LinearErrorModel(
+        change[:, :, :6], change[:, :, _DIPOLE], change[:, :, _TORQUE], np.zeros((count, 3)), shown
+    )
+
+
+def _halfway(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
+    """Return attitudes (n, 4) and rates (n, 3) in the middle of the steps."""
+    step, count = expected.step, len(motion.control)
+    q, w = motion.quaternion[:count], motion.rate[:count]
+    middle = w + 0.5 * step * expected.accelerations(q, w, motion.control)
+    return multiply(from_rotation_vector(0.5 * step * w), q), middle
+
+
+def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
+    """Return how accelerations change with dipole and torque (n, 3, 6) in a field (n, 3) of body axes."""
+    return np.concatenate(
+        [-inverse @ cross_matrices(shown), np.broadcast_to(inverse, (len(shown), 3, 3))], axis=2
+    )
+
+
+def _turned(vector: FloatArray) -> FloatArray:
+    """Return how the turn by a rotation vector (n, 3) changes with the vector (n, 3, 3).
+
+    The left Jacobian of the rotation group, with the signs of this house's quaternions.
+    """
+    angle = np.linalg.norm(vector, axis=1)[:, None, None]
+    safe = np.where(angle < 1e-2, 1.0, angle)
+    one = np.where(angle < 1e-2, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    two = np.where(angle < 1e-2, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    across = cross_matrices(vector)
+    return np.asarray(_EYE - one * across + two * across @ across)
+
+
+STEPS = 40
+"""Largest number of steps."""
+FARTHEST = math.radians(30.0)
+"""rad that a step may turn the motion at any instant; a larger one is scaled as a whole."""
+HALVES = 6
+"""How often a step is halved until the motion is better by it."""
+DEARER = 1.2
+"""What the equations not kept cost in the merit, by what they are worth to the cost."""
+DONE = math.radians(0.05)
+"""rad: a step that turns the motion by less is the last, and one that saves less than SAVED of the merit."""
+SAVED = 1e-4
+ENOUGH = 0.01
+"""Of the cost: what a motion may lack of its equations, by its price. A cost of one is beneath notice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ShootingStep:
+    """A whole step: the change (n + 1, 6) of turn and rate, that (n, 3) of the dipole, and how it was found.
+
+    `turned` is how far it turns the motion at most, rad; `worth` (6,) is how much the cost changes at most
+    with what lacks at an instant.
+    """
+
+    change: FloatArray
+    control: FloatArray
+    gains: MotionGains
+    linear: LinearErrorModel
+    turned: float
+    worth: FloatArray
+
+
+def best_course(
+    expected: PathConditions, begun: AttitudeReferences, state: FloatArray, dipole: float, fastest: float
+) -> tuple[PlannedMotion, MotionGains] | None:
+    """Return the best motion from the begin of `begun` over all that is expected, and the gains about it.
+
+    `begun` (n + 1,) leads into the law and is what will be flown; `state` (6, 6) and `dipole` are what a step
+    costs (`pointing_table.prices`). None where no motion is found within `STEPS`, where it needs more dipole
+    than there is, or turns faster than `fastest` rad/s meanwhile.
+    """
+    count, first = len(expected.field) - 1, len(begun.times)
+    quaternion = np.concatenate([begun.quaternion, expected.wanted.quaternion[first:]])
+    rate = np.concatenate([begun.rate, expected.wanted.rate[first:]])
+    motion = PlannedMotion(quaternion, rate, np.zeros((count, 3)))
+    criterion = _Merit(expected, state, dipole)
+    for _ in range(STEPS):
+        step = _direction(criterion, motion)
+        if not step.turned < math.inf:
+            return None
+        criterion.dear = np.maximum(criterion.dear, DEARER * step.worth)
+        before = sum(criterion.merit(motion))
+        better = _better(criterion, motion, step, before)
+        motion = motion if better is None else better
+        cost, lack = criterion.merit(motion)
+        kept = lack <= ENOUGH * (1.0 + cost)
+        if better is None or (kept and (step.turned < DONE or before - cost - lack < SAVED * (1.0 + before))):
+            break
+    strongest = float(np.abs(motion.control).max())
+    speed = float(np.linalg.norm(motion.rate[:first], axis=1).max())
+    return (motion, step.gains) if kept and strongest <= expected.limit and speed <= fastest else None
+
+
+@dataclass(eq=False)
+class _Merit:
+    """What a motion costs: `state` (6, 6) and `dipole` a step, and `dear` (6,) for what it lacks."""
+
+    expected: PathConditions
+    state: FloatArray
+    dipole: float
+    dear: FloatArray = field(default_factory=lambda: np.zeros(6))
+
+    def merit(self, motion: PlannedMotion) -> tuple[float, float]:
+        """Return the cost of a motion, and the price of what it lacks of the equations of motion."""
+        astray = off(self.expected.wanted, motion)
+        squares = float(np.einsum("ni,ij,nj->", astray, self.state, astray))
+        squares += self.dipole * float(np.sum(motion.control**2))
+        return 0.5 * squares, float(self.dear @ np.abs(missed(self.expected, motion)).sum(axis=0))
+
+
+def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
+    """Return the whole linear-quadratic step from a motion, and the gains about it."""
+    expected, state, dipole = criterion.expected, criterion.state, criterion.dipole
+    count, wanted, sizes = len(motion.control), expected.wanted, expected.sizes
+    shown = attitude_matrix(motion.quaternion[:count])
+    linear = derivative(expected, motion)
+    affine = np.zeros((count, 6, 1 + len(sizes)))
+    affine[:, :, 0] = missed(expected, motion)
+    affine[:, :, 1:] = linear.by_torque @ shapes(expected.pressures.until(count), shown)
+    turned, astray = bends(wanted, motion), off(wanted, motion)
+    back = np.swapaxes(turned, 1, 2)
+    states, slopes = back @ state @ turned, np.einsum("nij,nj->ni", back @ state, astray)
+    state_slope, control_slope = np.zeros(affine.shape), np.zeros((count, 3, affine.shape[2]))
+    state_slope[:, :, 0], control_slope[:, :, 0] = slopes[:-1], dipole * motion.control
+    end = np.zeros((6, affine.shape[2]))
+    end[:, 0] = slopes[-1]
+    cost = SweepCost(states[:-1], np.full((count, 3), dipole), state_slope, control_slope)
+    gain, steady, _ = sweep(linear, affine, cost, CostToGo(states[-1], end))
+    change, control = np.zeros((count + 1, 6)), np.empty((count, 3))
+    for k in range(count):
+        control[k] = -(gain[k] @ change[k] + steady[k, :, 0])
+        change[k + 1] = linear.transition[k] @ change[k] + linear.by_control[k] @ control[k] + affine[k, :, 0]
+    turns = np.linalg.norm(change[:, :3], axis=1)
+    own = np.einsum("nij,nj->ni", states, change) + slopes
+    worth, most = own[-1], np.abs(own[-1])
+    for k in range(count - 1, 0, -1):
+        worth = linear.transition[k].T @ worth + own[k]
+        most = np.maximum(most, np.abs(worth))
+    return _ShootingStep(change, control, MotionGains(gain, steady), linear, float(turns.max()), most)
+
+
+def _better(
+    criterion: _Merit, motion: PlannedMotion, step: _ShootingStep, before: float
+) -> PlannedMotion | None:
+    """Return the motion after as much of a step as betters the merit `before`; None where no part does."""
+    share = min(1.0, FARTHEST / max(step.turned, DONE))
+    for _ in range(HALVES):
+        moved = _moved(motion, share * step.change, share * step.control)
+        if sum(criterion.merit(moved)) < before:
+            return moved
+        closed = _closed(criterion.expected, moved, step)
+        if sum(criterion.merit(closed)) < before:
+            return closed
+        share *= 0.5
+    return None
+
+
+def _closed(expected: PathConditions, moved: PlannedMotion, step: _ShootingStep) -> PlannedMotion:
+    """Return a motion that lacks less of its equations, which a step has bent: a second-order correction."""
+    lack, gain = missed(expected, moved), step.gains.gain
+    change, control = np.zeros((len(gain) + 1, 6)), np.empty((len(gain), 3))
+    transition, push = step.linear.transition, step.linear.by_control
+    for k in range(len(gain)):
+        control[k] = -gain[k] @ change[k]
+        change[k + 1] = transition[k] @ change[k] + push[k] @ control[k] + lack[k]
+    return _moved(moved, change, control)
+
+
+def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> PlannedMotion:
+    """Return a motion with changes (n + 1, 6) of turn and rate and (n, 3) of its dipole."""
+    turned = multiply(from_rotation_vector(change[:, :3]), motion.quaternion)
+    return PlannedMotion(turned, motion.rate + change[:, 3:], motion.control + control)
+
 
 LEAST_PART = 1.0 / 3.0
 """Of a table: a shorter part that the body can fly is not worth leaving the last table for."""
@@ -60,8 +306,8 @@ class PointingTable:
         slew: the slew that the path begins with, where it does; its times count from the path's begin.
     """
 
-    path: References
-    wanted: References
+    path: AttitudeReferences
+    wanted: AttitudeReferences
     dipole: FloatArray
     gain: FloatArray
     torque_part: FloatArray
@@ -96,7 +342,7 @@ class PointingTable:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ahead:
+class PointingPreview:
     """What is expected along a law, at the instants of its `wanted` (m,): path and preview.
 
     Attributes:
@@ -106,8 +352,8 @@ class Ahead:
         sizes: (9,) N m, the torques estimated now.
     """
 
-    wanted: References
-    begun: References
+    wanted: AttitudeReferences
+    begun: AttitudeReferences
     field: FloatArray
     position: FloatArray
     pressures: Pressures
@@ -115,7 +361,7 @@ class Ahead:
 
 
 def pointing_table(
-    ahead: Ahead, inertia: FloatArray, limit: float, weights: PointingWeights
+    ahead: PointingPreview, inertia: FloatArray, limit: float, weights: PointingWeights
 ) -> PointingTable:
     """Return the table from the begin of `ahead.begun` to its end.
 
@@ -130,13 +376,13 @@ def pointing_table(
     state, dipole = prices(weights, dt)
     shape = shapes(ahead.pressures, attitude_matrix(ahead.wanted.quaternion))
     inverse = np.asarray(np.linalg.inv(inertia))
-    whole = Expected(
+    whole = PathConditions(
         ahead.wanted, ahead.field, ahead.position, ahead.pressures, ahead.sizes, inertia, inverse, limit
     )
     course = best_course(whole, ahead.begun, state, dipole, weights.fastest)
     if course is None:
         beyond = _beyond(ahead, count, inertia, state, dipole, shape)
-        criterion = Criterion(state, dipole, beyond, shape, weights.fastest)
+        criterion = PathCriterion(state, dipole, beyond, shape, weights.fastest)
         course = best_path(whole.until(count + 1), ahead.begun, criterion)
     motion, gains = course
     path = motion.references(ahead.wanted.times[: len(motion.rate)]).until(count + 1)
@@ -146,7 +392,11 @@ def pointing_table(
 
 
 def table_along(
-    motion: References, field: FloatArray, position: FloatArray, inertia: FloatArray, weights: PointingWeights
+    motion: AttitudeReferences,
+    field: FloatArray,
+    position: FloatArray,
+    inertia: FloatArray,
+    weights: PointingWeights,
 ) -> PointingTable:
     """Return the table that holds a given motion (n + 1,), its torque known ahead; no other is expected.
 
@@ -159,8 +409,8 @@ def table_along(
     affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
     nothing = np.zeros(affine.shape)
     states = np.broadcast_to(state, (count, 6, 6))
-    cost = Cost(states, np.full((count, 3), dipole), nothing, nothing[:, :3])
-    gain, steady, _ = sweep(linear, affine, cost, ToGo(state, nothing[0]))
+    cost = SweepCost(states, np.full((count, 3), dipole), nothing, nothing[:, :3])
+    gain, steady, _ = sweep(linear, affine, cost, CostToGo(state, nothing[0]))
     return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
 
 
@@ -173,8 +423,13 @@ def prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
 
 
 def _beyond(
-    ahead: Ahead, begin: int, inertia: FloatArray, state: FloatArray, dipole: float, shape: FloatArray
-) -> ToGo:
+    ahead: PointingPreview,
+    begin: int,
+    inertia: FloatArray,
+    state: FloatArray,
+    dipole: float,
+    shape: FloatArray,
+) -> CostToGo:
     """Return the cost-to-go of the law from instant `begin` on; the first column has the expected torques."""
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]
@@ -185,5 +440,5 @@ def _beyond(
     affine = np.concatenate([own[:, :, None], by_size], axis=2)
     nothing = np.zeros(affine.shape)
     states = np.broadcast_to(state, (len(affine), 6, 6))
-    cost = Cost(states, np.full((len(affine), 3), dipole), nothing, nothing[:, :3])
-    return sweep(law, affine, cost, ToGo(state, nothing[0]))[2]
+    cost = SweepCost(states, np.full((len(affine), 3), dipole), nothing, nothing[:, :3])
+    return sweep(law, affine, cost, CostToGo(state, nothing[0]))[2]

@@ -13,9 +13,8 @@ from enum import StrEnum
 import numpy as np
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.path import PolynomialPath, Sample
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, q2_of
+from knightcube.gnc.guidance.one_axis.path import PathSample, PolynomialPath
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, q2_of
 from knightcube.gnc.guidance.one_axis.vmc import Plan
 
 _CHECKED_POINTS = 600
@@ -24,7 +23,7 @@ _SAME = 1e-6
 
 
 class GuidanceState(StrEnum):
-    """What `Guidance.sample` returns: a path under way, a held attitude, or nothing yet."""
+    """What `PathGuidance.sample` returns: a path under way, a held attitude, or nothing yet."""
 
     NONE = "none"
     FOLLOWING = "following"
@@ -57,14 +56,14 @@ class AcceptanceRules:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PlanVerdict:
     """Whether a plan was accepted; `reason` says why not and is empty otherwise."""
 
     accepted: bool
     reason: str = ""
 
 
-class Guidance:
+class PathGuidance:
     """Owns the path being followed and the current target."""
 
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
@@ -127,7 +126,7 @@ class Guidance:
         estimate_angle: float,
         estimate_rate: float,
         disturbance: float = 0.0,
-    ) -> Verdict:
+    ) -> PlanVerdict:
         """Follow `plan` from `origin_ns` if it keeps the rules.
 
         The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance`
@@ -140,12 +139,12 @@ class Guidance:
             or self._displaced(plan.path, estimate_angle, estimate_rate)
         )
         if reason:
-            return Verdict(False, reason)
+            return PlanVerdict(False, reason)
         self._path = plan.path.starting_at(origin_ns)
         self._planned_ns = origin_ns
-        return Verdict(True)
+        return PlanVerdict(True)
 
-    def sample(self, now_ns: int) -> Sample | None:
+    def sample(self, now_ns: int) -> PathSample | None:
         """Return the commanded motion now; None without a path."""
         return None if self._path is None else self._path.sample(now_ns)
 

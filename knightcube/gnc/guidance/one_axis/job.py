@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import NODES, Plan, plan
 
 

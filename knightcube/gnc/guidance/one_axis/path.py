@@ -1,7 +1,11 @@
-"""A path in time, sampled by the tracker at 40 Hz.
+"""Paths of the angle in time: Legendre-Gauss-Lobatto polynomials, the prey's cubic, and sampling at 40 Hz.
 
-q2 is one polynomial in time, as the planner computed it; angle, rate and acceleration follow from q2 exactly
-(Sease 5.9; 5.13 corrected), so the current between nodes is the one that the planner limited.
+The pseudospectral discretisation is that of Sease 2013, 5.8. The n nodes are -1, 1 and the roots of P'(x), P
+the Legendre polynomial of degree n - 1. Quadrature on the nodes is exact to degree 2n - 3, the
+differentiation matrix to degree n - 1.
+
+A path is one polynomial in time of q2, as computed by the planner. Angle, rate and acceleration follow from
+q2 exactly (Sease 5.9; 5.13 corrected), so that the limit imposed by the planner also holds between nodes.
 After its end a path holds its last attitude, or coasts at its end rate as far as the coil has authority.
 """
 
@@ -12,20 +16,98 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.polynomial import chebyshev
+from numpy.polynomial import chebyshev, legendre
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y
-from knightcube.gnc.guidance.lgl import lgl_rule
-from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.plant import acceleration_of, angle_of, motion_of, rate_of
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, acceleration_of, angle_of, motion_of, rate_of
+
+
+@dataclass(frozen=True, slots=True)
+class LglRule:
+    """One set of nodes; the arrays are read-only because rules are shared.
+
+    Attributes:
+        nodes: (n,) ascending, from -1 to 1.
+        weights: (n,) of the quadrature; their sum is 2.
+        differentiation: (n, n) from values on the nodes to derivatives on the nodes.
+        barycentric: (n,) weights of Lagrange interpolation through the nodes.
+    """
+
+    nodes: FloatArray
+    weights: FloatArray
+    differentiation: FloatArray
+    barycentric: FloatArray
+
+    def interpolation(self, points: FloatArray) -> FloatArray:
+        """Return the matrix (m, n) from values on the nodes to values at `points` (m,) in [-1, 1]."""
+        difference = np.asarray(points, dtype=float)[:, None] - self.nodes
+        hit = difference == 0.0
+        terms = self.barycentric / np.where(hit, 1.0, difference)
+        rows = terms / terms.sum(axis=1, keepdims=True)
+        return np.asarray(np.where(hit.any(axis=1, keepdims=True), hit.astype(float), rows))
+
+
+@lru_cache(maxsize=32)
+def lgl_rule(count: int) -> LglRule:
+    """Return the rule of `count` >= 2 nodes; raises UsageError below that."""
+    if count < 2:
+        raise UsageError(f"{count} Legendre-Gauss-Lobatto nodes: at least 2, the ends, are needed")
+    degree = count - 1
+    series = legendre.Legendre.basis(degree)
+    inner = np.sort(np.real(series.deriv().roots()))
+    slope, curvature = series.deriv(), series.deriv(2)
+    for _ in range(3):  # the companion matrix is good to about 1e-12; Newton refines to rounding
+        inner = inner - slope(inner) / curvature(inner)
+    nodes = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
+
+    values = series(nodes)
+    weights = 2.0 / (degree * (degree + 1) * values**2)
+    barycentric = 1.0 / values
+    gap = nodes[:, None] - nodes + np.eye(count)
+    differentiation = barycentric / barycentric[:, None] / gap
+    # The diagonal is minus the sum of its row, so that the derivative of a constant is zero to rounding.
+    np.fill_diagonal(differentiation, 0.0)
+    np.fill_diagonal(differentiation, -differentiation.sum(axis=1))
+    for array in (nodes, weights, differentiation, barycentric):
+        array.setflags(write=False)
+    return LglRule(nodes, weights, differentiation, barycentric)
+
+
+@dataclass(frozen=True, slots=True)
+class CubicPrey:
+    """q_p(t) = C0 + C1 t + C2 t^2 + C3 t^3 for t in s (5.35)."""
+
+    c0: float
+    c1: float
+    c2: float
+    c3: float
+
+    @classmethod
+    def between(
+        cls, start: float, start_slope: float, end: float, end_slope: float, horizon: float
+    ) -> CubicPrey:
+        """Return the cubic from `start` to `end` in `horizon` s, slopes q2' in 1/s (5.37, 5.38)."""
+        c2 = (3.0 * (end - start) - (2.0 * start_slope + end_slope) * horizon) / horizon**2
+        c3 = (end_slope - start_slope - 2.0 * c2 * horizon) / (3.0 * horizon**2)
+        return cls(start, start_slope, c2, c3)
+
+    def q2(self, time: FloatArray) -> FloatArray:
+        """Return q_p (n,) at `time` (n,) s (5.35)."""
+        return np.asarray(self.c0 + time * (self.c1 + time * (self.c2 + time * self.c3)))
+
+    def q2_rate(self, time: FloatArray) -> FloatArray:
+        """Return q_p' (n,) in 1/s at `time` (n,) s (5.36)."""
+        return np.asarray(self.c1 + time * (2.0 * self.c2 + time * 3.0 * self.c3))
+
 
 FARTHEST = angle_of(Q2_LIMIT)
 """rad: the largest angle of a coast."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class PathSample:
     """The commanded motion at one time: theta in rad, theta' in rad/s, theta'' in rad/s^2."""
 
     angle: float
@@ -90,7 +172,7 @@ class PolynomialPath:
         """Return whether the horizon has passed at `now_ns`."""
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
-    def sample(self, now_ns: int) -> Sample:
+    def sample(self, now_ns: int) -> PathSample:
         """Return the commanded motion at `now_ns`: the start before the origin, a coast after the end."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
@@ -106,7 +188,7 @@ class PolynomialPath:
             c1, c2 = c + twice * c1 - c2, c1
         a, b, c = self.series[-1]
         q2, q2_rate, q2_acceleration = a + s * a1 - a2, b + s * b1 - b2, c + s * c1 - c2
-        return Sample(angle_of(q2), rate_of(q2, q2_rate), acceleration_of(q2, q2_rate, q2_acceleration))
+        return PathSample(angle_of(q2), rate_of(q2, q2_rate), acceleration_of(q2, q2_rate, q2_acceleration))
 
     def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| > 1."""
@@ -125,13 +207,13 @@ class PolynomialPath:
             angle[under_way], rate[under_way], acceleration[under_way] = moving
         return angle, rate, acceleration
 
-    def _coast(self, since: float) -> Sample:
+    def _coast(self, since: float) -> PathSample:
         """Return the motion `since` s after the horizon."""
         angle = self.end_angle + self.end_rate * since
         farthest = max(FARTHEST, abs(self.end_angle))
         if abs(angle) > farthest:
-            return Sample(math.copysign(farthest, angle), 0.0, 0.0)
-        return Sample(angle, self.end_rate, 0.0)
+            return PathSample(math.copysign(farthest, angle), 0.0, 0.0)
+        return PathSample(angle, self.end_rate, 0.0)
 
 
 @lru_cache(maxsize=8)

@@ -1,22 +1,32 @@
-"""The single-axis plant: a rigid body on a thread, turned by one torque coil in a fixed horizontal field.
+"""The single-axis plant: a rigid body on a thread, rotated by one torque coil in a fixed horizontal field.
 
 Sease 2013, 5.4 with the thread and a constant disturbance d added: J (w' - d) = n A B I cos(theta) - k theta
 - c w, where theta is the angle about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and
-estimator share these relations, so that the tracker can follow what was planned.
+estimator share these relations, so that the tracker can follow the planned path.
 
 Functions with singular names (`current`) take floats and use `math` because they run in the 40 Hz loop;
-those with plural names (`currents`) take arrays of one shape.
+functions with plural names (`currents`) take arrays of one shape.
+
+`PathCost` is the power that a path minimises: the coil's heat, or the power taken from the supply. A coil on
+a chopped supply carries full current for a part of each PWM period, because its L/R of 0.1 ms is short
+against the period of 20 ms. A mean current I then takes V |I| from the supply, V = R Imax. R I^2, the cost of
+the thesis (Sease 5.1), is the heat of a steady current I.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
+
+Q2_LIMIT = 0.68
+"""No path leads beyond: cos(theta) is 0.075 there; at 0.707 no current turns the body at all."""
+
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
 """cos(theta) = 1 - 2 q2^2 is zero here: the coil's axis lies along the field (5.15 corrected)."""
@@ -143,3 +153,29 @@ def current_and_slopes(
     current = torque * scale
     by_q2 = torque_by_q2 * scale + current * (4.0 * q2 / cosine)
     return current, by_q2, torque_by_rate * scale, plant.inertia * by_acceleration * scale
+
+
+_ROUNDED = 0.1
+"""Of Imax: while minimised, |I| is sqrt(I^2 + e^2) - e, whose slope is continuous."""
+
+
+class PathCost(StrEnum):
+    """The power whose integral is least along a path."""
+
+    HEAT = "heat"
+    SUPPLY = "supply"
+
+    def power(self, plant: SingleAxisPlant, current: FloatArray) -> FloatArray:
+        """Return the power in W for mean currents (m,) in A."""
+        if self is PathCost.HEAT:
+            return np.asarray(plant.resistance * current * current)
+        return np.asarray(plant.resistance * plant.current_limit * np.abs(current))
+
+    def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the power as it is minimised, W, and its derivative, W/A, for mean currents (m,) in A."""
+        if self is PathCost.HEAT:
+            pull = plant.resistance * current
+            return pull * current, 2.0 * pull
+        voltage, rounding = plant.resistance * plant.current_limit, _ROUNDED * plant.current_limit
+        size = np.sqrt(current * current + rounding * rounding)
+        return voltage * (size - rounding), voltage * current / size

@@ -1,27 +1,187 @@
-"""The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8, 5.14).
+"""The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8-5.14).
 
-Two programs share cost and limits: least energy at a fixed horizon, and least energy plus price times
-horizon. The limits hold at every time, not only on the nodes: they are imposed at the points of a dense grid
-where the previous solution exceeded them, until no point does (the exchange method of semi-infinite
-programming).
+The paths are q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey and q_r the reference point
+(5.10-5.12). A path is the polynomial of degree N - 1 through its node values, so q2', q2'' and the current
+are exact between nodes too. The path control parameter v is 1 at both ends; v_2 and v_(N-1) follow from the
+boundary rates by q' = D q at the ends (5.11 corrected). N - 4 path control parameters are free.
+
+The prey is affine in the horizon T, and a path is affine in v - 1 for a fixed prey. The paths are written as
+prey(T) + M y. The columns of M are the changes that preserve the ends and their slopes, scaled by (q_p - q_r)
+and whitened. Every optimisation here thus has affine trajectories and well-conditioned variables.
+
+Two programs share cost and limits: minimum energy at a fixed horizon, and minimum energy plus the time cost
+of the horizon. The limits hold at every time and not only on the nodes: they are imposed at those points of a
+dense grid where the previous solution exceeded them, until no point exceeds them (the exchange method of
+semi-infinite programming).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import nlopt
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
+from knightcube.gnc.guidance.one_axis.path import CubicPrey, LglRule, lgl_rule
 from knightcube.gnc.guidance.one_axis.plant import (
     SQUARE_Q2_WITHOUT_AUTHORITY,
+    PathCost,
     SingleAxisPlant,
     current_and_slopes,
 )
-from knightcube.gnc.guidance.one_axis.vmc_family import Family, Observed, time_scale
+
+DENSE_POINTS = 769
+
+
+@dataclass(frozen=True, slots=True)
+class SamplePoints:
+    """Points (m,) to evaluate paths at, and matrices (3, m, N) from nodes to q2, dq2/ds and d2q2/ds2."""
+
+    points: FloatArray
+    matrices: FloatArray
+
+    @classmethod
+    def at(cls, rule: LglRule, points: FloatArray) -> SamplePoints:
+        """Return the samples of polynomials on `rule` at `points` (m,) in [-1, 1]."""
+        value = rule.interpolation(points)
+        slope = value @ rule.differentiation
+        return cls(points, np.stack([value, slope, slope @ rule.differentiation]))
+
+    def take(self, index: IntArray) -> SamplePoints:
+        """Return the samples at the points of `index`."""
+        return SamplePoints(self.points[index], self.matrices[:, index])
+
+
+@dataclass(frozen=True, slots=True)
+class Discretisation:
+    """Matrices that depend on the number of nodes only.
+
+    Attributes:
+        rule: the N nodes.
+        cost: samples on 2 N LGL nodes, where the energy is integrated: I^2 has about twice the path's degree,
+            so that N nodes leave an error for the optimiser to exploit.
+        cost_weights: (2 N,) of that quadrature, their sum 2.
+        dense: samples where the limits are checked, denser towards the ends as the extrema are.
+        free: (N, N - 4) from the free nodes' changes to all nodes' changes, ends and end slopes unchanged.
+    """
+
+    rule: LglRule
+    cost: SamplePoints
+    cost_weights: FloatArray
+    dense: SamplePoints
+    free: FloatArray
+
+
+@lru_cache(maxsize=8)
+def discretisation(count: int) -> Discretisation:
+    """Return the discretisation on `count` >= 6 nodes."""
+    rule = lgl_rule(count)
+    fine = lgl_rule(2 * count)
+    dense = -np.cos(np.linspace(0.0, np.pi, DENSE_POINTS))
+    slopes = rule.differentiation[[0, -1]]
+    # 5.11, 5.12: the two nodes next to the ends change so that q' at the ends does not.
+    next_to_ends = np.linalg.solve(slopes[:, [1, -2]], -slopes[:, 2:-2])
+    free = np.zeros((count, count - 4))
+    free[2:-2] = np.eye(count - 4)
+    free[[1, -2]] = next_to_ends
+    return Discretisation(
+        rule, SamplePoints.at(rule, fine.nodes), fine.weights, SamplePoints.at(rule, dense), free
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BoundaryStates:
+    """The states a path joins: q2 and q2' (1/s) at both ends."""
+
+    start: float
+    start_slope: float
+    end: float
+    end_slope: float
+
+    def prey(self, horizon: float) -> CubicPrey:
+        """Return the prey path over `horizon` s."""
+        return CubicPrey.between(self.start, self.start_slope, self.end, self.end_slope, horizon)
+
+
+@dataclass(frozen=True, slots=True)
+class PathFamily:
+    """All paths between two states on N nodes: prey at rest + T * prey of the slopes + basis @ y.
+
+    Attributes:
+        grid: the discretisation.
+        still: (N,) the prey with both slopes zero, which no horizon changes.
+        drift: (N,) change of the prey per second of horizon, through its end slopes.
+        basis: (N, N - 4) node changes for each parameter y.
+    """
+
+    grid: Discretisation
+    still: FloatArray
+    drift: FloatArray
+    basis: FloatArray
+
+    @classmethod
+    def around(cls, boundary: BoundaryStates, horizon: float, reference: float, count: int) -> PathFamily:
+        """Return the family with y = v - 1 on the free nodes, v measured against the prey over `horizon`."""
+        grid = discretisation(count)
+        fraction = 0.5 * (grid.rule.nodes + 1.0)
+        still = CubicPrey.between(boundary.start, 0.0, boundary.end, 0.0, 1.0).q2(fraction)
+        drift = CubicPrey.between(0.0, boundary.start_slope, 0.0, boundary.end_slope, 1.0).q2(fraction)
+        to_reference = (still + horizon * drift - reference)[2:-2]
+        return cls(grid, still, drift, grid.free * to_reference)
+
+    @property
+    def size(self) -> int:
+        """The number of free path control parameters, N - 4."""
+        return int(self.basis.shape[1])
+
+    @property
+    def farthest_end(self) -> float:
+        """The larger |q2| of the two ends."""
+        return float(np.abs(self.still[[0, -1]]).max())
+
+    def remixed(self, mixing: FloatArray) -> PathFamily:
+        """Return the same paths under new parameters: y_old = mixing @ y_new, mixing (N - 4, N - 4)."""
+        return PathFamily(self.grid, self.still, self.drift, self.basis @ mixing)
+
+    def nodes(self, parameters: FloatArray, horizon: float) -> FloatArray:
+        """Return q2 on the nodes (N,)."""
+        return np.asarray(self.still + horizon * self.drift + self.basis @ parameters)
+
+    def observed(self, samples: SamplePoints) -> ObservedFamily:
+        """Return the family evaluated at `samples`."""
+        matrices = samples.matrices
+        return ObservedFamily(matrices @ self.still, matrices @ self.drift, matrices @ self.basis)
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedFamily:
+    """A family at m points: q2, dq2/ds, d2q2/ds2, affine in horizon and parameters: (3, m[, N - 4])."""
+
+    still: FloatArray
+    drift: FloatArray
+    basis: FloatArray
+
+    def trajectory(self, parameters: FloatArray, horizon: float) -> FloatArray:
+        """Return q2, q2' in 1/s and q2'' in 1/s^2 (3, m)."""
+        return time_scale(horizon) * (self.still + horizon * self.drift + self.basis @ parameters)
+
+    def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
+        """Return the derivative of `trajectory` (3, m) by the horizon, in units of the s-derivatives.
+
+        A longer horizon changes the prey and lowers the factors from s-derivatives to time derivatives.
+        """
+        slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
+        return np.asarray(self.drift + slower * trajectory)
+
+
+def time_scale(horizon: float) -> FloatArray:
+    """Return the factors (3, 1) from s-derivatives to time derivatives: s grows by 2 in `horizon` s (5.8)."""
+    per_second = 2.0 / horizon
+    return np.array([[1.0], [per_second], [per_second * per_second]])
+
 
 LIMIT_TOLERANCE = 3e-4
 """Largest relative excess over a limit on the dense grid; leaves room under 1e-3 between its points."""
@@ -58,7 +218,7 @@ class FreeHorizon:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ImposedLimits:
     """Imposed limits (m,): dense grid point, sign, and which limit, that of q2 or of the current."""
 
     index: IntArray
@@ -66,13 +226,13 @@ class Limits:
     is_q2: BoolArray
 
     @classmethod
-    def at(cls, chosen: BoolArray, ratios: FloatArray) -> Limits:
+    def at(cls, chosen: BoolArray, ratios: FloatArray) -> ImposedLimits:
         """Return limits at `chosen` (2, dense), signed as `ratios` (2, dense), current then q2."""
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
 
 
-class Program:
+class PathProgram:
     """One plant, one family of paths between two states, and their cost and limits.
 
     Attributes:
@@ -83,7 +243,7 @@ class Program:
     def __init__(
         self,
         plant: SingleAxisPlant,
-        family: Family,
+        family: PathFamily,
         q2_limit: float,
         horizon: float,
         cost: PathCost,
@@ -115,7 +275,7 @@ class Program:
         """Return the prey path itself over `horizon` s: every path control parameter one."""
         return Trial(np.zeros(self.family.size), horizon)
 
-    def _whitened(self, family: Family, horizon: float) -> Family:
+    def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
         """Return the family whose Gauss-Newton Hessian of the energy at the prey is the unit matrix.
 
         SLSQP starts from the unit matrix, so its first step is the Gauss-Newton step.
@@ -159,7 +319,7 @@ class Program:
         return trial.horizon * float(self._weights @ power)
 
     def excess(
-        self, limits: Limits, points: Observed, trial: Trial
+        self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,) at `points` (m)."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
@@ -206,7 +366,7 @@ class Program:
         chosen = (np.abs(ratios) > _IMPOSE_ABOVE) & every | _peaks(ratios)
         trial = start
         for _ in range(_EXCHANGES):
-            limits = Limits.at(chosen, ratios)
+            limits = ImposedLimits.at(chosen, ratios)
             trial, converged = self._minimise(trial, limits, free)
             latest = self.ratios(trial)
             worst = float(np.abs(latest).max())
@@ -223,7 +383,9 @@ class Program:
         """Return the tolerance on energy, J: 1e-8 of the energy at the current limit over the horizon."""
         return 1e-8 * self._bang * horizon
 
-    def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
+    def _minimise(
+        self, start: Trial, limits: ImposedLimits | None, free: FreeHorizon | None
+    ) -> tuple[Trial, bool]:
         """Run SLSQP once from `start`; return where it ended, and whether it converged."""
         variables = _Variables(start, self.family.size, free)
         size, price = variables.size, variables.price
@@ -257,7 +419,7 @@ class Program:
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in _CONVERGED
 
-    def _impose(self, solver: nlopt.opt, limits: Limits, variables: _Variables) -> None:
+    def _impose(self, solver: nlopt.opt, limits: ImposedLimits, variables: _Variables) -> None:
         points = self.family.observed(self.family.grid.dense.take(limits.index))
         size = variables.size
 

@@ -1,10 +1,15 @@
-"""Attitude laws: which attitude is wanted at each time, from two directions.
+"""Attitude laws: the commanded attitude as a function of time, from two directions or a pointing target.
 
-A law turns one body axis to a first direction exactly, and a second body axis as near to a second direction
-as the first allows (TRIAD: Black 1964). Directions are inertial, the orbit's own (nadir, velocity, normal),
-the Sun's, or a place on the ground. For a free roll the second direction is taken from the attitude at the
-start, fixed in inertial axes or in the orbit's, whichever the first direction belongs to, so that nothing
-turns about the first.
+A law aligns one body axis with a first direction exactly, and a second body axis with a second direction as
+closely as the first allows (TRIAD: Black 1964). Directions are inertial, fixed in the orbit's axes (nadir,
+velocity, normal), the Sun's, or that of a point on the ground. For a free roll the second direction is taken
+from the attitude at the start. It is held fixed in the inertial or in the orbital axes, whichever the first
+direction belongs to, so that nothing rotates about the first.
+
+The law of a pointing target aligns the pointing axis with the goal and the body axis `across` with a second
+direction: the velocity for goals below, nadir for the velocity itself, the celestial pole for the Sun. A
+given roll rotates the body about the pointing axis from there. A free roll is the roll of the body when the
+law begins.
 """
 
 from __future__ import annotations
@@ -26,9 +31,11 @@ from knightcube.astro.quaternion import (
     from_matrix,
     from_rotation_vector,
     multiply,
+    normalise,
     to_rotation_vector,
 )
 from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Gives unit vectors (n, 3), ICRS, at times (n,) s of an ephemeris."""
@@ -39,7 +46,7 @@ LEAST_SINE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class AttitudeReference:
     """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
 
     quaternion: FloatArray
@@ -48,7 +55,7 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class References:
+class AttitudeReferences:
     """The wanted motion at even `times` (n,) s: attitudes (n, 4), rates (n, 3), accelerations (n, 3).
 
     Rates, rad/s, and accelerations, rad/s^2, are in the axes of the wanted attitude.
@@ -66,29 +73,31 @@ class References:
         k = min(max(math.floor(place), 0), len(self.times) - 2)
         return k, min(max(place - k, 0.0), 1.0)
 
-    def at(self, time: float) -> Reference:
+    def at(self, time: float) -> AttitudeReference:
         """Return the wanted motion at a time, s, within the times; at the ends that of the end."""
         k, share = self.place(time)
         near = k + round(share)
         since = (share - round(share)) * float(self.times[1] - self.times[0])
         rate, acceleration = self.rate[near], self.acceleration[near]
         turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
-        return Reference(
+        return AttitudeReference(
             multiply(turned, self.quaternion[near]),
             (1.0 - share) * self.rate[k] + share * self.rate[k + 1],
             (1.0 - share) * self.acceleration[k] + share * self.acceleration[k + 1],
         )
 
-    def until(self, count: int) -> References:
+    def until(self, count: int) -> AttitudeReferences:
         """Return the first `count` instants."""
         return self._part(slice(count))
 
-    def since(self, place: int) -> References:
+    def since(self, place: int) -> AttitudeReferences:
         """Return the instants from `place` on."""
         return self._part(slice(place, None))
 
-    def _part(self, part: slice) -> References:
-        return References(self.times[part], self.quaternion[part], self.rate[part], self.acceleration[part])
+    def _part(self, part: slice) -> AttitudeReferences:
+        return AttitudeReferences(
+            self.times[part], self.quaternion[part], self.rate[part], self.acceleration[part]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,12 +120,12 @@ Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
 """Gives wanted attitudes (n, 4) at times (n,) s of an ephemeris: of an `AttitudeLaw`, or an `approach`."""
 
 
-def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> References:
+def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
     """Return attitude, rate and acceleration at times (n,) s, by central differences over a second."""
     before, now, after = (attitudes(ephemeris, times + shift) for shift in (-DIFFERENCE, 0.0, DIFFERENCE))
     back = to_rotation_vector(multiply(before, conjugate(now)))
     ahead = to_rotation_vector(multiply(after, conjugate(now)))
-    return References(times, now, (ahead - back) / (2.0 * DIFFERENCE), (ahead + back) / DIFFERENCE**2)
+    return AttitudeReferences(times, now, (ahead - back) / (2.0 * DIFFERENCE), (ahead + back) / DIFFERENCE**2)
 
 
 def nadir(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -290,3 +299,40 @@ def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _unit(vector: FloatArray) -> FloatArray:
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+POLE = inertial(np.array([0.0, 0.0, 1.0]))
+"""The Sun never comes within 66 deg of the celestial pole."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyAxes:
+    """The body axis (3,) that points, and the axis (3,) `across` to it that a given roll begins from."""
+
+    pointing: FloatArray
+    across: FloatArray
+
+
+def law_of(
+    target: PointingTarget, axes: BodyAxes, quaternion: FloatArray, ephemeris: Ephemeris, time: float
+) -> Attitudes:
+    """Return the law of a target; a free roll is that of the attitude (4,) at `time` s of the ephemeris."""
+    if target.goal is Goal.INERTIAL:
+        fixed = normalise(np.array(target.numbers))
+        return lambda _, times: np.broadcast_to(fixed, (len(times), 4))
+    first, second = directions_of(target)
+    if target.roll is None:
+        return free_roll(axes.pointing, first, quaternion, ephemeris, time).attitudes
+    turned = attitude_matrix(from_rotation_vector(target.roll * axes.pointing)) @ axes.across
+    return AttitudeLaw(axes.pointing, first, turned, second).attitudes
+
+
+def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
+    """Return a goal's direction, and the direction that a roll of zero is measured from. Not for INERTIAL."""
+    if target.goal is Goal.GROUND:
+        return ground(*target.numbers), velocity
+    return {
+        Goal.NADIR: (nadir, velocity),
+        Goal.VELOCITY: (velocity, nadir),
+        Goal.SUN: (sun, POLE),
+    }[target.goal]

@@ -1,14 +1,17 @@
-"""The motion of a satellite with coils, its Jacobian, and its curvature, at many times at once.
+"""The motion of a satellite with coils for the slew planner, its derivatives, and the path of a slew in time.
 
 State (7,): attitude and body rate; control (3,): the coils' dipole. With b = A(q) B and e = A(q) r:
 
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
 where d are the torques of `knightcube.astro.earth.disturbance`: one constant in body axes, and those of air
-and sunlight, c x A(q) v, which turn with the body.
+and sunlight, c x A(q) v, which rotate with the body.
 
-The torque has no part along the field: that is why only some paths can be flown. All derivatives are exact:
+The torque has no component along the field, so only some paths are feasible. All derivatives are exact:
 A(q) v is a quadratic form of q, with Davenport's matrix as its curvature.
+
+Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because scipy.interpolate would cost
+each process that flies or plans a slew 20 MiB for two formulas.
 """
 
 from __future__ import annotations
@@ -22,6 +25,8 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.earth.disturbance import AIR, CONSTANT, LIGHT, Pressures
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.astro.quaternion import normalise
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
 
 _EYE3: FloatArray = np.eye(3)
 _AXES = np.arange(3)
@@ -53,7 +58,7 @@ class SlewCraft:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Around:
+class SlewEnvironment:
     """What acts on the body at n times, ICRS axes: `field` (n, 3) T, `position` (n, 3) m, air and light.
 
     Without `pressures` there is neither air nor light.
@@ -63,11 +68,11 @@ class Around:
     position: FloatArray
     pressures: Pressures | None = None
 
-    def part(self, which: IntArray) -> Around:
+    def part(self, which: IntArray) -> SlewEnvironment:
         """Return what acts at some of the times."""
         found = self.pressures
         pressed = None if found is None else Pressures(found.air[which], found.light[which])
-        return Around(self.field[which], self.position[which], pressed)
+        return SlewEnvironment(self.field[which], self.position[which], pressed)
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return the directions (n, 3) of the position, and 3 mu / r^3 (n,) 1/s^2."""
@@ -75,7 +80,7 @@ class Around:
         return self.position / radius[:, None], 3.0 * GRAVITATIONAL_PARAMETER / radius**3
 
 
-Along = Callable[[FloatArray], Around]
+EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
 """Gives what acts at times (n,) s after the start of a slew."""
 
 
@@ -98,14 +103,14 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
     return 2.0 * curvature
 
 
-class Motion:
+class SlewDynamics:
     """The motion of one craft at n times; times are counted in units of `scale` s, dipoles in `unit` A m^2.
 
     With z = (m + residual, b, e, w, q), b and e quadratic in q, all of x' but a constant is quadratic in z:
     1/2 z . H z. So one product gives the derivatives of all times at once.
     """
 
-    def __init__(self, craft: SlewCraft, scale: float, unit: float, around: Around) -> None:
+    def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
         """`around` the craft at the n times; e is scaled with the gradient's strength."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
@@ -177,7 +182,7 @@ _M, _B, _E, _W, _Q, _BE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), s
 _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
-def _pushes(craft: SlewCraft, around: Around) -> FloatArray:
+def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
     """Return the second derivatives (n, 3, 4, 4) of the acceleration by air and light, by the attitude."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
@@ -213,3 +218,81 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
         ],
         axis=1,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HermiteCubic:
+    """A curve through `values` (n, k) with `slopes` (n, k) at rising `times` (n,), n > 1.
+
+    Times outside continue the first or the last cubic.
+    """
+
+    times: FloatArray
+    values: FloatArray
+    slopes: FloatArray
+
+    def __call__(self, times: FloatArray) -> FloatArray:
+        """Return the values (m, k) at `times` (m,)."""
+        s, span, start, step, out, into = self._parts(times)
+        bend = (1.0 - s) * (span * out - step) + s * (step - span * into)
+        return np.asarray(start + s * step + s * (1.0 - s) * bend)
+
+    def derivative(self, times: FloatArray) -> FloatArray:
+        """Return the slopes (m, k) at `times` (m,)."""
+        s, span, _, step, out, into = self._parts(times)
+        mean = 6.0 * s * (1.0 - s) * step / span
+        return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
+
+    def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
+        """Return share (m, 1) and length (m, 1) of the spans of `times`, their begins, steps and slopes."""
+        at = np.asarray(times, dtype=float)
+        before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
+        span = (self.times[before + 1] - self.times[before])[:, None]
+        share = (at - self.times[before])[:, None] / span
+        start = self.values[before]
+        step = self.values[before + 1] - start
+        return share, span, start, step, self.slopes[before], self.slopes[before + 1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlewPath:
+    """A path from 0 to its last time; between the times it is the cubic of the collocation.
+
+    Attributes:
+        times: (n,) s; quaternion: (n, 4) ICRS into body; rate: (n, 3) rad/s; acceleration: (n, 3) rad/s^2.
+        dipole: (n, 3) A m^2, straight lines between the times; all in body axes.
+    """
+
+    times: FloatArray
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+    dipole: FloatArray
+
+    @property
+    def horizon(self) -> float:
+        """The duration, s."""
+        return float(self.times[-1])
+
+    def references(self, times: FloatArray) -> AttitudeReferences:
+        """Return the wanted motion at times (m,) s; outside the path that of its ends, at rest from there."""
+        inside = np.clip(times, 0.0, self.horizon)
+        turning = HermiteCubic(self.times, self.rate, self.acceleration)
+        spin = np.concatenate([self.rate, np.zeros((len(self.times), 1))], axis=1)
+        v, s = self.quaternion[:, :3], self.quaternion[:, 3:]
+        slope = np.empty_like(self.quaternion)
+        slope[:, :3] = 0.5 * (np.cross(v, spin[:, :3]) + s * spin[:, :3])
+        slope[:, 3] = -0.5 * np.sum(v * spin[:, :3], axis=1)
+        attitude = normalise(HermiteCubic(self.times, self.quaternion, slope)(inside))
+        flying = ((times >= 0.0) & (times <= self.horizon))[:, None]
+        return AttitudeReferences(
+            np.asarray(times, dtype=float),
+            attitude,
+            np.where(flying, turning(inside), 0.0),
+            np.where(flying, turning.derivative(inside), 0.0),
+        )
+
+    def dipoles(self, times: FloatArray) -> FloatArray:
+        """Return the dipoles (m, 3) A m^2 at times (m,) s; zero outside the path."""
+        found = [np.interp(times, self.times, part, left=0.0, right=0.0) for part in self.dipole.T]
+        return np.stack(found, axis=1)

@@ -9,7 +9,7 @@ import pytest
 
 from flight.bodies.orbit.paths import PointingPaths
 from hal.interfaces.wires import SECOND_NS
-from knightcube.gnc.control.three_axes.astray import FAR, SLOW
+from knightcube.gnc.control.three_axes.pointing_law import FAR, SLOW
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
 from knightcube.gnc.guidance.three_axes.attitude_law import references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget

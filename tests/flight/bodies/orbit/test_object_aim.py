@@ -14,13 +14,12 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from knightcube.gnc.control.three_axes.pointing import PointingLaw
 from knightcube.gnc.control.three_axes.pointing_job import LEAD, PointingJob, run
+from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
 from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
-from knightcube.gnc.guidance.three_axes.attitude_law import following, references
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, following, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
-from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import ObjectTracker, TrackSettings
 from tests.knightcube.gnc.tracking.passes import PIXEL, sightings
 
 BORESIGHT = np.array([0.0, -1.0, 0.0])
@@ -54,7 +53,7 @@ class Chase:
     def __post_init__(self) -> None:
         log = EventLog(self._tell)
         self.aim = ObjectAim(SENSOR, self.limit, log)
-        self.tracker = Tracker(TrackSettings())
+        self.tracker = ObjectTracker(TrackSettings())
         self.first = attitude_matrix(self.quaternion).T @ BORESIGHT
         self.random = np.random.default_rng(5)
 

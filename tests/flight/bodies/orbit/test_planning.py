@@ -15,18 +15,16 @@ from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.targets import PointingLawOf
 from flight.loop.control_output import Target
 from hal.interfaces.wires import SECOND_NS
-from knightcube.gnc.control.three_axes.astray import LEAVING
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob
-from knightcube.gnc.control.three_axes.slew_table import SlewWish
-from knightcube.gnc.guidance.three_axes.attitude_law import References
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
+from knightcube.gnc.control.three_axes.pointing_law import LEAVING
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 from tests.flight.bodies.orbit.test_astray_body import AWAY, NADIR, STILL, table
 from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
 
 assert table  # a fixture
 RESIDUAL = np.array([1e-3, 0.0, 0.0])
-WISH = SlewWish(300.0, np.ones(3), np.zeros(3), Z)
+WISH = SlewRequest(300.0, np.ones(3), np.zeros(3), Z)
 SUN = PointingTarget(Goal.SUN)
 
 
@@ -110,7 +108,7 @@ def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, 
     assert sample.law is paths.sample(SECOND_NS).law  # type: ignore[union-attr] # it was not replaced
 
 
-def _fast_from(path: References, place: int) -> References:
+def _fast_from(path: AttitudeReferences, place: int) -> AttitudeReferences:
     """Return a path that turns at 0.2 rad/s from an instant on."""
     rate = path.rate.copy()
     rate[place:] = [0.2, 0.0, 0.0]

@@ -11,7 +11,7 @@ from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.carried_sun import MEMORY
 from knightcube.vision.sun.strings import SolarStrings
 
@@ -24,9 +24,9 @@ class Seen:
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
-        law = SunSeeker(
+        law = SunAcquisition(
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
-            Seeking(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
+            SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
         self.seeker = StringSeeker(law, SolarStrings(), 0.648, EventLog(self._tell))
         self.seeker.begin(0)

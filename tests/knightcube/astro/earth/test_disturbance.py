@@ -7,8 +7,8 @@ import pytest
 
 from knightcube.astro.earth.disturbance import AIR, Pressures, box_areas, pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.gnc.control.three_axes.slew_table import slew
-from knightcube.gnc.guidance.three_axes.slew_sky import along
+from knightcube.gnc.control.three_axes.pointing_job import slew
+from knightcube.gnc.guidance.three_axes.slew_task import along
 from sim_hal.worlds.free_body.craft import CRAFTS, box
 from sim_hal.worlds.free_body.pressure import drag
 from tests.knightcube.gnc.control.three_axes.test_pointing import ORBIT

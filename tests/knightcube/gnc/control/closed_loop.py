@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.one_axis.controller import Controller
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.control.one_axis.lq_tracker import AngleController
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.single_axis import (
     ANGLE,
@@ -24,9 +24,9 @@ BELIEVED = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148)
 
 
 def fly(
-    controller: Controller,
+    controller: AngleController,
     true: SingleAxisPlant,
-    wanted: Callable[[float], Sample],
+    wanted: Callable[[float], PathSample],
     duration: float,
     start: tuple[float, float] = (0.0, 0.0),
     seed: int = 1,
@@ -67,9 +67,9 @@ def fly(
     return np.array(rows)
 
 
-def held(angle: float) -> Callable[[float], Sample]:
+def held(angle: float) -> Callable[[float], PathSample]:
     """Want an attitude held."""
-    return lambda _: Sample(angle, 0.0, 0.0)
+    return lambda _: PathSample(angle, 0.0, 0.0)
 
 
 def largest_error(rows: FloatArray, angle: float, last: float) -> float:

@@ -11,9 +11,8 @@ from flight.bodies.testbed.tracker import controller_of
 from flight.schema.testbed import Control, Identification
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis.lq_tracker import LqTracker
-from knightcube.gnc.guidance.one_axis.path import Sample
-from knightcube.reference.control.adaptive import AdaptiveController
-from knightcube.reference.control.pid import PidController
+from knightcube.gnc.guidance.one_axis.path import PathSample
+from knightcube.reference.control import AdaptiveController, PidController
 from tests.knightcube.gnc.control.closed_loop import BELIEVED
 
 KINDS = {"lq": LqTracker, "thesis": LqTracker, "pid": PidController, "adaptive": AdaptiveController}
@@ -25,20 +24,20 @@ def test_a_name_means_its_controller(name: str) -> None:
     assert isinstance(controller, KINDS[name])
     rng = np.random.default_rng(2)
     for numbers in rng.normal(0.0, 0.5, (200, 6)).tolist():
-        made = controller.command(Sample(*numbers[:3]), *numbers[3:])
+        made = controller.command(PathSample(*numbers[:3]), *numbers[3:])
         assert abs(made.current) <= BELIEVED.current_limit
         assert made.saturated == (made.current != made.demanded)
     for position in range(6):
         spoilt = [0.1] * 6
         spoilt[position] = math.nan
         with pytest.raises(UsageError, match="not finite"):
-            controller.command(Sample(*spoilt[:3]), *spoilt[3:])
+            controller.command(PathSample(*spoilt[:3]), *spoilt[3:])
     controller.reset()
 
 
 def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
     """3.6 A per rad/s^2 at theta = 0: what J / (n A B) says."""
-    rest = Sample(0.0, 0.0, 0.0)
+    rest = PathSample(0.0, 0.0, 0.0)
     for name in KINDS:
         controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS
         current = controller.command(rest, 0.0, 0.0, 0.01).current

@@ -12,8 +12,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, derivative, from_rotation_vector, normalise
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import (
-    Braking,
     Detumbler,
+    DetumblerSettings,
     WindowSchedule,
     braking_current,
     share_in_turning_field,
@@ -22,9 +22,9 @@ from knightcube.gnc.estimation.field_rate import rate_across
 
 SCHEDULE = WindowSchedule(50_000_000, 50_000_000, 150_000_000)
 INERTIA = np.diag([1.05e-3, 1.2e-3, 1.4e-3])
-BRAKING = Braking(1.05e-3, 80 * 0.0081, 0.148, 0.3)
+BRAKING = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, 0.3)
 TURN = np.array([0.05, 0.0, 0.0])
-IN_TURNING_FIELD = Braking(1.05e-3, 80 * 0.0081, 0.148, share_in_turning_field(0.05, SCHEDULE))
+IN_TURNING_FIELD = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, share_in_turning_field(0.05, SCHEDULE))
 CYCLE = 0.025
 NOISE = 1.0e-7
 """T: a VN-100's magnetometer at 40 Hz, 140 microgauss per sqrt(Hz), rounded up (its datasheet)."""
@@ -147,7 +147,7 @@ def test_the_torque_opposes_the_rate_and_takes_the_stated_share() -> None:
 
 def test_a_limited_current_keeps_its_direction() -> None:
     field, rate = np.array([1e-4, 2e-4, 3e-4]), np.array([0.3, -0.2, 0.1])
-    wanted = braking_current(Braking(1.05e-3, 0.648, 1e9, 0.3), rate, field, 0.15)
+    wanted = braking_current(DetumblerSettings(1.05e-3, 0.648, 1e9, 0.3), rate, field, 0.15)
     given = braking_current(BRAKING, rate, field, 0.15)
     assert np.abs(wanted).max() > BRAKING.current_limit
     assert np.abs(given).max() == pytest.approx(BRAKING.current_limit)
@@ -181,7 +181,7 @@ def test_without_samples_the_coils_stay_off_and_after_a_gap_two_windows_are_need
 @pytest.mark.parametrize("share", [0.0, 1.0, math.nan])
 def test_a_share_that_does_not_brake_is_refused(share: float) -> None:
     with pytest.raises(UsageError, match="share"):
-        Braking(1e-3, 0.6, 0.1, share)
+        DetumblerSettings(1e-3, 0.6, 0.1, share)
 
 
 def test_a_window_without_time_to_measure_is_refused() -> None:

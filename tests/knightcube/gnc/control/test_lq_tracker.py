@@ -13,14 +13,14 @@ from scipy.linalg import solve_continuous_are
 
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis.lq_tracker import LqTracker, lq_gains
-from knightcube.gnc.guidance.one_axis.path import PolynomialPath, Sample
+from knightcube.gnc.guidance.one_axis.path import PathSample, PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import plan
 
 PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148)
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 STRONG = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 100.0, 1e-5, 2e-6)
-REST = Sample(0.0, 0.0, 0.0)
+REST = PathSample(0.0, 0.0, 0.0)
 WEIGHTS = 20.0, 1.0
 
 
@@ -137,10 +137,10 @@ def test_the_body_returns_to_the_path_within_the_coils_limit(
 
 def test_saturation_is_explicit() -> None:
     tracker = LqTracker(PLANT, *WEIGHTS)
-    strong = tracker.command(Sample(0.5, 0.0, 0.0), 0.0, 0.0)
+    strong = tracker.command(PathSample(0.5, 0.0, 0.0), 0.0, 0.0)
     assert strong.saturated
     assert strong.current == 0.148 < strong.demanded
-    weak = tracker.command(Sample(0.001, 0.0, 0.0), 0.0, 0.0)
+    weak = tracker.command(PathSample(0.001, 0.0, 0.0), 0.0, 0.0)
     assert not weak.saturated
     assert weak.current == weak.demanded > 0.0
 
@@ -150,8 +150,8 @@ def test_saturation_is_explicit() -> None:
 def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
     """sin(d) falls again after 90 degrees; the command does not."""
     tracker = LqTracker(STRONG, *WEIGHTS)
-    command = tracker.command(Sample(sign * size, 0.0, 0.0), 0.0, 0.0)
-    edge = tracker.command(Sample(sign * 1.0, 0.0, 0.0), 0.0, 0.0)
+    command = tracker.command(PathSample(sign * size, 0.0, 0.0), 0.0, 0.0)
+    edge = tracker.command(PathSample(sign * 1.0, 0.0, 0.0), 0.0, 0.0)
     assert command.held
     assert not edge.held
     assert command.demanded == pytest.approx(edge.demanded)
@@ -159,7 +159,7 @@ def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float,
 
 
 def test_the_error_is_taken_the_short_way_round() -> None:
-    command = LqTracker(STRONG, *WEIGHTS).command(Sample(3.0, 0.0, 0.0), -3.0, 0.0)
+    command = LqTracker(STRONG, *WEIGHTS).command(PathSample(3.0, 0.0, 0.0), -3.0, 0.0)
     assert command.error == pytest.approx(6.0 - 2.0 * math.pi)
 
 
@@ -177,7 +177,7 @@ def test_an_input_that_is_not_finite_is_refused(position: int, value: float) -> 
     numbers = [0.1, 0.0, 0.0, 0.1, 0.0]
     numbers[position] = value
     with pytest.raises(UsageError, match="not finite"):
-        LqTracker(PLANT, *WEIGHTS).command(Sample(*numbers[:3]), *numbers[3:])
+        LqTracker(PLANT, *WEIGHTS).command(PathSample(*numbers[:3]), *numbers[3:])
 
 
 @pytest.mark.parametrize(

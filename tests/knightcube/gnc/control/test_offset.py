@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knightcube.gnc.control.one_axis.controller import Controller
-from knightcube.gnc.control.one_axis.lq_tracker import LqTracker
+from knightcube.gnc.control.one_axis.lq_tracker import AngleController, LqTracker
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
-from knightcube.reference.control.pid import PidController, PidGains
+from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD, fly, held, largest_error
 
 WEIGHTS = 20.0, 1.0
@@ -42,12 +40,12 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     "controller",
     [
         LqTracker(BELIEVED, *WEIGHTS),
-        PidController(BELIEVED, PERIOD, PidGains.placed(0.76), 0.0),
+        PidController(BELIEVED, PERIOD, PidSettings.placed(0.76), 0.0),
         AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(1.0, 10.0, 0.55)),
     ],
     ids=["lq", "pid", "adaptive"],
 )
-def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: Controller) -> None:
+def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controller: AngleController) -> None:
     """0.1 rad there within the coil's limit, held to 0.15 deg: the adaptive one learns while it errs."""
     rows = fly(controller, replace(THREAD, stiffness=1e-5), held(0.1), 60.0)
     assert largest_error(rows, 0.1, 10.0) < 0.15

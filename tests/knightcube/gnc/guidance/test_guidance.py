@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance, GuidanceState
+from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, GuidanceState, PathGuidance
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from knightcube.gnc.guidance.one_axis.vmc import Plan, plan
@@ -31,22 +31,24 @@ def newer() -> Plan:
 
 
 @pytest.fixture
-def guidance(good: Plan) -> Guidance:
+def guidance(good: Plan) -> PathGuidance:
     """Return guidance that flies `good` since 100 s."""
-    guidance = Guidance(KNIGHTCUBE, RULES)
+    guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
     assert guidance.offer(good, 100 * SECOND, 100 * SECOND, START, 0.0).accepted
     return guidance
 
 
 def test_before_any_plan_there_is_nothing_to_fly(good: Plan) -> None:
-    guidance = Guidance(KNIGHTCUBE, RULES)
+    guidance = PathGuidance(KNIGHTCUBE, RULES)
     assert guidance.sample(0) is None
     assert guidance.state(0) == GuidanceState.NONE
     assert "no target" in guidance.offer(good, 0, 0, START, 0.0).reason
 
 
-def test_a_good_plan_is_flown_from_its_origin_and_held_after_its_end(guidance: Guidance, good: Plan) -> None:
+def test_a_good_plan_is_flown_from_its_origin_and_held_after_its_end(
+    guidance: PathGuidance, good: Plan
+) -> None:
     now = 104 * SECOND
     assert guidance.sample(now) == good.path.sample(4 * SECOND)
     assert guidance.state(now) == GuidanceState.FOLLOWING
@@ -57,7 +59,7 @@ def test_a_good_plan_is_flown_from_its_origin_and_held_after_its_end(guidance: G
     assert guidance.state(111 * SECOND) == GuidanceState.HOLDING
 
 
-def test_a_newer_plan_replaces_the_older(guidance: Guidance, newer: Plan) -> None:
+def test_a_newer_plan_replaces_the_older(guidance: PathGuidance, newer: Plan) -> None:
     verdict = guidance.offer(newer, 101 * SECOND, 101 * SECOND + SECOND // 5, START, 0.004)
     assert verdict.accepted
     assert verdict.reason == ""
@@ -71,7 +73,9 @@ def spoilt(path: PolynomialPath, row: int, value: float) -> PolynomialPath:
     return replace(path, series=tuple(series))
 
 
-def refused(guidance: Guidance, offered: Plan, origin: float, now: float, angle: float, rate: float) -> str:
+def refused(
+    guidance: PathGuidance, offered: Plan, origin: float, now: float, angle: float, rate: float
+) -> str:
     """Return why `offered` is refused; the path being flown must be the old one still."""
     before = guidance.path
     verdict = guidance.offer(offered, round(origin * SECOND), round(now * SECOND), angle, rate)
@@ -80,7 +84,7 @@ def refused(guidance: Guidance, offered: Plan, origin: float, now: float, angle:
     return verdict.reason
 
 
-def test_a_path_with_nan_or_infinity_is_never_flown(guidance: Guidance, newer: Plan) -> None:
+def test_a_path_with_nan_or_infinity_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
     for value in (math.nan, math.inf):
         bad = replace(newer, path=spoilt(newer.path, 3, value))
         assert "not finite" in refused(guidance, bad, 101, 101, START, 0.004)
@@ -89,13 +93,13 @@ def test_a_path_with_nan_or_infinity_is_never_flown(guidance: Guidance, newer: P
         assert "not finite" in refused(guidance, bad, 101, 101, START, 0.004)
 
 
-def test_a_path_beyond_the_current_limit_is_never_flown(guidance: Guidance) -> None:
+def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) -> None:
     strong = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.3)
     hasty = plan(strong, 0.1, 0.0, TARGET, 0.0, 3.5)
     assert "limit is 0.148 A" in refused(guidance, hasty, 101, 101, START, 0.0)
 
 
-def test_current_is_watched_between_the_nodes_too(guidance: Guidance, newer: Plan) -> None:
+def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: Plan) -> None:
     """A ripple of Chebyshev degree 40, too fine for 24 nodes: nothing at most of them, amperes between."""
     count = 41
     columns = np.zeros((count, 3))
@@ -106,7 +110,7 @@ def test_current_is_watched_between_the_nodes_too(guidance: Guidance, newer: Pla
 
 
 def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: Plan) -> None:
-    narrow = Guidance(KNIGHTCUBE, replace(RULES, q2_limit=0.2))
+    narrow = PathGuidance(KNIGHTCUBE, replace(RULES, q2_limit=0.2))
     narrow.aim(TARGET)
     swing = plan(KNIGHTCUBE, 0.19, 0.03, TARGET, 0.0, 12.0)
     assert "|q2|" in narrow.offer(swing, 0, 0, angle_of(0.19), 0.03).reason
@@ -114,18 +118,18 @@ def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: Plan) -> None:
     assert narrow.offer(newer, 0, 0, START, 0.004).accepted
 
 
-def test_a_late_plan_is_never_flown(guidance: Guidance, newer: Plan) -> None:
+def test_a_late_plan_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
     assert "late" in refused(guidance, newer, 101, 102.001, START, 0.004)
     assert guidance.offer(newer, 101 * SECOND, 102 * SECOND, START, 0.004).accepted
 
 
-def test_a_plan_from_the_future_or_out_of_order_is_never_flown(guidance: Guidance, newer: Plan) -> None:
+def test_a_plan_from_the_future_or_out_of_order_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
     assert "future" in refused(guidance, newer, 101.5, 101, START, 0.004)
     assert "out of order" in refused(guidance, newer, 100, 100.5, START, 0.004)
     assert "out of order" in refused(guidance, newer, 99.9, 100.5, START, 0.004)
 
 
-def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: Guidance, newer: Plan) -> None:
+def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
     assert "rad, the body" in refused(guidance, newer, 101, 101, START + 0.051, 0.004)
     assert "rad/s, the body" in refused(guidance, newer, 101, 101, START, 0.025)
     assert "the body" in refused(guidance, newer, 101, 101, math.nan, 0.004)
@@ -134,7 +138,7 @@ def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: Guidance, newer: 
 
 
 def test_a_plan_for_an_old_target_is_never_flown_and_the_old_path_is_flown_on(
-    guidance: Guidance, good: Plan, newer: Plan
+    guidance: PathGuidance, good: Plan, newer: Plan
 ) -> None:
     guidance.aim(0.3)
     assert "wanted is 0.3" in refused(guidance, newer, 101, 101, START, 0.004)
@@ -143,7 +147,7 @@ def test_a_plan_for_an_old_target_is_never_flown_and_the_old_path_is_flown_on(
     assert guidance.offer(newer, 101 * SECOND, 101 * SECOND, START, 0.004).accepted
 
 
-def test_a_hold_overrules_the_path_and_plans_made_before_it(guidance: Guidance, newer: Plan) -> None:
+def test_a_hold_overrules_the_path_and_plans_made_before_it(guidance: PathGuidance, newer: Plan) -> None:
     guidance.hold(0.3, 102 * SECOND)
     sample = guidance.sample(103 * SECOND)
     assert sample is not None
@@ -154,13 +158,13 @@ def test_a_hold_overrules_the_path_and_plans_made_before_it(guidance: Guidance, 
 
 
 @pytest.mark.parametrize("target", [math.nan, 0.69, -math.inf])
-def test_an_impossible_target_is_refused(guidance: Guidance, target: float) -> None:
+def test_an_impossible_target_is_refused(guidance: PathGuidance, target: float) -> None:
     with pytest.raises(UsageError, match="target q2"):
         guidance.aim(target)
     assert guidance.target_q2 == TARGET
 
 
-def test_an_impossible_hold_or_rule_is_refused(guidance: Guidance) -> None:
+def test_an_impossible_hold_or_rule_is_refused(guidance: PathGuidance) -> None:
     with pytest.raises(UsageError, match="hold"):
         guidance.hold(math.nan, 0)
     with pytest.raises(UsageError, match="late_after"):
@@ -169,21 +173,21 @@ def test_an_impossible_hold_or_rule_is_refused(guidance: Guidance) -> None:
 
 def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not_end(good: Plan) -> None:
     for arrives in (True, False):
-        guidance = Guidance(KNIGHTCUBE, RULES, arrives=arrives)
+        guidance = PathGuidance(KNIGHTCUBE, RULES, arrives=arrives)
         guidance.aim(TARGET)
         assert guidance.offer(good, 0, 0, START, 0.0).accepted
         assert not guidance.is_adrift(9 * SECOND)
         assert guidance.is_adrift(11 * SECOND) is not arrives
 
 
-def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(guidance: Guidance) -> None:
+def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(guidance: PathGuidance) -> None:
     guidance.aim(0.3, 0.0, 120 * SECOND)
     assert not guidance.is_adrift(120 * SECOND + SECOND // 2)
     assert guidance.is_adrift(121 * SECOND + SECOND // 2)
 
 
 def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_target(
-    guidance: Guidance, good: Plan
+    guidance: PathGuidance, good: Plan
 ) -> None:
     assert guidance.remains(103 * SECOND) == good.path.starting_at(-3 * SECOND)
     assert guidance.remains(111 * SECOND) is None
@@ -191,7 +195,7 @@ def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_targe
     assert guidance.remains(103 * SECOND) is None
 
 
-def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: Guidance) -> None:
+def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: PathGuidance) -> None:
     moving = plan(KNIGHTCUBE, 0.1, 0.0, TARGET, 0.01, 10.0)
     assert "wanted is" in refused(guidance, moving, 101, 101, START, 0.0)
     guidance.aim(TARGET, 0.01)
@@ -204,9 +208,9 @@ def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -
     """A push of 0.03 rad/s^2 takes 108 mA to hold against: with it this path is within the limit."""
     pushed = replace(KNIGHTCUBE, disturbance=0.03)
     helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
-    guidance = Guidance(KNIGHTCUBE, RULES)
+    guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(0.2)
     assert guidance.offer(helped, 0, 0, START, 0.0, disturbance=0.03).accepted
-    other = Guidance(KNIGHTCUBE, RULES)
+    other = PathGuidance(KNIGHTCUBE, RULES)
     other.aim(0.2)
     assert "limit is" in other.offer(helped, 0, 0, START, 0.0, disturbance=-0.03).reason

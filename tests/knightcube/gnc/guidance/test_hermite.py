@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
-from knightcube.gnc.guidance.hermite import HermiteCubic
+from knightcube.gnc.guidance.three_axes.slew_model import HermiteCubic
 
 
 def test_values_and_slopes_agree_with_scipy_inside_and_outside() -> None:

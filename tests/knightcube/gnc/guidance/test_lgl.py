@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.lgl import lgl_rule
+from knightcube.gnc.guidance.one_axis.path import lgl_rule
 
 
 @pytest.mark.parametrize(

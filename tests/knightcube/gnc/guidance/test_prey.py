@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knightcube.gnc.guidance.one_axis.prey import CubicPrey
+from knightcube.gnc.guidance.one_axis.path import CubicPrey
 
 Q2 = st.floats(-0.7, 0.7)
 SLOPE = st.floats(-0.1, 0.1)

@@ -12,11 +12,15 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.path_cost import PathCost
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
+from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, angle_of, q2_of
 from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus, plan
-from knightcube.gnc.guidance.one_axis.vmc_family import Boundary, Family
-from knightcube.gnc.guidance.one_axis.vmc_program import Limits, Program, Trial
+from knightcube.gnc.guidance.one_axis.vmc_program import (
+    BoundaryStates,
+    ImposedLimits,
+    PathFamily,
+    PathProgram,
+    Trial,
+)
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.gnc.guidance.oracle import solve
 from tests.knightcube.gnc.guidance.problems import (
@@ -153,7 +157,7 @@ def test_the_boundary_states_are_met_exactly(problem: Problem) -> None:
 def test_nodes_follow_the_prey_through_the_path_control_parameters() -> None:
     """q2_i = q_r + v_i (q_p,i - q_r) (5.10), v one at both ends."""
     found = plan(KNIGHTCUBE, 0.1, 0.01, -0.2, 0.0, 12.0, nodes=16, reference=2.0)
-    prey = Boundary(0.1, 0.5 * 0.01 * math.sqrt(1 - 0.01), -0.2, 0.0).prey(12.0).q2(found.node_times)
+    prey = BoundaryStates(0.1, 0.5 * 0.01 * math.sqrt(1 - 0.01), -0.2, 0.0).prey(12.0).q2(found.node_times)
     assert found.nu.shape == (16,)
     np.testing.assert_allclose(found.node_q2, 2.0 + found.nu * (prey - 2.0), atol=1e-14)
     np.testing.assert_allclose(found.nu[[0, -1]], 1.0, atol=1e-14)
@@ -168,13 +172,13 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 @pytest.mark.parametrize("horizon", [9.0, 14.0])
 def test_gradients_are_exact(horizon: float) -> None:
     """Energy and limits against central differences, by every parameter and by the horizon."""
-    family = Family.around(Boundary(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
-    program = Program(THREAD, family, 0.68, horizon, PathCost.HEAT)
+    family = PathFamily.around(BoundaryStates(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
+    program = PathProgram(THREAD, family, 0.68, horizon, PathCost.HEAT)
     rng = np.random.default_rng(0)
     y = 0.3 * rng.normal(size=program.family.size)
     chosen = np.zeros((2, family.grid.dense.points.size), dtype=bool)
     chosen[:, ::50] = True
-    limits = Limits.at(chosen, rng.normal(size=chosen.shape))
+    limits = ImposedLimits.at(chosen, rng.normal(size=chosen.shape))
     points = program.family.observed(family.grid.dense.take(limits.index))
     _, gradient, by_horizon = program.energy(Trial(y, horizon))
     _, slopes, drift = program.excess(limits, points, Trial(y, horizon))

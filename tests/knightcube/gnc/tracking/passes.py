@@ -8,7 +8,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
-from knightcube.gnc.tracking.sightings import Sightings
+from knightcube.gnc.tracking.tracker import FrameSightings
 
 EARTH = 3.986004418e14
 PIXEL = np.radians(20.0) / 1024
@@ -77,7 +77,7 @@ def sightings(
     sigma: float,
     attitude_sigma: float,
     magnitudes: FloatArray | None = None,
-) -> Sightings:
+) -> FrameSightings:
     """Return what a frame shows of objects: errors of their places, and one turn common to all."""
     turn = rng.normal(scale=attitude_sigma, size=3)
     seen = directions + np.cross(turn, directions) + rng.normal(scale=sigma, size=directions.shape)
@@ -85,4 +85,4 @@ def sightings(
     count = len(directions)
     known = np.full(count, 4.0) if magnitudes is None else magnitudes
     spread = np.tile(sigma**2 * np.eye(3), (count, 1, 1))
-    return Sightings(round(time * 1e9), seen, spread, known, attitude_sigma**2 * np.eye(3))
+    return FrameSightings(round(time * 1e9), seen, spread, known, attitude_sigma**2 * np.eye(3))

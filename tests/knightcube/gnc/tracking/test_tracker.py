@@ -7,8 +7,16 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, predict, tides, update
-from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import (
+    LineOfSightState,
+    MotionModel,
+    ObjectTracker,
+    TrackSettings,
+    begin,
+    predict,
+    tides,
+    update,
+)
 from tests.knightcube.gnc.tracking.passes import PIXEL, Pass, a_pass, sightings
 
 _SIGMA, _ATTITUDE = 0.1 * PIXEL, 0.05 * PIXEL
@@ -20,7 +28,7 @@ def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> t
 
     `sigma` rad of a sighting, and half of it of the attitude; `known`: the gravity gradient is.
     """
-    motion = Motion()
+    motion = MotionModel()
     state = None
     places: list[float] = []
     rates: list[float] = []
@@ -70,10 +78,10 @@ def test_the_gravity_gradient_takes_the_tides_out_of_a_minute_s_prediction() -> 
         off = []
         for known in (False, True):
             velocity = flown.relative_velocity[0] / far[0]
-            line = LineOfSight(0, flown.directions[0], velocity, np.zeros((6, 6)))
+            line = LineOfSightState(0, flown.directions[0], velocity, np.zeros((6, 6)))
             for k in range(1, len(times)):
                 tide = tides(0.5 * (flown.observer[k - 1] + flown.observer[k])) if known else None
-                line = predict(line, round(times[k] * 1e9), Motion(), tide)
+                line = predict(line, round(times[k] * 1e9), MotionModel(), tide)
             off.append(float(np.linalg.norm(line.direction - flown.directions[-1])))
         assert far.max() < 250e3
         assert off[0] > 1.2e-3
@@ -85,7 +93,7 @@ def test_no_pass_of_a_tracked_object_is_lost_or_doubled_through_ten_seconds_with
     times = np.arange(0.0, 40.0, _PERIOD)
     for rate_deg in (0.05, 0.15, 0.3, 0.6):
         flown = a_pass(rng, np.radians(rate_deg), times, 20.0)
-        tracker = Tracker(TrackSettings())
+        tracker = ObjectTracker(TrackSettings())
         for index, time in enumerate(times):
             lost = 14.0 <= time < 24.0
             seen = flown.directions[index : index + 1] if not lost else np.zeros((0, 3))
@@ -104,7 +112,7 @@ def test_no_pass_of_a_tracked_object_is_lost_or_doubled_through_ten_seconds_with
 def test_a_track_ends_when_its_object_stays_away() -> None:
     rng = np.random.default_rng(4)
     flown = a_pass(rng, np.radians(0.2), np.arange(0.0, 30.0, 1.0), 10.0)
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     ends = []
     for index, time in enumerate(flown.times):
         seen = flown.directions[index : index + 1] if time < 8.0 else np.zeros((0, 3))
@@ -126,7 +134,7 @@ def test_two_objects_that_cross_keep_their_numbers() -> None:
     fast = slow - 2.0 * np.outer(slow @ aside, aside)
     fast = fast + 0.02 * np.radians(times - 15.0)[:, None] * normal
     fast /= np.linalg.norm(fast, axis=1, keepdims=True)
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     for index, time in enumerate(times):
         both = np.array([slow[index], fast[index]])
         tracker.ingest(sightings(rng, time, both, _SIGMA, _ATTITUDE, np.array([3.0, 5.0])))
@@ -145,7 +153,7 @@ def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None
         one, two = (a_pass(rng, rate, times, 15.0).directions for rate in rates)
         turn = _turn_onto(two[15], one[15], rng.uniform(0.0, 2.0 * np.pi))
         paths = np.stack([one, two @ turn.T], axis=1)
-        tracker = Tracker(TrackSettings())
+        tracker = ObjectTracker(TrackSettings())
         own: list[dict[int, int]] = []
         for time, both in zip(times, paths, strict=True):
             middle = both.mean(axis=0) / np.linalg.norm(both.mean(axis=0))
@@ -173,7 +181,7 @@ def test_an_object_that_flashes_by_four_magnitudes_is_one_track() -> None:
     rng = np.random.default_rng(8)
     times = np.arange(0.0, 60.0, 1.0)
     flown = a_pass(rng, np.radians(0.3), times, 30.0)
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     for index, time in enumerate(times):
         magnitude = np.array([5.0 + 3.0 * np.sin(2.0 * np.pi * time / 25.0)])
         seen = flown.directions[index : index + 1]
@@ -188,7 +196,7 @@ def test_an_object_that_flashes_by_four_magnitudes_is_one_track() -> None:
 def test_noise_and_stars_that_no_catalogue_has_make_no_track_in_100_frames() -> None:
     rng = np.random.default_rng(6)
     fixed = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.17, 0.17, size=(5, 3)) * [1.0, 1.0, 0.0]
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     for index in range(100):
         noise = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.17, 0.17, size=(3, 3)) * [1.0, 1.0, 0.0]
         seen = np.vstack([fixed, noise])
@@ -200,7 +208,7 @@ def test_noise_and_stars_that_no_catalogue_has_make_no_track_in_100_frames() -> 
 
 def test_a_frame_older_than_the_last_is_refused() -> None:
     rng = np.random.default_rng(7)
-    tracker = Tracker(TrackSettings())
+    tracker = ObjectTracker(TrackSettings())
     one = np.array([[0.0, 0.0, 1.0]])
     tracker.ingest(sightings(rng, 5.0, one, _SIGMA, _ATTITUDE))
     with pytest.raises(ValueError, match="give one from"):

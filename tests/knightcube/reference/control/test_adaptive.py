@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.path import Sample
-from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
+from knightcube.gnc.guidance.one_axis.path import PathSample
+from knightcube.reference.control import AdaptiveController, AdaptiveSettings
 from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD, fly, held, largest_error
 
 SETTINGS = AdaptiveSettings(bandwidth=1.0, adaptation=10.0, reference_bandwidth=0.5)
@@ -37,11 +37,11 @@ def test_an_unknown_torque_is_learnt_and_the_offset_goes() -> None:
 def test_nothing_is_learnt_while_the_coil_is_at_its_limit_nor_from_noise() -> None:
     controller = AdaptiveController(BELIEVED, PERIOD, replace(SETTINGS, reference_bandwidth=None))
     before = controller.parameters.copy()
-    assert controller.command(Sample(1.0, 0.0, 0.0), 0.0, 0.0).saturated
+    assert controller.command(PathSample(1.0, 0.0, 0.0), 0.0, 0.0).saturated
     np.testing.assert_array_equal(controller.parameters, before)
-    controller.command(Sample(5e-4, 0.0, 0.0), 0.0, 0.0)
+    controller.command(PathSample(5e-4, 0.0, 0.0), 0.0, 0.0)
     np.testing.assert_array_equal(controller.parameters, before)
-    controller.command(Sample(5e-3, 0.0, 0.0), 0.0, 0.0)
+    controller.command(PathSample(5e-3, 0.0, 0.0), 0.0, 0.0)
     assert np.abs(controller.parameters - before).max() > 0.0
 
 
@@ -50,7 +50,7 @@ def test_parameters_stay_within_what_a_body_can_have() -> None:
     rng = np.random.default_rng(3)
     for _ in range(2000):
         at, rate = rng.uniform(-0.5, 0.5), rng.uniform(-0.1, 0.1)
-        made = controller.command(Sample(float(rng.uniform(-0.5, 0.5)), 0.0, 0.0), float(at), float(rate))
+        made = controller.command(PathSample(float(rng.uniform(-0.5, 0.5)), 0.0, 0.0), float(at), float(rate))
         assert abs(made.current) <= BELIEVED.current_limit
     inertia = BELIEVED.inertia / BELIEVED.torque_constant
     assert 0.5 * inertia <= controller.parameters[0] <= 1.5 * inertia

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.path import Sample
-from knightcube.reference.control.pid import PidController, PidGains
+from knightcube.gnc.guidance.one_axis.path import PathSample
+from knightcube.reference.control import PidController, PidSettings
 from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD, fly, held
 
 
 def placed(bandwidth: float) -> PidController:
     """Return a controller with three poles at -`bandwidth` and b = 0."""
-    return PidController(BELIEVED, PERIOD, PidGains.placed(bandwidth), 0.0)
+    return PidController(BELIEVED, PERIOD, PidSettings.placed(bandwidth), 0.0)
 
 
 def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
@@ -28,29 +28,29 @@ def test_a_small_step_is_the_response_of_three_equal_poles() -> None:
 
 
 def test_taking_over_at_rest_asks_for_no_current() -> None:
-    command = placed(0.8).command(Sample(0.4, 0.0, 0.0), 0.4, 0.0)
+    command = placed(0.8).command(PathSample(0.4, 0.0, 0.0), 0.4, 0.0)
     assert command.current == pytest.approx(0.0, abs=1e-12)
-    first = placed(0.8).command(Sample(0.5, 0.0, 0.0), 0.4, 0.0)
+    first = placed(0.8).command(PathSample(0.5, 0.0, 0.0), 0.4, 0.0)
     assert 0.0 < first.current < 1e-2, "a step of the target does not kick the coil"
 
 
 def test_the_integral_waits_while_the_limit_is_in_force_and_goes_on_after() -> None:
-    controller = PidController(BELIEVED, PERIOD, PidGains.placed(2.0), target_weight=1.0)
-    pushed = [controller.command(Sample(1.0, 0.0, 0.0), 0.0, 0.0) for _ in range(400)]
+    controller = PidController(BELIEVED, PERIOD, PidSettings.placed(2.0), target_weight=1.0)
+    pushed = [controller.command(PathSample(1.0, 0.0, 0.0), 0.0, 0.0) for _ in range(400)]
     assert all(command.saturated for command in pushed)
     assert pushed[-1].demanded == pytest.approx(pushed[0].demanded)
-    back = controller.command(Sample(0.0, 0.0, 0.0), 0.0, 0.0)
+    back = controller.command(PathSample(0.0, 0.0, 0.0), 0.0, 0.0)
     assert not back.saturated
 
 
 def test_a_reset_forgets_the_integral() -> None:
     controller = placed(0.8)
-    first = controller.command(Sample(0.1, 0.0, 0.0), 0.0, 0.0)
+    first = controller.command(PathSample(0.1, 0.0, 0.0), 0.0, 0.0)
     for _ in range(40):
-        last = controller.command(Sample(0.1, 0.0, 0.0), 0.0, 0.0)
+        last = controller.command(PathSample(0.1, 0.0, 0.0), 0.0, 0.0)
     assert last.demanded > 2.0 * first.demanded
     controller.reset()
-    assert controller.command(Sample(0.1, 0.0, 0.0), 0.0, 0.0) == first
+    assert controller.command(PathSample(0.1, 0.0, 0.0), 0.0, 0.0) == first
 
 
 @pytest.mark.parametrize(
@@ -64,9 +64,9 @@ def test_a_reset_forgets_the_integral() -> None:
 def test_impossible_settings_are_refused_by_name(arguments: tuple[float, float, float], name: str) -> None:
     period, bandwidth, weight = arguments
     with pytest.raises(UsageError, match=name):
-        PidController(BELIEVED, period, PidGains.placed(bandwidth), weight)
+        PidController(BELIEVED, period, PidSettings.placed(bandwidth), weight)
 
 
 def test_an_input_that_is_not_finite_is_refused() -> None:
     with pytest.raises(UsageError, match="not finite"):
-        placed(1.0).command(Sample(0.1, 0.0, 0.0), math.nan, 0.0)
+        placed(1.0).command(PathSample(0.1, 0.0, 0.0), math.nan, 0.0)

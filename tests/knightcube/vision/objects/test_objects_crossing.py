@@ -7,8 +7,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
-from knightcube.gnc.tracking.sightings import Sightings
-from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack
@@ -36,7 +35,7 @@ def _places(since: FloatArray) -> FloatArray:
 
 
 def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_tracks() -> None:
-    tracker, own = Tracker(TrackSettings()), {}
+    tracker, own = ObjectTracker(TrackSettings()), {}
     focal = CAMERA.pinhole.focal_length
     for second in range(15):
         ways = _places(second - 7.0 + TIMES)
@@ -48,7 +47,7 @@ def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_t
         assert sighted is not None
         assert len(sighted.points) <= 2
         frame = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
-        tracker.ingest(Sightings(second * 1_000_000_000, *frame))
+        tracker.ingest(FrameSightings(second * 1_000_000_000, *frame))
         true = CAMERA.pinhole.unit_vectors(_places(np.array([second - 7.0]))[0]) @ attitude_matrix(HELD)
         away = {
             track.number: focal * np.linalg.norm(true - track.line.direction, axis=1)

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from knightcube.gnc.control.three_axes.astray import FAR, LEAVING, PATIENCE, SLOW, Astray, damping_dipole
+from knightcube.gnc.control.three_axes.pointing_law import (
+    FAR,
+    LEAVING,
+    PATIENCE,
+    SLOW,
+    PathRecovery,
+    damping_dipole,
+)
 
 
 def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
@@ -19,13 +26,13 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
         )
 
 
-def seen(astray: Astray, off: float, speed: float, now: float) -> tuple[float | None, bool]:
+def seen(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[float | None, bool]:
     astray.see(off, speed, now)
     return astray.since, astray.ready
 
 
 def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
-    astray = Astray()
+    astray = PathRecovery()
     assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
     assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
     # Nearer again it is held still all the same.
@@ -36,14 +43,14 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
 
 
 def test_a_spin_along_the_field_is_not_waited_for() -> None:
-    astray = Astray()
+    astray = PathRecovery()
     astray.see(2.0 * FAR, 5.0 * SLOW, 0.0)
     assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE - 1.0)[1]
     assert seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE + 1.0)[1]
 
 
 def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:
-    astray = Astray()
+    astray = PathRecovery()
     for off, leaving in ((0.9 * LEAVING, False), (1.1 * LEAVING, True), (1.1 * FAR, False)):
         astray.see(off, SLOW, 0.0)
         assert astray.leaving == leaving

@@ -16,8 +16,8 @@ from knightcube.gnc.control.three_axes.field_detumbler import (
     BOUNDED,
     TRUSTED,
     UNHEARD,
-    FieldBraking,
     FieldDetumbler,
+    FieldDetumblerSettings,
 )
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 
@@ -32,7 +32,7 @@ CYCLE_NS = 100_000_000
 
 def detumbler() -> FieldDetumbler:
     noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
-    return FieldDetumbler(SCHEDULE, FieldBraking(limit=LIMIT), noise)
+    return FieldDetumbler(SCHEDULE, FieldDetumblerSettings(limit=LIMIT), noise)
 
 
 def fly(
@@ -197,4 +197,4 @@ def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
 
 def test_constants_that_do_not_brake_are_refused() -> None:
     with pytest.raises(UsageError, match="limit"):
-        FieldBraking(limit=0.0)
+        FieldDetumblerSettings(limit=0.0)

@@ -7,7 +7,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from knightcube.gnc.control.three_axes.momentum import (
+from knightcube.gnc.control.three_axes.field_detumbler import (
     LIMIT_GAIN,
     braking_dipole,
     momentum_plan,

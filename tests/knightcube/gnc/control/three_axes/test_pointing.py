@@ -17,9 +17,9 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.errors import PlanningError, UsageError
-from knightcube.gnc.control.three_axes.pointing import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
 from knightcube.gnc.control.three_axes.pointing_table import (
-    Ahead,
+    PointingPreview,
     PointingTable,
     PointingWeights,
     pointing_table,
@@ -48,7 +48,7 @@ def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_
     way = approach(LAW, begin, wanted.rate[0] + spin, STEP, STEP + 500.0)
     begun = references(way, ORBIT, times[: kept + 1])
     field, position = ORBIT.field_at(times), ORBIT.position_at(times)
-    ahead = Ahead(wanted, begun, field, position, pressures(ORBIT, times), SIZE)
+    ahead = PointingPreview(wanted, begun, field, position, pressures(ORBIT, times), SIZE)
     return pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
 
 
@@ -153,7 +153,7 @@ def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
     wanted, field = references(LAW, ORBIT, times), ORBIT.field_at(times)
     position, pressed = ORBIT.position_at(times), pressures(ORBIT, times)
     for begun in (wanted.until(3), wanted):
-        ahead = Ahead(wanted, begun, field, position, pressed, SIZE)
+        ahead = PointingPreview(wanted, begun, field, position, pressed, SIZE)
         with pytest.raises(UsageError, match="even"):
             pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
 

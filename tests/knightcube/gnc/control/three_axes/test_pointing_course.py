@@ -17,11 +17,22 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.control.three_axes.pointing_course import best_course
-from knightcube.gnc.control.three_axes.pointing_path import RUN_AWAY, Expected, Gains, Motion, fly
-from knightcube.gnc.control.three_axes.pointing_step import carried, derivative, missed
-from knightcube.gnc.control.three_axes.pointing_sweep import linearised
-from knightcube.gnc.control.three_axes.pointing_table import PointingWeights, prices
+from knightcube.gnc.control.three_axes.pointing_path import (
+    RUN_AWAY,
+    MotionGains,
+    PathConditions,
+    PlannedMotion,
+    fly,
+    linearised,
+)
+from knightcube.gnc.control.three_axes.pointing_table import (
+    PointingWeights,
+    best_course,
+    carried,
+    derivative,
+    missed,
+    prices,
+)
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
 from tests.knightcube.gnc.guidance.three_axes.orbits import circular
 
@@ -39,27 +50,27 @@ BULGED = np.array([4.6e-11, 8.9e-11, -1.1e-10, 3.9e-9, 1.7e-9, 2.35e-9, 3.6e-10,
 KEPT = 180
 
 
-def expected(sizes: FloatArray = SIZES, limit: float = LIMIT) -> Expected:
+def expected(sizes: FloatArray = SIZES, limit: float = LIMIT) -> PathConditions:
     times = np.arange(STEP, 7_200.0, STEP)
     wanted = references(LAW, ORBIT, times)
     field, position = ORBIT.field_at(times), ORBIT.position_at(times)
     shape = pressures(ORBIT, times)
-    return Expected(wanted, field, position, shape, sizes, INERTIA, np.linalg.inv(INERTIA), limit)
+    return PathConditions(wanted, field, position, shape, sizes, INERTIA, np.linalg.inv(INERTIA), limit)
 
 
-def course(of: Expected, weights: PointingWeights, fastest: float = 0.01) -> Motion | None:
+def course(of: PathConditions, weights: PointingWeights, fastest: float = 0.01) -> PlannedMotion | None:
     found = best_course(of, of.wanted.until(KEPT + 1), *prices(weights, STEP), fastest)
     return None if found is None else found[0]
 
 
 @pytest.fixture(scope="module")
-def rolling() -> Motion:
+def rolling() -> PlannedMotion:
     found = course(expected(), CHEAP)
     assert found is not None
     return found
 
 
-def off_axis(motion: Motion) -> FloatArray:
+def off_axis(motion: PlannedMotion) -> FloatArray:
     """Return the angles (n,) deg between the pointing axis and nadir."""
     wanted = expected().wanted.quaternion
     axes = [attitude_matrix(q).transpose(0, 2, 1) @ Z for q in (motion.quaternion, wanted)]
@@ -74,7 +85,7 @@ def test_a_cheap_turn_about_the_axis_takes_torques_along_the_field_from_the_goal
     assert rms[1] > 4.0 * rms[0]
 
 
-def test_its_dipoles_alone_fly_it(rolling: Motion) -> None:
+def test_its_dipoles_alone_fly_it(rolling: PlannedMotion) -> None:
     """The equations of motion of one instant, in steps of 1 s, lead along it for twenty minutes."""
     ahead = expected()
     q, w = rolling.quaternion[0], rolling.rate[0]
@@ -90,7 +101,7 @@ def test_its_dipoles_alone_fly_it(rolling: Motion) -> None:
     assert np.degrees(angle_between(q, rolling.quaternion[120])) < 0.1 * turned
 
 
-def test_no_other_motion_near_it_costs_less(rolling: Motion) -> None:
+def test_no_other_motion_near_it_costs_less(rolling: PlannedMotion) -> None:
     """Planned again from a state ten minutes on, the rest stays what it was."""
     whole, later = expected(), 60
     count = len(whole.field)
@@ -113,7 +124,7 @@ def test_more_dipole_than_there_is_and_more_rate_than_allowed_are_refused() -> N
     assert course(expected(), CHEAP, fastest=1e-3) is None
 
 
-def test_the_flow_of_an_error_is_the_derivative_of_the_acceleration(rolling: Motion) -> None:
+def test_the_flow_of_an_error_is_the_derivative_of_the_acceleration(rolling: PlannedMotion) -> None:
     """By differences: a turn changes the field on the dipole, gravity, air and light."""
     ahead, count, size = expected(), 200, 1e-4
     motion = rolling.references(ahead.wanted.times).until(count)
@@ -137,7 +148,7 @@ def test_the_flow_of_an_error_is_the_derivative_of_the_acceleration(rolling: Mot
         )
 
 
-def test_the_accelerations_are_those_of_one_instant(rolling: Motion) -> None:
+def test_the_accelerations_are_those_of_one_instant(rolling: PlannedMotion) -> None:
     ahead = expected()
     found = ahead.accelerations(rolling.quaternion[:50], rolling.rate[:50], rolling.control[:50])
     for k in (0, 17, 49):
@@ -172,17 +183,17 @@ def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: 
     assert lack[3:].max() < 1e-5
 
 
-def test_the_derivative_of_a_step_is_exact(rolling: Motion) -> None:
+def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
     """By differences, of a body that turns by 2 deg/s: 20 deg in a step."""
     ahead, size = expected(), 1e-6
-    spun = Motion(rolling.quaternion, rolling.rate + np.array([0.02, -0.02, 0.02]), rolling.control)
+    spun = PlannedMotion(rolling.quaternion, rolling.rate + np.array([0.02, -0.02, 0.02]), rolling.control)
     linear = derivative(ahead, spun)
     for axis in range(9):
         turn, rate, dipole = size * np.eye(9)[axis].reshape(3, 3)
         ends = [
             carried(
                 ahead,
-                Motion(
+                PlannedMotion(
                     multiply(from_rotation_vector(np.tile(way * turn, (len(spun.rate), 1))), spun.quaternion),
                     spun.rate + way * rate,
                     spun.control + way * dipole,
@@ -201,9 +212,9 @@ def test_the_derivative_of_a_step_is_exact(rolling: Motion) -> None:
 def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
     """Gains that drive the body out by torques along the field: faster by orders with each step."""
     ahead = expected().until(61)
-    rest = Motion(ahead.wanted.quaternion, ahead.wanted.rate, np.zeros((60, 4)))
+    rest = PlannedMotion(ahead.wanted.quaternion, ahead.wanted.rate, np.zeros((60, 4)))
     gain = np.zeros((60, 4, 6))
-    nothing = Gains(gain, np.zeros((60, 4, 1)))
+    nothing = MotionGains(gain, np.zeros((60, 4, 1)))
     still = fly(ahead, rest, nothing, 1.0)
     assert still is not None
     assert np.abs(still.rate).max() < 0.01
@@ -211,9 +222,9 @@ def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
         steady = np.zeros((60, 4, 1))
         steady[:, 3] = push * 1e-3
         with np.errstate(all="raise"):
-            assert fly(ahead, rest, Gains(gain, steady), 1.0) is None
+            assert fly(ahead, rest, MotionGains(gain, steady), 1.0) is None
     steady = np.zeros((60, 4, 1))
     steady[0, 3] = 1e-4
-    fast = fly(ahead, rest, Gains(gain, steady), 1.0)
+    fast = fly(ahead, rest, MotionGains(gain, steady), 1.0)
     assert fast is not None, "a motion of several revolutions a step is followed"
     assert 2.0 * np.pi < 10.0 * np.abs(fast.rate).max() < 10.0 * RUN_AWAY

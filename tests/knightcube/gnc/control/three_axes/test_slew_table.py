@@ -11,13 +11,12 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import pressures
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
-from knightcube.gnc.control.three_axes import slew_table as slew_tables
-from knightcube.gnc.control.three_axes.pointing import PointingLaw
-from knightcube.gnc.control.three_axes.pointing_table import Ahead, PointingTable
-from knightcube.gnc.control.three_axes.slew_table import FINE, SlewBegin, SlewWish, slew, slew_table
-from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.pointing_job import FINE, SlewRequest, SlewStart, slew, slew_table
+from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_table import PointingPreview, PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 from tests.knightcube.gnc.control.three_axes.test_pointing import (
     INERTIA,
     LAW,
@@ -35,10 +34,10 @@ from tests.knightcube.gnc.control.three_axes.test_pointing import (
 
 NADIR = PointingTarget(Goal.NADIR, roll=0.0)
 AXES = BodyAxes(Z, X)
-WISH = SlewWish(700.0, np.full(3, 5.0), RESIDUAL, -Y)
+WISH = SlewRequest(700.0, np.full(3, 5.0), RESIDUAL, -Y)
 TIMES = np.arange(STEP, 5_000.0, STEP)
 WANTED = references(LAW, ORBIT, TIMES)
-BEGIN = SlewBegin(
+BEGIN = SlewStart(
     multiply(from_rotation_vector(np.radians([0.0, 60.0, 0.0])), WANTED.quaternion[0]),
     np.zeros(3),
     TIMES,
@@ -55,7 +54,7 @@ def planned(sizes: FloatArray) -> PointingTable:
     path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
     assert path is not None
     field, position = ORBIT.field_at(TIMES), ORBIT.position_at(TIMES)
-    expected = Ahead(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), sizes)
+    expected = PointingPreview(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), sizes)
     return slew_table(begin, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)
 
 
@@ -96,8 +95,8 @@ def test_what_torques_not_known_at_the_begin_have_done_is_led_back_by_the_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     believed, ends = -9.0 * SIZE, []
-    for end in (slew_tables.END, STEP / FINE):
-        monkeypatch.setattr(slew_tables, "END", end)
+    for end in (pointing_job.END, STEP / FINE):
+        monkeypatch.setattr(pointing_job, "END", end)
         table = planned(believed)
         assert table.slew is not None
         learned = 0.35 * table.slew.horizon
@@ -129,5 +128,5 @@ def test_a_body_that_would_turn_too_fast_slews_for_longer() -> None:
 def test_a_body_within_a_cone_slews_out_of_it() -> None:
     q = BEGIN.quaternion
     sun = attitude_matrix(q) @ ORBIT.sun_at(TIMES[:1])[0]
-    inside = SlewWish(700.0, WISH.heat, RESIDUAL, sun, {"sun": 0.3})
+    inside = SlewRequest(700.0, WISH.heat, RESIDUAL, sun, {"sun": 0.3})
     assert slew(BEGIN, inside, NADIR, AXES, ORBIT, np.inf) is not None

@@ -8,7 +8,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.carried_sun import MEMORY
 
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
@@ -22,8 +22,8 @@ BIAS = np.array([4e-4, -3e-4, 5e-4])
 STEP_NS = 100_000_000
 
 
-def seeker() -> SunSeeker:
-    return SunSeeker(SCHEDULE, Seeking(inertia=INERTIA, axis=Z, limit=LIMIT))
+def seeker() -> SunAcquisition:
+    return SunAcquisition(SCHEDULE, SunAcquisitionSettings(inertia=INERTIA, axis=Z, limit=LIMIT))
 
 
 def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:

@@ -17,10 +17,9 @@ from numpy.polynomial import chebyshev
 from scipy.integrate import solve_ivp
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.three_axes.slew_ends import Whole
-from knightcube.gnc.guidance.three_axes.slew_model import Along, Around, SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCraft, SlewEnvironment
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
-from knightcube.gnc.guidance.three_axes.slew_task import SlewTask
+from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, SlewTask
 
 FILE = Path(__file__).resolve().parents[5].parent / "shared" / "data" / "optimum_orbit.json"
 
@@ -47,7 +46,7 @@ def matrix(q: FloatArray) -> FloatArray:
     return np.asarray((s * s - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) - 2.0 * s * cross)
 
 
-def along_of(case: dict[str, Any]) -> Along:
+def along_of(case: dict[str, Any]) -> EnvironmentAt:
     """Return field and position of a problem over time."""
     file = recorded()
     orbit = file["orbit"][case["orbit"]]
@@ -58,10 +57,10 @@ def along_of(case: dict[str, Any]) -> Along:
     ahead = np.array([-np.sin(node) * np.cos(tilt), np.cos(node) * np.cos(tilt), np.sin(tilt)])
     series = np.array(file["fields"][f"{case['orbit']}-{case['u0_deg']:g}"])
 
-    def along(times: FloatArray) -> Around:
+    def along(times: FloatArray) -> SlewEnvironment:
         argument = np.radians(case["u0_deg"]) + motion * times
         position = radius * (np.outer(np.cos(argument), rise) + np.outer(np.sin(argument), ahead))
-        return Around(chebyshev.chebval(2.0 * times / file["window_s"] - 1.0, series).T, position)
+        return SlewEnvironment(chebyshev.chebval(2.0 * times / file["window_s"] - 1.0, series).T, position)
 
     return along
 
@@ -69,7 +68,7 @@ def along_of(case: dict[str, Any]) -> Along:
 def task_of(case: dict[str, Any], horizon: float, **options: Any) -> SlewTask:
     """Return the planner's task of a problem over `horizon` s."""
     craft = recorded()["craft"][case["craft"]]
-    end = Whole(np.array(case["qf"]), matrix(np.array(case["qf"])).T @ np.array(case["wf"]))
+    end = AttitudeEnd(np.array(case["qf"]), matrix(np.array(case["qf"])).T @ np.array(case["wf"]))
     model = SlewCraft(
         np.diag(craft["inertia"]),
         np.full(3, craft["m_max"]),

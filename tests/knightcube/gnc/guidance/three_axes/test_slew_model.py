@@ -6,7 +6,7 @@ import numpy as np
 
 from knightcube.astro.earth.disturbance import Pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.gnc.guidance.three_axes.slew_model import Around, Motion, SlewCraft, shown
+from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewDynamics, SlewEnvironment, shown
 
 
 def test_slopes_and_curvature_are_those_of_central_differences() -> None:
@@ -16,8 +16,8 @@ def test_slopes_and_curvature_are_those_of_central_differences() -> None:
     craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3), residual).facing(sizes)
     point, pull = rng.normal(size=(4, 10)), rng.normal(size=(4, 7))
     pressures = Pressures(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
-    around = Around(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)), pressures)
-    motion = Motion(craft, 300.0, 0.2, around)
+    around = SlewEnvironment(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)), pressures)
+    motion = SlewDynamics(craft, 300.0, 0.2, around)
 
     def flow(z: np.ndarray) -> np.ndarray:
         return motion.flow(z[:, :7], z[:, 7:])
@@ -40,10 +40,10 @@ def test_torques_of_air_and_light_are_those_that_the_filter_estimates() -> None:
     inertia = np.diag([0.0066, 0.0333, 0.04])
     craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3))
     pressures = Pressures(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
-    around = Around(3e-5 * rng.normal(size=(5, 3)), 7e6 * rng.normal(size=(5, 3)), pressures)
+    around = SlewEnvironment(3e-5 * rng.normal(size=(5, 3)), 7e6 * rng.normal(size=(5, 3)), pressures)
     still, nothing = np.concatenate([q, np.zeros((5, 3))], axis=1), np.zeros((5, 3))
-    pushed = Motion(craft.facing(sizes), 1.0, 0.2, around).flow(still, nothing)
-    pushed = pushed - Motion(craft, 1.0, 0.2, around).flow(still, nothing)
+    pushed = SlewDynamics(craft.facing(sizes), 1.0, 0.2, around).flow(still, nothing)
+    pushed = pushed - SlewDynamics(craft, 1.0, 0.2, around).flow(still, nothing)
     expected = shapes(pressures, attitude_matrix(q)) @ sizes
     np.testing.assert_allclose(pushed[:, 4:] @ inertia, expected, rtol=1e-9, atol=1e-18)
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.three_axes.slew_cones import Cone
-from knightcube.gnc.guidance.three_axes.slew_ends import Boresight, Whole
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_slew
+from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, BoresightEnd, Cone
 from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
     flown,
     matrix,
@@ -58,7 +57,7 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
     case = problem("E-cube-3u-sso-y90-300")
     axis = np.array([0.0, 0.0, 1.0])
     direction = matrix(np.array(case["qf"])).T @ axis
-    task = replace(task_of(case, case["T"]), end=lambda _: Boresight(axis, direction, np.zeros(3)))
+    task = replace(task_of(case, case["T"]), end=lambda _: BoresightEnd(axis, direction, np.zeros(3)))
     free = plan_slew(task)
     assert free.energy < case["energy_J"]
     assert matrix(flown(free, task)[:4]) @ direction == pytest.approx(axis, abs=1e-4)
@@ -87,7 +86,7 @@ def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int,
     assert plan.peak <= 1.001
     assert clearance(task, plan) >= 0.0
     end = task.end(plan.horizon)
-    assert isinstance(end, Whole)
+    assert isinstance(end, AttitudeEnd)
     assert off_degrees(flown(plan, task)[:4], end.quaternion) <= 0.005
 
 

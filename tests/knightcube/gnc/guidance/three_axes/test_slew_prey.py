@@ -5,23 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.gnc.guidance.three_axes.slew_ends import Whole
-from knightcube.gnc.guidance.three_axes.slew_prey import guesses
-from knightcube.gnc.guidance.three_axes.slew_solver import Solver
+from knightcube.gnc.guidance.three_axes.slew_search import SlewSolver, guesses
+from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd
 from tests.studies.bench.orbit_slews import slews
 
 
 def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep_the_cones() -> None:
     """Case 0 of `bench orbit_slews --cones --seed 43`: without limits every path goes through one."""
     (_, task), *_ = slews(1, 43, True)
-    solver = Solver(task)
+    solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 24)
     kept, scale = solver.kept(equations), task.horizon
     found = guesses(
         equations.motion, task.craft, equations.start, equations.end, equations.around, kept, scale
     )
     end = task.end(task.horizon)
-    assert isinstance(end, Whole)
+    assert isinstance(end, AttitudeEnd)
     for guess in found[:3]:
         q, rate = guess.states[:, :4], guess.states[:, 4:] / scale
         momentum = np.einsum("nji,nj->ni", attitude_matrix(q), rate @ task.craft.inertia)
@@ -35,7 +34,7 @@ def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep
 
 def test_guesses_are_the_same_each_time() -> None:
     (_, task), *_ = slews(1, 43, False)
-    solver = Solver(task)
+    solver = SlewSolver(task)
     equations = solver.equations(task.horizon, 10)
     first, then = (
         guesses(

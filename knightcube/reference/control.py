@@ -1,6 +1,14 @@
-"""An adaptive controller, for comparison (Sease 2013, ch. 5: 0.66 W on the testbed).
+"""PID and adaptive controllers of the angle about the thread, for comparison (Sease 2013, ch. 5).
 
-Slotine and Li 1991, 8.5: with the composite error s = e' + l e and a_r = theta_m'' + l e' the current
+PID (0.15 W on the testbed): the gains are free, or place three poles of a double integrator at -w: 3 w, 3 w^2
+and w^3 on rate, angle and its integral. The reference enters the proportional part with a weight b (two
+degrees of freedom, Astrom and Hagglund 1995, 3.4): with b = 0 a step of the target makes no step of the
+current and no overshoot. The integral stops while the limit is applied and the error would push it further
+(conditional integration). Of the plant the controller uses only the ratio of inertia to torque constant,
+which scales the gains.
+
+Adaptive (0.66 W): Slotine and Li 1991, 8.5. With the composite error s = e' + l e and a_r = theta_m'' + l e'
+the current
 
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
@@ -19,9 +27,82 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from knightcube.gnc.control.one_axis.controller import CoilCommand, attitude_error
-from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.control.one_axis.lq_tracker import CurrentCommand, attitude_error
+from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+
+
+@dataclass(frozen=True, slots=True)
+class PidSettings:
+    """The gains on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
+
+    proportional: float
+    integral: float
+    derivative: float
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for gains that are not finite and positive."""
+        for name in ("proportional", "integral", "derivative"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"PID {name} gain is {value}: it must be finite and positive")
+
+    @classmethod
+    def placed(cls, bandwidth: float) -> PidSettings:
+        """Return the gains that place three poles at -`bandwidth` rad/s."""
+        return cls(3.0 * bandwidth**2, bandwidth**3, 3.0 * bandwidth)
+
+
+class PidController:
+    """Owns the integral of the error, rad s."""
+
+    def __init__(
+        self, plant: SingleAxisPlant, period: float, gains: PidSettings, target_weight: float
+    ) -> None:
+        """Control `plant` every `period` s.
+
+        Raises UsageError when a value is outside its range.
+        """
+        if not (math.isfinite(period) and period > 0.0):
+            raise UsageError(f"PID period is {period}: it must be finite and positive")
+        if not 0.0 <= target_weight <= 1.0:
+            raise UsageError(f"PID target_weight is {target_weight}: it must lie between 0 and 1")
+        self._scale = plant.inertia / plant.torque_constant
+        self._limit = plant.current_limit
+        self._period = period
+        self._weight = target_weight
+        self._gains = gains
+        self._sum: float | None = None
+
+    def command(
+        self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
+    ) -> CurrentCommand:
+        """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
+
+        Raises UsageError when an input is not finite.
+        """
+        error = attitude_error(wanted, angle, rate, disturbance)
+        # The integral starts with the part of the target that the proportional part leaves out, so that the
+        # first command at rest is zero.
+        unweighted = (1.0 - self._weight) * wanted.angle
+        if self._sum is None:
+            self._sum = self._gains.proportional / self._gains.integral * ((1.0 - self._weight) * angle)
+        total = self._sum + self._period * error
+        acceleration = (
+            self._gains.proportional * (error - unweighted)
+            + self._gains.integral * total
+            + self._gains.derivative * (wanted.rate - rate)
+            + wanted.acceleration
+        )
+        made = CurrentCommand.within(self._limit, self._scale * acceleration, error)
+        if not (made.saturated and made.demanded * error > 0.0):
+            self._sum = total
+        return made
+
+    def reset(self) -> None:
+        """Clear the integral."""
+        self._sum = None
+
 
 _LEAST_AUTHORITY = 0.05
 
@@ -73,7 +154,9 @@ class AdaptiveController:
         self.parameters: FloatArray = begin
         self._model: tuple[float, float] | None = None
 
-    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+    def command(
+        self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
+    ) -> CurrentCommand:
         """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
 
         Raises UsageError when an input is not finite.
@@ -81,13 +164,13 @@ class AdaptiveController:
         error = attitude_error(wanted, angle, rate, disturbance)
         cosine = math.cos(angle)
         if abs(cosine) < _LEAST_AUTHORITY:
-            return CoilCommand.without_authority(error)
+            return CurrentCommand.without_authority(error)
         model = self._follow(wanted, angle, rate)
         lead, lag = math.remainder(model.angle - angle, 2.0 * math.pi), model.rate - rate
         slide = lag + self._settings.bandwidth * lead
         regressor = np.array([model.acceleration + self._settings.bandwidth * lag, angle, rate, -1.0])
         demanded = (float(self.parameters @ regressor) + self._gain * slide) / cosine
-        made = CoilCommand.within(self._limit, demanded, error)
+        made = CurrentCommand.within(self._limit, demanded, error)
         if not made.saturated and abs(slide) > self._settings.dead_zone:
             learnt = self._settings.adaptation * self._range**2 * regressor * slide
             self.parameters = np.clip(self.parameters + self._period * learnt, self._low, self._high)
@@ -97,7 +180,7 @@ class AdaptiveController:
         """Restart the reference model from the body's state at the next command; p is kept."""
         self._model = None
 
-    def _follow(self, wanted: Sample, angle: float, rate: float) -> Sample:
+    def _follow(self, wanted: PathSample, angle: float, rate: float) -> PathSample:
         """Return the reference model's motion and propagate the model by one period."""
         w = self._settings.reference_bandwidth
         if w is None:
@@ -106,4 +189,4 @@ class AdaptiveController:
         acceleration = w * w * (wanted.angle - at) + 2.0 * w * (wanted.rate - moving)
         dt = self._period
         self._model = (at + dt * moving + 0.5 * dt * dt * acceleration, moving + dt * acceleration)
-        return Sample(at, moving, acceleration)
+        return PathSample(at, moving, acceleration)

@@ -1,15 +1,16 @@
-"""Turns an axis of the body to the Sun by solar strings, gyro and magnetometer alone: no attitude is needed.
+"""Aligns a body axis with the Sun by solar cells, gyro and magnetometer alone; no attitude is needed.
 
-In body axes the Sun's direction s and the field B are measured, and carried on between measurements by the
-gyro. The wanted torque J (w^2 e - 2 z w rate), e the turn from the axis to the Sun, can be made only across
-the field (Lovera & Astolfi 2004, Automatica 40(8)). So the part along the field is taken from it by a torque
-about the Sun, which turns the axis off the Sun least: wherever the field is not normal to the Sun, both axes
-that matter are steered at once, and the body rolls. The faster the roll, the less is asked of it.
+The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
+the gyro. Only the component across the field of the wanted torque J (w^2 e - 2 z w rate), e the rotation from
+the axis to the Sun, can be made (Lovera & Astolfi 2004, Automatica 40(8)). The component along the field is
+therefore cancelled by a torque about the Sun, which moves the axis off the Sun least. If the field is not
+normal to the Sun, both axes that matter are controlled at once, and the body rolls. The faster the roll, the
+less torque about the Sun is used.
 
-A Sun that is not seen is carried on through an eclipse (`knightcube.gnc.estimation.carried_sun`); without one
-the body is only held still. The residual dipole, a light body's largest torque, is learned and cancelled
-(`knightcube.gnc.estimation.residual_dipole`). The coils pause while the field is measured. One field starts
-nothing: two pauses in a row must agree.
+A Sun that is not visible is propagated through an eclipse (`knightcube.gnc.estimation.carried_sun`); without
+a known Sun the body is only damped. The residual dipole, the largest torque on a light body, is estimated and
+cancelled (`knightcube.gnc.estimation.residual_dipole`). The coils pause while the field is measured. A single
+field starts nothing: two pauses in a row must agree.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Seeking:
+class SunAcquisitionSettings:
     """The law's constants.
 
     Attributes:
@@ -64,13 +65,13 @@ class Seeking:
         return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
 
 
-class SunSeeker:
+class SunAcquisition:
     """Owns the knowledge of Sun and field.
 
     Takes each reading of the inertial unit and each Sun; returns the dipole each cycle, in order of time.
     """
 
-    def __init__(self, schedule: WindowSchedule, seeking: Seeking) -> None:
+    def __init__(self, schedule: WindowSchedule, seeking: SunAcquisitionSettings) -> None:
         self._schedule, self._seeking = schedule, seeking
         self._carried = CarriedSun()
         self._residual = ResidualDipole(seeking.inertia, RESIDUAL * seeking.limit)

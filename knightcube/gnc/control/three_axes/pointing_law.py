@@ -1,4 +1,10 @@
-"""The pointing law: from an estimate and a table of gains to a dipole."""
+"""The pointing law: from an estimate and a table of gains to a dipole, and the recovery of a body far off.
+
+The law is linear in small rotations. If the law led a light body back from far off, its coils would follow
+the path at their limits and make the body rotate faster than before. A body that leaves its path is therefore
+planned for again, and a body far off is first damped until it is slow. Damping cannot accelerate the body:
+its torque is the component of -2 w J rate normal to the field, which removes energy in any attitude.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_product
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -16,7 +23,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import Reference
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_TURN = math.radians(20.0)
 """rad: a larger error is cut to this, its direction kept; the law is linear in small turns."""
@@ -53,11 +60,11 @@ class PointingLaw:
         times = self._table.path.times
         return float(times[0]), float(times[-1])
 
-    def reference(self, time: float) -> Reference:
+    def reference(self, time: float) -> AttitudeReference:
         """Return the path at a time, s, within the table's; at its ends that of the end."""
         return self._table.path.at(time)
 
-    def wanted(self, time: float) -> Reference:
+    def wanted(self, time: float) -> AttitudeReference:
         """Return the attitude law likewise."""
         return self._table.wanted.at(time)
 
@@ -99,3 +106,47 @@ def _limited(dipole: FloatArray, limit: float) -> FloatArray:
     """Return the dipole, scaled as a whole to the limit of the coils, which keeps its torque's direction."""
     largest = float(np.abs(dipole).max())
     return dipole if largest <= limit else dipole * (limit / largest)
+
+
+FAR = math.radians(15.0)
+"""rad off the path, from which on a body is held still."""
+LEAVING = math.radians(5.0)
+"""rad off the path, from which on a body that flies it is planned for again: torques are not as expected."""
+SLOW = math.radians(0.1)
+"""rad/s, below which a body is slow; an orbit's own is 0.06 deg/s."""
+PATIENCE = 180.0
+"""s after which it is planned for though not slow: what lies along the field takes a quarter of an orbit."""
+DAMPING = 0.01
+"""rad/s, w."""
+
+
+class PathRecovery:
+    """Decides between path and damping; `since` is when damping began, s, None while the path is flown.
+
+    Attributes:
+        ready: whether the body may be planned for.
+        leaving: whether it should be, though the path is flown.
+    """
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+        self.ready = self.leaving = False
+
+    def see(self, off: float, speed: float, now: float) -> None:
+        """Take the turn off the path, rad, and the rate, rad/s, at a time, s."""
+        if self.since is None and off > FAR:
+            self.since = now
+        self.leaving = self.since is None and off > LEAVING
+        self.ready = self.since is not None and (speed < SLOW or now - self.since > PATIENCE)
+
+    def planned(self) -> None:
+        """Fly a path again."""
+        self.since, self.ready, self.leaving = None, False, False
+
+
+def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
+    """Return the dipole (3,) A m^2 that takes a rate (3,) rad/s as the field (3,) T allows, body axes.
+
+    `inertia` (3,) kg m^2 of the body axes.
+    """
+    return np.asarray(cross_product(field, -2.0 * DAMPING * inertia * rate) / float(field @ field))
