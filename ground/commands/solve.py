@@ -41,7 +41,7 @@ from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.camera.pinhole import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.detection import DetectionSettings
-from knightcube.vision.startracker.detection.settings import CENTROIDS
+from knightcube.vision.startracker.detection.survey import CENTROIDS
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex

@@ -19,8 +19,7 @@ from knightcube.vision.objects.object_fit import Fitted
 from knightcube.vision.objects.scene import Scene, Stars, stars_in
 from knightcube.vision.objects.sighted import Sighted, SightSettings
 from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
-from knightcube.vision.startracker.detection.areas import Areas
-from knightcube.vision.startracker.detection.survey import Survey
+from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solution import FrameSolution
 from knightcube.vision.streaks.corners.settings import StreakSettings

@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
-from knightcube.vision.startracker.detection.settings import CENTROIDS, Method
+from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 

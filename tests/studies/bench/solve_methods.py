@@ -21,7 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
 from knightcube.vision.startracker.detection import DetectionSettings, detect
-from knightcube.vision.startracker.detection.settings import CENTROIDS, Method
+from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from sim_hal.star_camera import StarCameraModel

@@ -1,20 +1,24 @@
-"""Stars in a frame: points with honest errors, from a camera of any kind.
+"""Detection of stars in a frame: positions with covariances, from a camera of any kind.
 
     found = detect(pixels, DetectionSettings()).stars()
     found.points, found.covariance, found.flux        # brightest first
 
-`sky` measures the background and finds what stands above it, `areas` puts that together: that is the
-`survey`, which distinguishes points from streaks (`frame_kind`); streaks are `knightcube.vision.streaks`'s.
-`peaks` chooses the peaks to measure, `first_look` measures the frame's own point spread and noise
-(`noise_model`), and `measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of
-mass (`window_centroid`); `detect` composes. `nearby` measures about predicted places only.
+`sky` measures the background and its noise. `survey` finds the connected areas above the noise and decides
+whether the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits stars
+to their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches a
+frame, or the surroundings of predicted positions, for stars.
 """
 
-from knightcube.vision.startracker.detection.detect import detect, measure_areas
-from knightcube.vision.startracker.detection.detections import Detections, FrameKind, FrameShape, Quality
-from knightcube.vision.startracker.detection.nearby import measure_near
-from knightcube.vision.startracker.detection.settings import DetectionSettings
-from knightcube.vision.startracker.detection.survey import Survey, kind_of_frame, survey
+from knightcube.vision.startracker.detection.detect import (
+    Detections,
+    FrameKind,
+    FrameShape,
+    Quality,
+    detect,
+    measure_areas,
+    measure_near,
+)
+from knightcube.vision.startracker.detection.survey import DetectionSettings, Survey, kind_of_frame, survey
 
 __all__ = [
     "DetectionSettings",

@@ -1,20 +1,238 @@
-"""Stars of a whole frame."""
+"""Detection of the stars of a frame, in the whole frame or near predicted positions.
+
+`detect` searches a whole frame: local maxima of the areas, measurement, and quality flags for what is not a
+star. `measure_near` reads only small windows around predicted positions, for tracking.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum, IntFlag
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.vision.startracker.detection.areas import Areas, cluttered
-from knightcube.vision.startracker.detection.detections import REFUSED, Detections, FrameKind, Quality
-from knightcube.vision.startracker.detection.first_look import FrameSpread, Shapes, first_look, frame_spread
-from knightcube.vision.startracker.detection.frame_kind import frame_shape, is_streak
-from knightcube.vision.startracker.detection.measurement import Measured, measure
-from knightcube.vision.startracker.detection.peaks import Peaks, find_peaks, worth_measuring
-from knightcube.vision.startracker.detection.settings import DetectionSettings
-from knightcube.vision.startracker.detection.sky import Sky
-from knightcube.vision.startracker.detection.survey import Survey, survey
-from knightcube.vision.startracker.detection.targets import Targets
+from knightcube.vision.frame.background import MAD_TO_SIGMA
+from knightcube.vision.frame.regions import label_pixels
+from knightcube.vision.frame.saturation import saturation_level
+from knightcube.vision.records import select
+from knightcube.vision.startracker.detection.measurement import (
+    FrameSpread,
+    Measured,
+    Shapes,
+    first_look,
+    frame_spread,
+    measure,
+)
+from knightcube.vision.startracker.detection.psf_fit import Targets, Windows, cut, smoothed
+from knightcube.vision.startracker.detection.sky import KERNEL_NORM, Sky, correlation_of, in_counts, one_sided
+from knightcube.vision.startracker.detection.survey import (
+    Areas,
+    DetectionSettings,
+    Survey,
+    cluttered,
+    frame_shape,
+    is_streak,
+    survey,
+)
+
+
+class Quality(IntFlag):
+    """Faults of a detection. Those of the first line are still stars, their errors widened."""
+
+    POINT = 0
+    SATURATED, BLENDED, CLIPPED = 1, 2, 4
+    HOT, EXTENDED, STREAK, CLUTTER = 16, 32, 64, 128
+
+
+REFUSED = int(Quality.HOT | Quality.EXTENDED | Quality.STREAK | Quality.CLUTTER)
+
+
+class FrameKind(Enum):
+    """The content of a frame: stars at rest, stars drawn out to streaks, or neither."""
+
+    POINTS = "points"
+    STREAKS = "streaks"
+    NEITHER = "neither"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameShape:
+    """What kind of frame it is, and the median length of its streaks, px (about 0 for points)."""
+
+    kind: FrameKind
+    length: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """Sources of one frame, the brightest first.
+
+    Attributes:
+        points: (n, 2) px, x and y.
+        sigma: (n,) px, standard deviation along one axis.
+        covariance: (n, 2, 2) px^2.
+        flux: (n,) counts above the background.
+        background: (n,) counts a pixel beneath the source.
+        signal_to_noise: (n,) flux over its standard deviation.
+        width: (n,) px, the sigma of the Gaussian that fits the source best by itself; NaN where not measured.
+        quality: (n,) int64, `Quality` flags.
+        prediction: (n,) number of the prediction a source was found at; -1 for one of a whole frame.
+        psf_sigma: px, of the stars of this frame; NaN where it was neither given nor measured.
+    """
+
+    points: FloatArray
+    sigma: FloatArray
+    covariance: FloatArray
+    flux: FloatArray
+    background: FloatArray
+    signal_to_noise: FloatArray
+    width: FloatArray
+    quality: IntArray
+    prediction: IntArray
+    psf_sigma: float
+
+    @classmethod
+    def none(cls, psf_sigma: float = np.nan) -> Detections:
+        """Return no detections."""
+        empty, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
+        return cls(
+            np.zeros((0, 2)),
+            empty,
+            np.zeros((0, 2, 2)),
+            empty,
+            empty,
+            empty,
+            empty,
+            whole,
+            whole,
+            psf_sigma,
+        )
+
+    @property
+    def is_star(self) -> BoolArray:
+        """Which (n,) may be stars: not refused as hot, extended, streak or clutter."""
+        return np.asarray((self.quality & REFUSED) == 0)
+
+    def select(self, chosen: BoolArray | IntArray) -> Detections:
+        """Return those that `chosen` picks, by mask (n,) or by number in the order given."""
+        return select(self, chosen, "psf_sigma")
+
+    def in_order(self) -> Detections:
+        """Return them with the brightest first."""
+        return self.select(np.argsort(-self.flux, kind="stable"))
+
+    def scaled(self, unit: float) -> Detections:
+        """Return them with flux and background in units of 1 / `unit`."""
+        return replace(self, flux=self.flux * unit, background=self.background * unit)
+
+    def stars(self) -> Detections:
+        """Return those that may be stars."""
+        return self.select(self.is_star)
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+
+# Real optics leave bumps on a star's wings: light falls no faster than (1 + (d / a)^2)^-b of the peak's.
+_WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
+_WINGS_END = 60.0
+_CELLS = 4
+_MOST_COMPARED = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Peaks:
+    """Local maxima of the smoothed frame, highest first.
+
+    Attributes:
+        place: (p, 2) px, column and row.
+        height: (p,) counts of the smoothed frame.
+        area: (p,) number of the area it stands on.
+        core: (p,) px, radius of the saturated disc about it; 0 for none.
+    """
+
+    place: IntArray
+    height: FloatArray
+    area: IntArray
+    core: FloatArray
+
+    def select(self, chosen: BoolArray | IntArray) -> Peaks:
+        """Return those that `chosen` picks."""
+        return select(self, chosen)
+
+    def __len__(self) -> int:
+        return len(self.height)
+
+
+def find_peaks(areas: Areas) -> Peaks:
+    """Return the local maxima of the areas; a saturated disc counts as one, at its centre."""
+    top = areas.peak
+    place = np.stack([areas.column[top], areas.row[top]], axis=-1)
+    peaks = Peaks(place, areas.smooth[top], areas.owner[top], np.zeros(len(place)))
+    if areas.saturated.any():
+        peaks = _with_cores(peaks, areas)
+    return peaks.select(np.argsort(-peaks.height, kind="stable"))
+
+
+def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
+    """Return which peaks (p,) to measure, highest first, without bumps on brighter stars' wings.
+
+    Of those in the `open_sky` (p,) `most`, and of a cell of a sixteenth of `shape` a quarter of them at most,
+    so that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others
+    show what the sources of the foreground look like, and take no star's place.
+    """
+    compared = np.sort(
+        np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
+    )
+    compared = compared[~on_wings(peaks.select(compared))]
+    parts = (compared[open_sky[compared]], compared[~open_sky[compared]])
+    return np.sort(np.concatenate([part[_spread(peaks.select(part), shape, most)] for part in parts]))
+
+
+def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
+    """Return the first `most` of the peaks, of a cell of a sixteenth of `shape` a quarter of them at most."""
+    row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
+    cell = row * _CELLS + column
+    order = np.argsort(cell, kind="stable")
+    rank = np.empty(len(peaks), dtype=np.int64)
+    rank[order] = np.arange(len(peaks)) - np.searchsorted(cell[order], cell[order])
+    return np.flatnonzero(rank < max(4, most // 4))[:most]
+
+
+def on_wings(peaks: Peaks) -> BoolArray:
+    """Return which peaks (p,), highest first, are no higher than a brighter one's wings might be there."""
+    x, y = peaks.place.T.astype(np.float32)
+    square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
+    # Only a few pairs are near enough to ask: at 60 px wings are a millionth of the peak.
+    lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
+    # A saturated disc's wings begin at its rim.
+    apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
+    wing = _WING_SHARE * (1.0 + (apart / _WING_SCALE) ** 2) ** -_WING_POWER
+    hidden = peaks.height[lower] < peaks.height[higher] * wing
+    return np.bincount(lower[hidden], minlength=len(x)) > 0
+
+
+def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
+    """Return the peaks with one at each saturated disc's centre, and none else on the disc or its rim."""
+    row, column = areas.row[areas.saturated], areas.column[areas.saturated]
+    owner, count = label_pixels(row * areas.shape[1] + column, areas.shape[1])
+    size = np.bincount(owner, minlength=count)
+    x, y = np.bincount(owner, column, count) / size, np.bincount(owner, row, count) / size
+    radius = np.sqrt(size / np.pi)
+    apart = np.hypot(peaks.place[:, 0, None] - x, peaks.place[:, 1, None] - y)
+    kept = ~np.any(apart < 2.0 * radius + 2.5, axis=1)
+    area = np.zeros(count, dtype=np.int64)
+    area[owner] = areas.owner[areas.saturated]
+    height = np.zeros(count)
+    np.maximum.at(height, owner, areas.smooth[areas.saturated])
+    return Peaks(
+        np.concatenate([peaks.place[kept], np.rint(np.stack([x, y], axis=-1)).astype(np.int64)]),
+        np.concatenate([peaks.height[kept], height * np.maximum(1.0, radius**2)]),
+        np.concatenate([peaks.area[kept], area]),
+        np.concatenate([peaks.core[kept], radius]),
+    )
+
 
 # This many times the stars wanted are measured: some will prove to be none.
 _MEASURED_FOR_ONE = 1.5
@@ -161,3 +379,129 @@ def _brightest(found: Detections, most: int) -> Detections:
     star = found.is_star
     kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= most
     return found.select(kept)
+
+
+# Room about the search: the sky is taken from the pixels of its rim.
+_RIM = 5
+_ROUNDING = 12.0**-0.5
+_TAIL_PART = 0.97725
+_SAME_STAR = 1.5
+
+
+def measure_near(
+    pixels: Image,
+    predicted: FloatArray,
+    settings: DetectionSettings | None = None,
+    trail: FloatArray | None = None,
+) -> Detections:
+    """Return the stars found near `predicted` (m, 2) px, brightest first; `prediction` says of which.
+
+    `trail` (m, 2) px is by how much each moves over the exposure, a few px at most; None: not at all.
+
+    Only windows about the predictions are read. Nothing is reported where no peak within the settings'
+    search radius exceeds the threshold, and one star is given to the nearest prediction only. Raises
+    ValueError when `pixels` is no frame of real numbers of 16 x 16 or larger, or a prediction is not finite.
+    """
+    pixels, unit = in_counts(pixels)
+    settings = (settings or DetectionSettings()).in_units_of(unit)
+    predicted = np.asarray(predicted, dtype=float).reshape(-1, 2)
+    if not np.all(np.isfinite(predicted)):
+        raise ValueError("a predicted place that is not finite")
+    limits = np.array(pixels.shape)[::-1] - 0.5
+    asked = np.flatnonzero(((predicted > -0.5) & (predicted < limits)).all(axis=1))
+    if not len(asked):
+        return Detections.none(settings.psf_sigma or np.nan)
+    ceiling = saturation_level(pixels, settings.saturation)
+    half = int(np.ceil(settings.search_radius)) + _RIM
+    whole = np.zeros(len(asked))
+    # Saturated pixels are light too in the search for the peak.
+    path = None if trail is None else trail[asked]
+    windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf, path)
+    targets, number = _peaks_near(pixels, windows, predicted[asked], ceiling, settings)
+    if not len(targets):
+        return Detections.none(settings.psf_sigma or np.nan)
+    shapes = first_look(targets, settings.gain)
+    spread = frame_spread(shapes, plain_ones(np.ones(len(targets), dtype=bool), targets), settings)
+    found = measure(targets, shapes, spread, settings)
+    quality = quality_of(found, shapes, spread, targets)
+    prediction = asked[number]
+    everything = assemble(found, shapes, quality, targets, spread, prediction)
+    real = confirmed(found, targets, settings)
+    return everything.select(real).in_order().scaled(unit)
+
+
+def _peaks_near(
+    pixels: Image, windows: Windows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
+) -> tuple[Targets, IntArray]:
+    """Return the highest peaks within the search radius that exceed the threshold, and whose they are."""
+    level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
+    light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
+    smooth = smoothed(light)
+    step = np.arange(-windows.half, windows.half + 1)
+    off = predicted - windows.middle
+    square = (step - off[:, :1])[:, None, :] ** 2 + (step - off[:, 1:])[:, :, None] ** 2
+    allowed = windows.good & (square <= (settings.search_radius + 0.5) ** 2)
+    smooth = np.where(allowed, smooth, -np.inf).reshape(len(windows), -1)
+    best = smooth.argmax(axis=1)
+    bright = smooth[np.arange(len(best)), best] > settings.threshold_sigmas * tail
+    row, column = np.divmod(best, len(step))
+    middle = windows.middle + np.stack([column, row], axis=-1) - windows.half
+    saturated = np.count_nonzero(windows.good & (windows.light >= ceiling), axis=(1, 2))
+    at_core = pixels[np.clip(middle[:, 1], 0, None), np.clip(middle[:, 0], 0, None)] >= ceiling
+    core = np.where(at_core, np.sqrt(saturated / np.pi), 0.0)
+    targets = Targets(pixels, middle, level, noise, ceiling, core, windows.trail, correlation)
+    apart = np.linalg.norm(middle - predicted, axis=1)
+    number = np.flatnonzero(bright)
+    number = number[_nearest(middle[number], apart[number])]
+    return targets.select(number), number
+
+
+def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the sky's level (n,), its noise (n,) of single pixels and of smoothed ones, and its correlation.
+
+    From the windows' rims. The smoothed noise has the light of faint stars in it, which the threshold of the
+    search needs; the correlation is how much more noisy a sum of pixels is than independent ones.
+    """
+    step = np.abs(np.arange(-windows.half, windows.half + 1))
+    rim = np.maximum(step[:, None], step) > radius + 1.0
+    mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
+    # Other stars and a rim of few counts widen or narrow single windows: they are taken together.
+    common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
+    light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
+    smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
+    tail = max(0.5 * _reach(smooth), KERNEL_NORM * common)
+    cut_off = one_sided(np.array(_reach(-light[:, rim])), np.array(common))
+    spread = tail if cut_off else float(np.sqrt(np.median(_clipped(smooth)[1])))
+    noise = np.full(len(windows), common)
+    return mean, noise, np.full(len(windows), tail), correlation_of(spread, common)
+
+
+def _reach(values: FloatArray) -> float:
+    """Return how far 2.3 % of each line of `values` (n, k) reach upwards, of a typical line."""
+    place = int(_TAIL_PART * values.shape[1])
+    return float(np.median(np.partition(values, place, axis=1)[:, place]))
+
+
+def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance (n,) of each line of `values` (n, k), inf for nothing, without its tails."""
+    level = _median(values)
+    apart = np.abs(values - level[:, None])
+    kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
+    count = np.maximum(kept.sum(axis=1), 1)
+    mean = np.where(kept, values, 0.0).sum(axis=1) / count
+    square = np.where(kept, values - mean[:, None], 0.0) ** 2
+    return mean, square.sum(axis=1) / count
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Return the lower median of each line of `values` (n, k), in which inf stands for nothing."""
+    count = np.maximum(np.isfinite(values).sum(axis=1), 1)
+    return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])
+
+
+def _nearest(points: IntArray, apart: FloatArray) -> BoolArray:
+    """Return which (n,) are the nearest to their prediction of all that found the same peak."""
+    same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
+    order = np.arange(len(points))
+    better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))
+    return np.asarray(~np.any(same & better, axis=1))

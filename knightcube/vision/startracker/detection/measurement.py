@@ -1,27 +1,351 @@
-"""Stars measured with their frame's own point spread and noise, by a fit or by the centre of mass."""
+"""Positions and fluxes of stars: by a PSF fit, or by the centre of mass in a window.
+
+`first_look` fits each star alone with a free width, and `frame_spread` derives the PSF and the noise of the
+frame from these fits. `measure` then fits every star with the PSF of the frame, or takes a centroid in a
+window with border subtraction (Michalski eq. 12-21). Equations 14 and 15 as printed end the window one pixel
+too far for the divisor 4 (a - 1) of equation 16e, which counts the border of a x a pixels; here the window
+ends at x_start + a - 1. Equation 20 is y_CM with j (errata).
+
+Three other centroids start from the centre of mass and weigh the pixels differently. `weighted` weighs each
+pixel with its own light (Michalski's reference [22]; most CubeSat star trackers use it). `iterative` uses a
+Gaussian weight that follows the centroid (Stone 1989, Astron. J. 97, 1227; the windowed positions of
+SExtractor). `gaussian` fits a parabola to the logarithm of the light. Each also returns the derivatives of
+the centroid by the pixels, from which its variance follows.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.startracker.detection.blending import Pairs, neighbour_light, neighbours
-from knightcube.vision.startracker.detection.first_look import (
-    LEAST_HALF,
-    MOST_HALF,
-    REACH,
-    FrameSpread,
-    Shapes,
-    start,
+from knightcube.vision.frame.hot_pixels import are_hot
+from knightcube.vision.startracker.detection.psf_fit import (
+    FLUX,
+    WIDTH,
+    NoiseModel,
+    Pairs,
+    PsfFit,
+    Targets,
+    Windows,
+    fit,
+    light,
+    measure_noise,
+    neighbour_light,
+    neighbours,
 )
-from knightcube.vision.startracker.detection.noise_model import NoiseModel
-from knightcube.vision.startracker.detection.psf_fit import PsfFit, fit
-from knightcube.vision.startracker.detection.settings import DetectionSettings
-from knightcube.vision.startracker.detection.targets import Targets
-from knightcube.vision.startracker.detection.window_centroid import centre_of_mass
-from knightcube.vision.startracker.detection.windows import Windows
+from knightcube.vision.startracker.detection.survey import DetectionSettings, Method
+
+FIRST_WIDTH = 1.0
+_HALF_OF_FIRST = 4
+LEAST_HALF, MOST_HALF = 3, 9
+REACH = 2.7
+"""Half a window, in sigmas of the point spread, and its least and greatest, px."""
+_FIRST_NOISE = NoiseModel(0.0, 0.1)
+# Of a shape that is nearly found: under the first noise bright stars are fitted by their wings alone, which
+# leaves as much of their cores as if the shape were wrong.
+_NEXT_MISMATCH = 0.02
+# Of the shape, where no star shows it.
+_UNKNOWN_MISMATCH = 0.02
+_MOST_OF_CELL = 4
+# Stars that show the width themselves, so that a given one is not needed.
+_MANY = 8
+_LEAST_LONE = 3
+# Of a pixel's noise: fainter ones are not called hot.
+_LEAST_HOT = 10.0
+# Two windows of the first look that do not touch.
+_APART = 2 * _HALF_OF_FIRST + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shapes:
+    """Each star fitted alone: its width (n,) px, its error (n,) px, whether it is hot (n,)."""
+
+    width: FloatArray
+    error: FloatArray
+    hot: BoolArray
+    fitted: PsfFit
+    windows: Windows
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSpread:
+    """The point spread of one frame's stars and the noise of their pixels."""
+
+    psf_sigma: float
+    noise: NoiseModel
+
+    @property
+    def half(self) -> int:
+        """Half the window that holds a star, px."""
+        return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
+
+
+def first_look(targets: Targets, gain: float | None = None) -> Shapes:
+    """Return the shapes of stars whose point spread is not known yet; `gain` electrons a count if known."""
+    windows = targets.windows(_HALF_OF_FIRST)
+    offset, flux = start(windows)
+    width = np.full(len(windows), FIRST_WIDTH)
+    fitted = fit(windows, offset, flux, width, _FIRST_NOISE, free_width=True, steps=4)
+    width, error = fitted.width, np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
+    if gain is not None:
+        noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
+        fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
+    # Widths are judged by the first noise, which forgives an unlike shape.
+    return Shapes(width, error, single_pixels(windows), fitted, windows)
+
+
+def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
+    """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
+
+    Settings that are given are kept, but for a width of which many stars show their own. Without a usable
+    star the width is 1 px and no photon noise is known.
+    """
+    fitted = shapes.fitted
+    certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
+    inside = np.all(np.abs(fitted.offset) < 1.5, axis=1)
+    lone = ~crowded(shapes.windows.middle)
+    plain = plain & lone if np.count_nonzero(plain & lone) >= _LEAST_LONE else plain
+    telling = np.flatnonzero(plain & ~shapes.hot & certain & inside & (shapes.error < 0.2 * shapes.width))
+    given = settings.psf_sigma
+    if not len(telling):
+        return FrameSpread(
+            given or FIRST_WIDTH, NoiseModel(1.0 / settings.gain if settings.gain else 0.0, _UNKNOWN_MISMATCH)
+        )
+    telling, share = _evenly_spread(shapes.windows.middle, telling)
+    width, error = shapes.width[telling], shapes.error[telling]
+    psf_sigma = given or 0.0
+    if given is None or len(telling) >= _MANY:
+        psf_sigma = _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
+    alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
+    part, windows = fitted.select(alike), shapes.windows.select(alike)
+    noise = _noise_of(part, windows, settings)
+    # A given point spread needs no second look, which is half of a tracking frame's time.
+    for _ in range(0 if given else 2):
+        part = fit(windows, part.offset, part.flux, part.width, noise, free_width=True, steps=2)
+        noise = _noise_of(part, windows, settings)
+        if len(alike):
+            error = np.sqrt(part.covariance[:, WIDTH, WIDTH])
+            psf_sigma = _weighted_median(part.width, 1.0 / ((error / part.width) ** 2 + 0.02**2))
+    return FrameSpread(psf_sigma, noise)
+
+
+def _noise_of(fitted: PsfFit, windows: Windows, settings: DetectionSettings) -> NoiseModel:
+    return measure_noise(
+        fitted.residual, fitted.variance, fitted.leverage, fitted.model, windows.noise, settings.gain
+    )
+
+
+def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
+    """Return offset (n, 2) px and flux (n,) to begin with, from the middle 3 x 3 pixels."""
+    h = windows.half
+    core = np.maximum(windows.light[:, h - 1 : h + 2, h - 1 : h + 2], 0.0)
+    whole = np.maximum(core.sum(axis=(1, 2)), 1e-12)
+    x = (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / whole
+    y = (core[:, 2] - core[:, 0]).sum(axis=1) / whole
+    # Three quarters of the light of a star of sigma 1 px; more pixels would hold neighbours' too.
+    flux = np.maximum(whole / 0.75, windows.noise)
+    return np.clip(np.stack([x, y], axis=-1), -0.6, 0.6), flux
+
+
+def single_pixels(windows: Windows) -> BoolArray:
+    """Return which windows (n,) hold one or two bright pixels with dark neighbours, which no optics make."""
+    h = windows.half
+    core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
+    return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
+
+
+def crowded(middle: IntArray) -> BoolArray:
+    """Return which targets (n,) have another in their window of the first look."""
+    apart = np.abs(middle[:, None] - middle).max(axis=-1)
+    np.fill_diagonal(apart, _APART)
+    return np.asarray(apart.min(axis=1) < _APART)
+
+
+def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return the first four of `chosen` in each sixteenth of what they cover, and weights (k,).
+
+    Each sixteenth weighs the same: stars are everywhere, a tree's leaves in a corner.
+    """
+    place = middle[chosen] - middle.min(axis=0)
+    column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
+    cell = row * 4 + column
+    rank = np.array([np.count_nonzero(cell[:k] == cell[k]) for k in range(len(cell))])
+    first = rank < _MOST_OF_CELL
+    count = np.bincount(cell[first], minlength=16)
+    return chosen[first], 1.0 / count[cell[first]]
+
+
+def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    order = np.argsort(values)
+    whole = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(whole, 0.5 * whole[-1])])
+
+
+Centroid = tuple[FloatArray, FloatArray]
+"""Places (n, 2) px from the middle, and their slopes (n, 2, m, m) px a count of each pixel."""
+
+_ROUNDS = 12
+_STANDS_OUT = 3.0
+"""Standard deviations; fainter pixels have no logarithm worth fitting."""
+_LEAST = 6
+"""Pixels for a parabola of four unknowns."""
+_INSIDE = 1.5
+"""px from the centre of mass: a parabola's top farther away is no star's."""
+
+
+def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Centroid:
+    """Return the centres of the squared light (n, m, m)."""
+    light = np.maximum(clean, 0.0)
+    total = np.maximum(np.sum(light * light, axis=(1, 2)), 1e-30)
+    places, slopes = [], []
+    for step in _steps(clean):
+        place = np.sum(light * light * step, axis=(1, 2)) / total
+        places.append(place)
+        slopes.append(2.0 * light * (step - place[:, None, None]) / total[:, None, None])
+    return np.stack(places, axis=1), np.stack(slopes, axis=1)
+
+
+def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: float) -> Centroid:
+    """Return the centres under a Gaussian window that follows them, started at the centre of mass."""
+    steps = np.stack([np.broadcast_to(step, clean.shape[1:]) for step in _steps(clean)])
+    place, reach = start[0].copy(), (clean.shape[1] - 1) / 2.0
+    for _round in range(_ROUNDS + 1):
+        off = steps - place[:, :, None, None]
+        window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
+        seen = (window * clean)[:, None]
+        # How fast the sum of window, light and distance falls as the window moves: by half the light seen.
+        gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
+        half = 0.5 * np.sum(seen, axis=(2, 3))
+        gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
+        if _round == _ROUNDS:
+            break
+        place = np.clip(place + np.sum(seen * off, axis=(2, 3)) / gain, -reach, reach)
+    return place, window[:, None] * off / gain[:, :, None, None]
+
+
+def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float) -> Centroid:
+    """Return the tops of parabolas through the light's logarithm; the start where few pixels stand out."""
+    x, y = (np.broadcast_to(step, clean.shape) for step in _steps(clean))
+    used: BoolArray = clean > _STANDS_OUT * np.sqrt(variance)
+    light = np.where(used, clean, 1.0)
+    weight = np.where(used, light * light / variance, 0.0)
+    columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
+    weighed = columns * weight.reshape(len(clean), 1, -1)
+    normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
+    # Of the four unknowns, how each pixel's logarithm moves them.
+    moved = np.linalg.solve(normal, weighed)
+    found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
+    bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
+    place = found[:, 1:3] / (2.0 * bend[:, None])
+    by_log = (moved[:, 1:3] - 2.0 * place[:, :, None] * moved[:, 3:]) / (2.0 * bend[:, None, None])
+    slopes = by_log.reshape(len(clean), 2, *clean.shape[1:]) / light[:, None]
+    sound = (np.count_nonzero(used, axis=(1, 2)) >= _LEAST) & np.isfinite(bend)
+    sound &= np.all(np.abs(place - start[0]) < _INSIDE, axis=1)
+    return (
+        np.where(sound[:, None], place, start[0]),
+        np.where(sound[:, None, None, None], slopes, start[1]),
+    )
+
+
+METHODS: dict[str, Callable[[FloatArray, FloatArray, Centroid, float], Centroid]] = {
+    "weighted": weighted,
+    "gaussian": gaussian,
+    "iterative": iterative,
+}
+
+
+def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the pixels' places along x (1, m) and y (m, 1), from the middle."""
+    half = clean.shape[1] // 2
+    step = np.arange(-half, half + 1, dtype=float)
+    return step[None, :], step[:, None]
+
+
+_PHASES = np.linspace(-0.45, 0.45, 10)
+_FAINTEST = 1e-3
+"""Noise of a pixel, of the star's light, by which a method without noise still leaves pixels out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowCentroids:
+    """Centres of mass.
+
+    Attributes:
+        offset: (n, 2) px from the middle pixel; clipped to the window where the light is noise.
+        flux, sky: (n,) counts within the border, and a pixel on the border.
+        variance: (n,) px^2 along one axis, of the noise and of the light that the window cuts off.
+        flux_variance: (n,) counts^2.
+    """
+
+    offset: FloatArray
+    flux: FloatArray
+    sky: FloatArray
+    variance: FloatArray
+    flux_variance: FloatArray
+
+
+def centre_of_mass(
+    windows: Windows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
+) -> WindowCentroids:
+    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of the pixels there.
+
+    Another `method` replaces the place by that of `centroids`.
+    """
+    half = windows.half
+    offset, flux, sky = _moments(windows.light)
+    inner = windows.light[:, 1:-1, 1:-1]
+    variance = noise.variance(inner - sky[:, None, None], windows.noise)
+    offset, slopes = _places(windows.light, variance, psf_sigma, method)
+    both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
+    # The border's mean is off by its noise, and pulls the centre of mass towards the window's middle.
+    border = windows.noise**2 / (8.0 * half)
+    area = float(inner[0].size) if len(inner) else 1.0
+    both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
+    return WindowCentroids(
+        offset,
+        flux,
+        sky,
+        both + _cut_off(half, psf_sigma, method) ** 2,
+        np.sum(variance, axis=(1, 2)) + area**2 * border,
+    )
+
+
+def _places(window: FloatArray, variance: FloatArray, psf_sigma: float, method: Method) -> Centroid:
+    """Return the centroids of a method and their slopes by the pixels within the border."""
+    offset, flux, sky = _moments(window)
+    clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
+    half = window.shape[1] // 2
+    step = np.arange(1 - half, half)
+    whole = np.maximum(flux, 1e-30)[:, None, None]
+    across = np.broadcast_to((step - offset[:, :1])[:, None, :], clean.shape) / whole
+    down = np.broadcast_to((step - offset[:, 1:])[:, :, None], clean.shape) / whole
+    plain = offset, np.stack([across, down], axis=1)
+    return METHODS[method](clean, variance, plain, psf_sigma) if method in METHODS else plain
+
+
+def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    half = window.shape[1] // 2
+    rim = window[:, 0].sum(axis=1) + window[:, -1].sum(axis=1)
+    rim = rim + window[:, 1:-1, 0].sum(axis=1) + window[:, 1:-1, -1].sum(axis=1)
+    sky = rim / (4.0 * (window.shape[1] - 1))
+    clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
+    flux = clean.sum(axis=(1, 2))
+    step = np.arange(1 - half, half)
+    whole = np.where(flux > 0.0, flux, np.inf)
+    x, y = clean.sum(axis=1) @ step / whole, clean.sum(axis=2) @ step / whole
+    return np.clip(np.stack([x, y], axis=-1), 1 - half, half - 1), flux, sky
+
+
+def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
+    """Return the rms error in px of window, border and method over a pixel's places, without noise."""
+    place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
+    stars = light(place, np.full(len(_PHASES), psf_sigma), half)
+    places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)
+    return float(np.sqrt(np.mean((places[:, 0] - _PHASES) ** 2)))
+
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12

@@ -1,21 +1,271 @@
-"""Stars fitted to their pixels, all at once: Gauss-Newton steps with the weights of the fitted light.
+"""Stars fitted to their pixels with a Gaussian point spread function (PSF), all stars of a frame at once.
 
-Unknown of each star: place, flux, the sky left beneath it and, on request, its own width. The weights come
-from the fitted light, not from the counts: a pixel that happens to be low would otherwise weigh more, and
-the flux come out low. The normal matrices are 4 x 4 or 5 x 5, one a star, solved together.
+Each star is fitted in a square window: position, flux, residual sky level and, on request, its own width. A
+star that moves over the exposure is the mean of Gaussians along its path (Gauss-Legendre quadrature). The
+Gauss-Newton weights come from the fitted light, not from the counts: otherwise a pixel that happens to be low
+would weigh more, and the flux would be too low. The normal matrices, 4 x 4 or 5 x 5 for each star, are solved
+together.
+
+The variance of a pixel is noise^2 + light / gain + (mismatch light)^2: sky, photons, and the difference
+between the PSF and a Gaussian. Where the gain is unknown, gain and mismatch are measured from the residuals
+of the stars: photon noise grows with the light, the mismatch with its square.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.vision.records import select
-from knightcube.vision.startracker.detection.noise_model import NoiseModel
-from knightcube.vision.startracker.detection.point_spread import path, profile
-from knightcube.vision.startracker.detection.windows import Windows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Windows of k x k pixels, k = 2 half + 1.
+
+    Attributes:
+        middle: (n, 2) column and row of the middle pixel.
+        half: px.
+        light: (n, k, k) counts above the sky, 0 where there is no pixel; saturated ones as they are.
+        good: (n, k, k) which pixels exist and are usable.
+        noise: (n,) counts, of a pixel without a star.
+        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
+    """
+
+    middle: IntArray
+    half: int
+    light: FloatArray
+    good: BoolArray
+    noise: FloatArray
+    trail: FloatArray
+
+    def select(self, chosen: BoolArray | IntArray) -> Windows:
+        """Return the windows that `chosen` picks."""
+        return select(self, chosen, "half")
+
+    def without(self, light: FloatArray) -> Windows:
+        """Return the windows with `light` (n, k, k) taken off."""
+        return replace(self, light=self.light - light)
+
+    def __len__(self) -> int:
+        return len(self.middle)
+
+
+def cut(
+    pixels: Image,
+    middle: IntArray,
+    half: int,
+    level: FloatArray,
+    noise: FloatArray,
+    ceiling: float,
+    trail: FloatArray | None = None,
+) -> Windows:
+    """Return the windows of `pixels` (rows, columns) about the pixels `middle` (n, 2), which are inside.
+
+    `level` (n,) is the sky's, `noise` (n,) its noise; pixels at `ceiling` counts or above are saturated and
+    not used. Without `trail` (n, 2) the stars stand still.
+    """
+    rows, columns = pixels.shape
+    step = np.arange(-half, half + 1)
+    column, row = middle[:, :1] + step, middle[:, 1:] + step
+    good = ((row >= 0) & (row < rows))[:, :, None] & ((column >= 0) & (column < columns))[:, None, :]
+    row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
+    counts = pixels[row[:, :, None], column[:, None, :]].astype(np.float64)
+    light = np.where(good, counts - level[:, None, None], 0.0)
+    path = np.zeros((len(middle), 2)) if trail is None else trail
+    return Windows(middle, half, light, good & (counts < ceiling), noise, path)
+
+
+def smoothed(light: FloatArray) -> FloatArray:
+    """Return windows (n, k, k) under the search's kernel, [1 2 1] each way; the outermost pixels are zero."""
+    down = light[:, :-2] + 2.0 * light[:, 1:-1] + light[:, 2:]
+    out = np.zeros_like(light)
+    out[:, 1:-1, 1:-1] = down[:, :, :-2] + 2.0 * down[:, :, 1:-1] + down[:, :, 2:]
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Targets:
+    """Where stars are to be measured.
+
+    Attributes:
+        pixels: (rows, columns) counts.
+        middle: (n, 2) column and row.
+        level, noise: (n,) counts of a pixel without a star.
+        ceiling: counts at which pixels saturate.
+        core: (n,) px, radius of the saturated disc.
+        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
+        correlation: how much more noisy sums of pixels are than of independent ones.
+    """
+
+    pixels: Image
+    middle: IntArray
+    level: FloatArray
+    noise: FloatArray
+    ceiling: float
+    core: FloatArray
+    trail: FloatArray
+    correlation: float
+
+    def windows(self, half: int, middle: IntArray | None = None) -> Windows:
+        """Return the windows about all targets, or about `middle` (n, 2) beside them."""
+        about = self.middle if middle is None else middle
+        return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
+
+    def select(self, chosen: BoolArray | IntArray) -> Targets:
+        """Return the targets that `chosen` picks."""
+        return select(self, chosen, "pixels", "ceiling", "correlation")
+
+    def __len__(self) -> int:
+        return len(self.middle)
+
+
+# A path shorter than this, px, is a point: it widens one of 1 px by 0.2 %.
+_SHORTEST = 0.2
+# Enough for paths of four sigmas, to 1e-3 of the light.
+_NODES = 4
+_BELL = 1.0 / math.sqrt(2.0 * math.pi)
+
+
+def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the share (n, k) of a star's light in each of k = 2 half + 1 pixels, and its derivatives.
+
+    `offset` (n,) px is the star's place from the middle pixel's centre, `sigma` (n,) px. The derivatives
+    (n, k) are by place and by sigma.
+    """
+    from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
+
+    edges = (np.arange(-half, half + 2) - 0.5 - offset[:, None]) / sigma[:, None]
+    whole = ndtr(edges)
+    bell = _BELL * np.exp(-0.5 * edges * edges)
+    slope = bell / sigma[:, None]
+    spread = edges * slope
+    share = whole[:, 1:] - whole[:, :-1]
+    return share, slope[:, :-1] - slope[:, 1:], spread[:, :-1] - spread[:, 1:]
+
+
+def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
+    """Return places (n, 2) px along paths of `trail` (n, 2) px, from the middle, and each place's share."""
+    if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
+        return [(np.zeros_like(trail), 1.0)]
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    return [(0.5 * node * trail, 0.5 * weight) for node, weight in zip(nodes, weights, strict=True)]
+
+
+def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
+    """Return the share (n, k, k), rows first, of each star's light.
+
+    `offset` (n, 2) px, `sigma` (n,) px; `trail` (n, 2) px by which it moves over the exposure, None: none.
+    """
+    out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
+    for shift, share in path(np.zeros_like(offset) if trail is None else trail):
+        x, y = (offset + shift).T
+        across, down = profile(x, sigma, half)[0], profile(y, sigma, half)[0]
+        out += share * (down[:, :, None] * across[:, None, :])
+    return out
+
+
+# Residuals allowed before they are another thing's light, as part of the star's light in the pixel.
+_TOLERATED = 0.25
+_LEAST_PIXELS = 40
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseModel:
+    """`photon` counts^2 a count of light (1/gain) and `mismatch`, a part of the light."""
+
+    photon: float = 0.0
+    mismatch: float = 0.0
+
+    def variance(self, light: FloatArray, noise: FloatArray) -> FloatArray:
+        """Return counts^2 (n, k, k) of pixels with `light` (n, k, k) on a sky of `noise` (n,)."""
+        seen = np.maximum(light, 0.0)
+        return np.asarray((noise**2)[:, None, None] + self.photon * seen + (self.mismatch * seen) ** 2)
+
+    def tolerant(self, light: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return `variance` widened for shapes that no Gaussian has."""
+        return np.asarray(variance + (_TOLERATED * light) ** 2)
+
+
+def measure_noise(
+    residual: FloatArray,
+    variance: FloatArray,
+    leverage: FloatArray,
+    light: FloatArray,
+    noise: FloatArray,
+    gain: float | None,
+) -> NoiseModel:
+    """Return the noise model that the residuals (n, k, k) of a fit show; a given `gain` is kept.
+
+    Least squares of residual^2 - noise^2 on light and light^2, weighted by the spread of squared normal
+    residuals and never negative. `leverage` is the part of each residual that the fit absorbed.
+    """
+    used = np.isfinite(variance) & (light > 0.5 * noise[:, None, None]) & (leverage < 0.8)
+    given = 0.0 if gain is None else 1.0 / gain
+    if np.count_nonzero(used) < _LEAST_PIXELS:
+        return NoiseModel(given, 0.0)
+    if gain is not None:
+        return NoiseModel(given, _shared_mismatch(residual, leverage, light, noise, used, given))
+    m = light[used]
+    floor = np.broadcast_to((noise**2)[:, None, None], light.shape)[used]
+    excess = residual[used] ** 2 / (1.0 - leverage[used]) - floor
+    photon, square = 0.0, 0.0
+    for _ in range(_ROUNDS):
+        expected = floor + photon * m + square * m * m
+        weight = 1.0 / expected**2
+        # Residuals beyond 5 sigma of the present model are let go: neighbours and hot pixels.
+        weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
+        photon, square = _non_negative(m, excess, weight)
+    return NoiseModel(photon, float(np.sqrt(square)))
+
+
+def _shared_mismatch(
+    residual: FloatArray,
+    leverage: FloatArray,
+    light: FloatArray,
+    noise: FloatArray,
+    used: BoolArray,
+    photon: float,
+) -> float:
+    """Return the mismatch that stars of a known photon noise share: the median of theirs, by their weight.
+
+    A wrong shape is the same in all of them; a neighbour's light, which is none, is in a few.
+    """
+    m = np.where(used, light, 0.0)
+    floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
+    excess = np.where(used, residual**2 / np.where(used, 1.0 - leverage, 1.0) - floor - photon * m, 0.0)
+    square = 0.0
+    for _ in range(_ROUNDS):
+        weight = (m / (floor + photon * m + square * m * m)) ** 2
+        own, least = np.sum(weight * excess, axis=(1, 2)), np.sum(weight * m * m, axis=(1, 2))
+        seen = least > 0.0
+        ratio, share = own[seen] / least[seen], least[seen]
+        order = np.argsort(ratio)
+        whole = np.cumsum(share[order])
+        square = max(0.0, float(ratio[order][np.searchsorted(whole, 0.5 * whole[-1])]))
+    return float(np.sqrt(square))
+
+
+def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tuple[float, float]:
+    """Return the parts of `excess` that go with m and with m^2, neither below zero."""
+    first, second, third = (float(np.sum(weight * m**power)) for power in (2, 3, 4))
+    along, square = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
+    determinant = first * third - second**2
+    if determinant > 1e-12 * first * third:
+        both = (
+            (third * along - second * square) / determinant,
+            (first * square - second * along) / determinant,
+        )
+        if min(both) >= 0.0:
+            return both
+    alone = max(0.0, along / first), max(0.0, square / third)
+    gains = alone[0] * along, alone[1] * square
+    return (alone[0], 0.0) if gains[0] >= gains[1] else (0.0, alone[1])
+
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
@@ -155,3 +405,51 @@ def _inverse(normal: FloatArray) -> FloatArray:
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
     outer = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal / outer + _RIDGE * np.eye(normal.shape[1])) / outer)
+
+
+# A neighbour farther than this many sigmas of the point spread beyond the window gives it nothing.
+_BEYOND = 3.0
+_MOST_OVERLAP = 0.8
+_LEAST_OVERLAP = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Ordered pairs: `first` (p,) has `second` (p,) in its window; `overlap` (n,) of each star's image."""
+
+    first: IntArray
+    second: IntArray
+    overlap: FloatArray
+
+
+def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int) -> Pairs:
+    """Return which of the stars at `points` (n, 2) px send light into another's window.
+
+    The overlap is that of the two images, exp(-d^2 / 4 sigma^2): 0 for a lone star and where the neighbour
+    is too faint to matter.
+    """
+    apart = points[:, None] - points
+    reach = half + _BEYOND * psf_sigma
+    near = (np.abs(apart) < reach).all(axis=-1) & (flux > 0.0)
+    np.fill_diagonal(near, val=False)
+    first, second = np.nonzero(near)
+    square = np.sum(apart[first, second] ** 2, axis=-1)
+    each = np.minimum(np.exp(-square / (4.0 * psf_sigma**2)), _MOST_OVERLAP)
+    overlap = np.zeros(len(points))
+    np.maximum.at(overlap, first, np.where(each > _LEAST_OVERLAP, each, 0.0))
+    return Pairs(first, second, overlap)
+
+
+def neighbour_light(
+    pairs: Pairs, windows: Windows, middle: IntArray, offset: FloatArray, flux: FloatArray, width: FloatArray
+) -> FloatArray:
+    """Return the light (n, k, k) of all neighbours in each star's window about `middle` (n, 2).
+
+    The stars are at `offset` (n, 2) px from there, of `flux` (n,) and `width` (n,) px.
+    """
+    size = 2 * windows.half + 1
+    out = np.zeros((len(middle), size, size))
+    place = (middle + offset)[pairs.second] - middle[pairs.first]
+    share = light(place, width[pairs.second], windows.half, windows.trail[pairs.second])
+    np.add.at(out, pairs.first, share * np.maximum(flux, 0.0)[pairs.second, None, None])
+    return out

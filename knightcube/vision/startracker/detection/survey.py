@@ -1,21 +1,247 @@
-"""The first pass over a frame, of points or of streaks: its sky, and what stands above the noise."""
+"""The first pass over a frame: its sky, the connected areas above the noise, and whether they are streaks.
+
+`survey` smooths the frame, finds the pixels above the noise (`sky`) and joins them into areas. The shapes of
+the brightest areas tell a frame of points from a frame of streaks.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
-from knightcube.astro.arrays import Image
-from knightcube.vision.startracker.detection.areas import Areas, find_areas
-from knightcube.vision.startracker.detection.detections import FrameShape
-from knightcube.vision.startracker.detection.frame_kind import frame_shape
-from knightcube.vision.startracker.detection.settings import DetectionSettings
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.vision.frame.regions import label_pixels, moments
+from knightcube.vision.frame.saturation import saturation_of_bright
+from knightcube.vision.startracker.detection.detect import FrameKind, FrameShape
 from knightcube.vision.startracker.detection.sky import (
+    BrightPixels,
     Sky,
     find_bright,
     in_counts,
     measure_sky,
     without_hot_pixels,
 )
+
+Method = Literal["psf", "window", "weighted", "gaussian", "iterative"]
+
+
+CENTROIDS: tuple[Method, ...] = get_args(Method)
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionSettings:
+    """How stars are found and measured.
+
+    Attributes:
+        method: `psf` fits the point spread, `window` takes the centre of mass of eq. 12-21, the others weigh
+            its pixels otherwise (`centroids`).
+        threshold_sigmas: least height of a peak of the smoothed frame, over that frame's measured noise.
+        most_stars: the brightest are kept, no more; no sixteenth of the frame gives more than its share
+            (`selection`).
+        psf_sigma: px; None measures it from the frame. Tracking frames hold few stars: give it there.
+        gain: electrons per count; None measures it from the scatter of the stars' own pixels.
+        saturation: counts at which a pixel clips; None for the frame's highest count where several pixels
+            share it, else the top of the integer type.
+        window: px, a_ROI of eq. 12-15, odd.
+        search_radius: px, how far from its prediction `measure_near` looks for a star.
+    """
+
+    method: Method = "psf"
+    threshold_sigmas: float = 5.0
+    most_stars: int = 60
+    psf_sigma: float | None = None
+    gain: float | None = None
+    saturation: float | None = None
+    window: int = 7
+    search_radius: float = 4.0
+
+    def __post_init__(self) -> None:
+        if self.method not in CENTROIDS:
+            raise ValueError(f"method = {self.method!r}: use {', '.join(CENTROIDS)}")
+        for name, low, high in (
+            ("threshold_sigmas", 1.0, 100.0),
+            ("most_stars", 1, 10_000),
+            ("psf_sigma", 0.3, 6.0),
+            ("gain", 1e-6, 1e6),
+            ("saturation", 1e-6, 1e9),
+            ("search_radius", 1.0, 50.0),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise ValueError(f"{name} = {value!r}: give {low} .. {high}")
+        if self.window % 2 == 0 or not 5 <= self.window <= 31:
+            raise ValueError(f"window = {self.window!r}: give an odd number of pixels, 5 .. 31")
+
+    def in_units_of(self, unit: float) -> DetectionSettings:
+        """Return the settings for a frame whose counts were divided by `unit`."""
+        if unit == 1.0:
+            return self
+        saturation = None if self.saturation is None else self.saturation / unit
+        return replace(self, saturation=saturation, gain=None if self.gain is None else self.gain * unit)
+
+
+_BLOCK = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Areas:
+    """Connected areas, `n` of them, and their `m` pixels.
+
+    Attributes:
+        row, column, owner: (m,) of each pixel, and the number of its area.
+        smooth: (m,) counts of the smoothed frame above its level.
+        peak: (m,) whether no neighbour is higher.
+        saturated: (m,) whether the pixel is.
+        ceiling: counts at which pixels saturate; inf where nothing is known.
+        pixels: (n,) how many.
+        flux: (n,) counts.
+        centre: (n, 2) px, of light.
+        length: (n,) px, of the uniform line with the area's moments, free of the point spread.
+        thickness: (n,) px, rms across.
+        direction: (n,) rad, of the length to the rows.
+        shape: rows, columns of the frame.
+    """
+
+    row: IntArray
+    column: IntArray
+    owner: IntArray
+    smooth: FloatArray
+    peak: BoolArray
+    saturated: BoolArray
+    ceiling: float
+    pixels: IntArray
+    flux: FloatArray
+    centre: FloatArray
+    length: FloatArray
+    thickness: FloatArray
+    direction: FloatArray
+    shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+
+def find_areas(pixels: Image, sky: Sky, bright: BrightPixels, saturation: float | None) -> Areas:
+    """Return the 8-connected areas of `bright` pixels, with moments in `pixels` less the sky."""
+    owner, count = label_pixels(bright.index, bright.shape[1])
+    row, column = np.divmod(bright.index, bright.shape[1])
+    counts = pixels[row, column].astype(np.float64)
+    light = np.maximum(counts - sky.level.at(column, row), 0.0)
+    found = moments(owner, column, row, light, count)
+    ceiling = saturation_of_bright(counts, pixels, saturation)
+    return Areas(
+        row,
+        column,
+        owner,
+        bright.smooth,
+        _peaks(bright.smooth, *_adjoining(bright.index, bright.shape[1])),
+        counts >= ceiling,
+        ceiling,
+        np.bincount(owner, minlength=count),
+        found.flux,
+        found.centre,
+        found.length,
+        found.thickness,
+        found.direction,
+        bright.shape,
+    )
+
+
+def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
+    """Return which pixels `place` (p, 2) lie in blocks of 32 px of which the areas fill more than `share`.
+
+    Half a block's step each way is looked at too, so that where the blocks begin does not matter.
+    """
+    down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
+    found = np.zeros(len(place), dtype=bool)
+    for shift_y in (0, _BLOCK // 2):
+        for shift_x in (0, _BLOCK // 2):
+            block = (areas.row + shift_y) // _BLOCK * across + (areas.column + shift_x) // _BLOCK
+            filled = np.bincount(block, minlength=down * across)
+            own = (place[:, 1] + shift_y) // _BLOCK * across + (place[:, 0] + shift_x) // _BLOCK
+            found |= filled[own] > share * _BLOCK**2
+    return found
+
+
+def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
+    """Return the pairs (p,) of pixels that touch, by number in `index` (m,), flat and increasing.
+
+    Two pixels that the frame's border parts are never both given: the outermost columns hold none.
+    """
+    pairs = []
+    for step in (1, columns - 1, columns, columns + 1):
+        other = np.searchsorted(index, index + step)
+        other[other == len(index)] = 0
+        first = np.flatnonzero(index[other] == index + step) if len(index) else other
+        pairs.append((first, other[first]))
+    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
+
+
+def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
+    """Return which pixels (m,) are higher than all that touch them; of equals the last one wins.
+
+    Pixels below the noise threshold are lower than those above it.
+    """
+    best = np.ones(len(smooth), dtype=bool)
+    best[first[smooth[first] <= smooth[second]]] = False
+    best[second[smooth[second] < smooth[first]]] = False
+    return best
+
+
+# The brightest areas decide; a rate shows in all of them, or in all but those on its axis.
+_LOOKED_AT = 20
+_LEAST_PIXELS = 4
+_SHORTEST_STREAK = 5.0
+_SLENDER = 3.5
+_LEAST_STREAKS = 4
+_STREAKED_PART = 0.4
+_ROUND = 3.0
+_THICKEST = 6.0
+# Sine of the angle by which a tree's twigs miss one rotation's flow, and streaks do not.
+_CROOKED = 0.12
+
+
+def is_streak(areas: Areas) -> BoolArray:
+    """Return which areas (n,) are thin and long."""
+    return np.asarray((areas.length > _SHORTEST_STREAK) & (areas.length > _SLENDER * areas.thickness))
+
+
+def frame_shape(areas: Areas) -> FrameShape:
+    """Return the kind of the frame; four streaks are needed, at least four in ten of its areas."""
+    chosen = np.argsort(-areas.flux, kind="stable")[: 3 * _LOOKED_AT]
+    usable = (areas.pixels[chosen] >= _LEAST_PIXELS) & (areas.thickness[chosen] < _THICKEST)
+    chosen = chosen[usable][:_LOOKED_AT]
+    streaks = is_streak(areas)[chosen]
+    points = areas.length[chosen] < _ROUND * np.maximum(areas.thickness[chosen], 1.0)
+    long, short = int(np.count_nonzero(streaks)), int(np.count_nonzero(points & ~streaks))
+    if (
+        long >= _LEAST_STREAKS
+        and long >= _STREAKED_PART * (long + short)
+        and share_one_rotation(areas.centre[chosen][streaks], areas.direction[chosen][streaks])
+    ):
+        return FrameShape(FrameKind.STREAKS, float(np.median(areas.length[chosen][streaks])))
+    if short:
+        return FrameShape(FrameKind.POINTS, float(np.median(areas.length[chosen][points & ~streaks])))
+    return FrameShape(FrameKind.NEITHER, 0.0)
+
+
+def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
+    """Return whether lines at `centre` (n, 2) px, `direction` (n,) rad, follow one rotation of the camera.
+
+    Near the boresight its flow is t + w (-y, x): normal to no line that follows it. The t and w that are
+    the least so are the smallest singular vector of the normals' products with the flow.
+    """
+    middle = centre.mean(axis=0)
+    scale = float(np.abs(centre - middle).max()) or 1.0
+    x, y = ((centre - middle) / scale).T
+    normal = np.stack([-np.sin(direction), np.cos(direction)], axis=-1)
+    products = np.column_stack([normal, normal[:, 1] * x - normal[:, 0] * y])
+    tx, ty, turn = np.linalg.svd(products)[2][-1]
+    flow = np.stack([tx - turn * y, ty + turn * x], axis=-1)
+    speed = np.maximum(np.linalg.norm(flow, axis=1), 1e-12)
+    return bool(np.median(np.abs(np.sum(flow * normal, axis=1)) / speed) < _CROOKED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.startracker.detection.centroids import METHODS
-from knightcube.vision.startracker.detection.point_spread import light
+from knightcube.vision.startracker.detection.measurement import METHODS
+from knightcube.vision.startracker.detection.psf_fit import light
 
 PLACES = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.4]])
 WIDTH = 0.9

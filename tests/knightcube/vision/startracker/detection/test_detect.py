@@ -13,7 +13,7 @@ from knightcube.vision.startracker.detection import (
     detect,
     kind_of_frame,
 )
-from knightcube.vision.startracker.detection.settings import Method
+from knightcube.vision.startracker.detection.survey import Method
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import real_sky

@@ -10,13 +10,11 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.frame.background import Background
-from knightcube.vision.startracker.detection.areas import find_areas
-from knightcube.vision.startracker.detection.noise_model import NoiseModel, measure_noise
-from knightcube.vision.startracker.detection.peaks import find_peaks
-from knightcube.vision.startracker.detection.point_spread import light, profile
+from knightcube.vision.startracker.detection.detect import find_peaks
+from knightcube.vision.startracker.detection.measurement import centre_of_mass
+from knightcube.vision.startracker.detection.psf_fit import NoiseModel, cut, light, measure_noise, profile
 from knightcube.vision.startracker.detection.sky import Surface, find_bright, measure_sky
-from knightcube.vision.startracker.detection.window_centroid import centre_of_mass
-from knightcube.vision.startracker.detection.windows import cut
+from knightcube.vision.startracker.detection.survey import find_areas
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 
 
