@@ -11,7 +11,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 
 
 def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:

@@ -45,7 +45,7 @@ from knightcube.vision.startracker.detection.survey import CENTROIDS
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import FrameSolution
 from knightcube.vision.startracker.solve import RatePrior, SolveSettings
 from knightcube.vision.streaks.streak_result import StreakStatus

@@ -17,7 +17,7 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import EXTRA
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import FrameSolution
 
 if TYPE_CHECKING:

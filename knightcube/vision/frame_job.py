@@ -30,9 +30,8 @@ from knightcube.vision.startracker.detection import FrameKind, Survey, measure_a
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.mid_exposure import MOVED
-from knightcube.vision.startracker.short_trails import ShortTrails
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.startracker.sky_map import ShortTrails
+from knightcube.vision.startracker.solution import MOVED, FrameSolution, SolveStatus
 from knightcube.vision.startracker.solve import (
     PRIOR_SIGMAS,
     AttitudePrior,

@@ -31,7 +31,7 @@ from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.solution import HorizonStatus
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import SolveStatus
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion

@@ -20,7 +20,7 @@ from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
 from knightcube.vision.kept_frames import KeptFrames
 from knightcube.vision.objects.sighted import SightSettings
-from knightcube.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
+from knightcube.vision.startracker.solution import NODES, middle_covariance, weighting_of
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.maximum_likelihood.course import Course

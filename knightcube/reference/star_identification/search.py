@@ -1,25 +1,126 @@
-"""From candidate patterns to an identification: the part that all classical methods share.
+"""From candidate patterns to an identification: the common part of all classical methods.
 
-A method yields batches of candidates, observed stars and the guide stars they may be. Each gives an attitude,
-the brightest observed stars are carried to the sky by it, and those that fall near guide stars are counted;
-the best counts are verified against the whole field, which rejects false candidates of any method.
+A method yields batches of candidates: observed stars and the guide stars that they may be. Each candidate
+gives an attitude. The brightest observed stars are transformed to the sky by it, and those that fall near
+guide stars are counted. The candidates with the highest counts are verified against the whole field, which
+rejects false candidates of any method. A field of uncertain scale is searched at several scales (`View`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.errors import FlightError
 from knightcube.reference.star_identification.known_sky import KnownSky
-from knightcube.reference.star_identification.settings import DEFAULT, ClassicalSettings
-from knightcube.reference.star_identification.view import View, views
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
-from knightcube.vision.startracker.identification.verification import nothing, verify_matrix
+from knightcube.reference.star_identification.pair_table import angles
+from knightcube.vision.startracker.identification.attitude_fit import stretched
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
+from knightcube.vision.startracker.identification.verification import (
+    VerificationSettings,
+    nothing,
+    verify_matrix,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassicalSettings:
+    """One set for all methods; each uses some of it.
+
+    Attributes:
+        brightest: observed stars of which patterns are made.
+        tolerance: of an angle, an area or a moment, in its sigmas.
+        patterns: triangles or pivots that are looked up in a table at most.
+        joins: triangles made of pairs at most, over all scales: each takes half a millisecond, and a list
+            without a match takes them all.
+        candidates: of all patterns together, that are laid over the field at most: the budget of work.
+        screened: observed stars, the brightest, that a candidate is laid over before it is verified.
+        verified: candidates of a pattern that the whole field verifies at most.
+        scale_step: relative half width of the scales that one look-up covers.
+        scales: look-ups at most; a field that would need more is rejected.
+        verification: when a candidate is accepted.
+    """
+
+    brightest: int = 11
+    tolerance: float = 3.0
+    patterns: int = 80
+    joins: int = 24
+    candidates: int = 2500
+    screened: int = 14
+    verified: int = 4
+    scale_step: float = 0.002
+    scales: int = 9
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+
+
+DEFAULT = ClassicalSettings()
+
+
+class FieldUnknown(FlightError):
+    """A field of view too uncertain for the classical methods; the default method solves those."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A field at one scale.
+
+    Attributes:
+        field: as given.
+        scale: by which its tangents are multiplied here.
+        direction: (n, 3) unit vectors, so multiplied.
+        sigma: (n,) rad.
+        slack: relative error of angles by the scale.
+        stars: number of the brightest stars that patterns are made of.
+    """
+
+    field: StarField
+    scale: float
+    direction: FloatArray
+    sigma: FloatArray
+    slack: float
+    stars: int
+
+    def angles(
+        self, one: IntArray, other: IntArray, tolerance: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the angles (k,) between observed stars, and the limits (k,), (k,) of the true ones.
+
+        The limits are `tolerance` sigmas (31: the variances of the two along their arc add up) and the slack.
+        """
+        angle = angles(self.direction[one], self.direction[other])
+        off = tolerance * np.hypot(self.sigma[one], self.sigma[other]) + self.slack * angle
+        return angle, angle - off, angle + off
+
+
+def views(field: StarField, settings: ClassicalSettings) -> Iterator[View]:
+    """Yield the field at the scales that cover its range, the likeliest first.
+
+    Raises FieldUnknown when the range needs more of them than the settings allow.
+    """
+    low, high = (math.log(edge) for edge in field.scale)
+    steps = max(1, math.ceil((high - low) / (2.0 * settings.scale_step) - 1e-9))
+    if steps > settings.scales:
+        known = 100.0 * settings.scales * settings.scale_step
+        raise FieldUnknown(
+            f"scale known to {50.0 * (high - low):.1f} %: the classical methods need {known:.1f} %;"
+            " the default method takes any"
+        )
+    edges = np.linspace(low, high, steps + 1)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    for middle in middles[np.argsort(np.abs(middles - 0.5 * (low + high)), kind="stable")]:
+        scale = math.exp(middle)
+        yield View(
+            field,
+            scale,
+            stretched(field.direction, scale),
+            field.sigma * scale,
+            0.5 * (high - low) / steps,
+            min(settings.brightest, len(field)),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

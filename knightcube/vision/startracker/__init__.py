@@ -1,6 +1,7 @@
 """The star tracker: identifies the stars of a frame and determines its attitude (Michalski chapter 3).
 
-    pixels -> detection -> StarField -> an identification method -> verification -> attitude
+    pixels -> detection -> StarField -> identification -> verification -> attitude
 
-`field` is the input of an identification method, `identification` its result; `guide_stars` is the catalogue.
+`detection` finds and measures stars, `identification` names them with the guide stars of `index`, and
+`image_fit` determines the attitude from their positions. `solve` combines these steps into a `solution`.
 """

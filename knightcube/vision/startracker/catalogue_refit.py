@@ -17,9 +17,8 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.startracker.aberration import apparent
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.sky_map import SkyMap
+from knightcube.vision.startracker.sky_map import SkyMap, apparent
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
 from knightcube.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from knightcube.vision.streaks.maximum_likelihood.chains import apart, circles, close_by

@@ -1,19 +1,20 @@
-"""The attitude from matched stars whose places in the image have individual covariances.
+"""The attitude from matched stars whose image positions have individual covariances.
 
 A streaked star is measured well across its path and badly along it. Each residual b - A r is taken in the two
-directions across the star and whitened by the place's covariance; Gauss-Newton minimises the sum of squares:
-the maximum likelihood for Gaussian errors. Light of another star in a streak shifts its place: stars that
-disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
-bound the pull of any star, and are excluded.
+directions across the star and whitened by the covariance of the position; Gauss-Newton minimises the sum of
+squares, the maximum likelihood estimate for Gaussian errors. The light of another star in a streak shifts its
+position. Stars that disagree by more than chance allows, given the scatter of the majority, are found with
+Huber's weights, which bound the influence of any star, and are excluded.
 
-The tilt, decentring and distortion of a lens that is not exact are fitted too, held by what is known of it or
-is usual of lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance. So is a
-shutter that rolls otherwise than described: it displaces each star along its motion, by its row.
+Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are fitted too, with a prior from
+the calibration or from typical lenses: their remaining uncertainty is part of the covariance of the attitude.
+The same holds for an error of the line time of a rolling shutter, which displaces each star along its motion
+in proportion to its row.
 
-Streaks unlike the model err by px, bright ones as much as faint ones: where they scatter beyond their noise,
-a variance common to all is added to it, so large that the squares are as many as their degrees of freedom
-(Mandel & Paule 1970, Analytical Chemistry 42(11)). Else the brightest, whose noise is least, would decide
-alone, and claim too much.
+Streaks that differ from the model err by pixels, bright ones as much as faint ones. Where streaks scatter
+beyond their noise, a common variance is added to the noise, so large that the sum of squares equals the
+degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without it the brightest stars, whose
+noise is smallest, would dominate, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -23,12 +24,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
+from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
-from knightcube.vision.startracker.lens_bend import BENDS, bend_slope, bent
+from knightcube.vision.startracker.identification.attitude_fit import (
+    inflation,
+    scale_slope,
+    stretched,
+    turned,
+)
+from knightcube.vision.startracker.sky_map import BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
@@ -278,3 +284,26 @@ def _whitener(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     spread = slopes @ np.linalg.cholesky(covariance)
     # The pseudo-inverse: the third direction, along the line of sight, carries no error.
     return np.asarray(np.linalg.inv(np.swapaxes(spread, -1, -2) @ spread) @ np.swapaxes(spread, -1, -2))
+
+
+def attitude_by(
+    solver: Solver,
+    points: FloatArray,
+    covariance: FloatArray,
+    reference: FloatArray,
+    camera: CameraModel,
+    fit: ImageFit,
+    late: FloatArray,
+) -> AttitudeFix:
+    """Return a solver's attitude from the stars at `points` (n, 2) px that agree in an image fit.
+
+    `covariance` (n, 2, 2) px^2, `reference` (n, 3) and `late` (n, 2) are theirs, `camera` is that of the
+    fit's start. Raises AttitudeError.
+    """
+    if len(late):
+        points = points - fit.delay * late
+    seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
+    pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
+    # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
+    sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
+    return solver(seen, reference[fit.agree], sigma)

@@ -1,4 +1,13 @@
-"""From the pixels of a solved picture to the sky, and back."""
+"""Conversion between pixels and directions in the sky, for a camera of known attitude.
+
+- Stellar aberration: a moving camera sees stars displaced towards its direction of motion, by up to 20.8"
+  (the exact formula of special relativity; Green, Spherical Astronomy, 1985, 8.3; Explanatory Supplement,
+  7.2.3).
+- Lens errors that remain besides a wrong focal length: the optical axis is not in the image centre, and the
+  lens distorts. Tangents u are off by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with tilt a, decentring b
+  and distortion k, l (Brown 1966). The vector (a, b, k, l), (6,), is called the bend of the lens.
+- Pointing: right ascension, declination and roll of an attitude.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +16,129 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT
+from knightcube.astro.quaternion import attitude_matrix, from_matrix
+from knightcube.vision.camera.knowledge import CameraKnowledge
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.startracker.aberration import apparent
-from knightcube.vision.startracker.lens_bend import BENDS, bent
+from knightcube.vision.startracker.identification.attitude_fit import scale_slope
+
+
+def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Return where stars at `direction` (n, 3), unit vectors, appear to a camera at `velocity` (3,) m/s.
+
+    The velocity is with respect to the solar system's barycentre, in the axes of the directions. Raises
+    ValueError unless it is finite and below the speed of light.
+    """
+    beta = np.asarray(velocity, dtype=float) / SPEED_OF_LIGHT
+    square = float(beta @ beta)
+    if not square < 1.0:
+        raise ValueError(f"velocity = {velocity!r} m/s: give a finite one below the speed of light")
+    slowed = np.sqrt(1.0 - square)
+    along = (direction @ beta)[:, None]
+    shifted = slowed * direction + beta + along / (1.0 + slowed) * beta
+    return np.asarray(shifted / (1.0 + along))
+
+
+BENDS = 6
+# Standard deviations of the tilt along x and y, as a part of the corner's tangent, and of the distortion
+# there by its two terms: 20 px of 1024, 3 and 1 %. The decentring is the product of tilt and distortion.
+_TILT, _DISTORTION = 0.03, (0.03, 0.01)
+
+# px, and a share of the radius: what is known better is taken to be known so well.
+_LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
+
+
+def usual_bend(camera: CameraModel) -> FloatArray:
+    """Return the information (6,) about the bend that is usual of lenses."""
+    corner = float(np.tan(camera.half_diagonal))
+    first, second = _DISTORTION
+    off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
+    return np.array([*off, first / corner**2, second / corner**4]) ** -2.0
+
+
+def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
+    """Return the information (6,) about the bend of a lens known so well; (0,) of one that is exact.
+
+    An axis that is off the described one turns all stars alike, which is the mounting's, and tilts the lens.
+    """
+    if lens.centre == lens.distortion == 0.0:
+        return np.zeros(0)
+    corner = float(np.tan(camera.half_diagonal))
+    tilt = max(lens.centre, _LEAST_CENTRE) / camera.focal_length
+    first = max(lens.distortion, _LEAST_DISTORTION) / corner**2
+    off = [tilt] * 2 + [tilt * first] * 2
+    return np.array([*off, first, _DISTORTION[1] / _DISTORTION[0] * first / corner**2]) ** -2.0
+
+
+def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
+    """Return the unit vectors (n, 3) of what a lens of this `bend` (6,) shows at `direction` (n, 3)."""
+    if not bend.any():
+        return direction
+    out = direction + bend_slope(direction) @ bend
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+
+
+def bend_slope(seen: FloatArray) -> FloatArray:
+    """Return by how much directions (n, 3) move per unit of tilt, decentring and distortion, (n, 3, 6)."""
+    tangent = seen[:, :2] / seen[:, 2:]
+    square = np.sum(tangent**2, axis=1, keepdims=True)
+    # Tilt and distortion stretch a tangent u along itself, by u_x, u_y, |u|^2 and |u|^4.
+    along = np.concatenate([tangent, square, square**2], axis=1)
+    stretch = scale_slope(seen)[:, :, None] * along[:, None, :]
+    across = np.eye(3)[:, :2] - seen[:, :, None] * seen[:, None, :2]
+    shift = across * (seen[:, 2:] * square)[:, :, None]
+    return np.asarray(np.concatenate([stretch[:, :, :2], shift, stretch[:, :, 2:]], axis=2))
+
+
+@dataclass(frozen=True, slots=True)
+class Pointing:
+    """A camera's attitude, rad.
+
+    Attributes:
+        right_ascension, declination: of the boresight, ICRS; right ascension in [0, 2 pi).
+        roll: position angle of the image's upward direction (-y), from north towards east, [0, 2 pi).
+            At a celestial pole north is that of right ascension zero.
+    """
+
+    right_ascension: float
+    declination: float
+    roll: float
+
+    @classmethod
+    def of(cls, quaternion: FloatArray) -> Pointing:
+        """Return the pointing of an attitude (4,), ICRS to camera."""
+        _, y, z = attitude_matrix(quaternion)
+        declination = np.arctan2(z[2], np.hypot(z[0], z[1]))
+        right_ascension = np.arctan2(z[1], z[0])
+        north, east = _north_and_east(float(right_ascension), float(declination))
+        roll = np.arctan2(-y @ east, -y @ north)
+        full = 2.0 * np.pi
+        return cls(float(right_ascension % full), float(declination), float(roll % full))
+
+    def quaternion(self) -> FloatArray:
+        """Return the attitude (4,), ICRS to camera."""
+        cosine = np.cos(self.declination)
+        z = np.array(
+            [
+                cosine * np.cos(self.right_ascension),
+                cosine * np.sin(self.right_ascension),
+                np.sin(self.declination),
+            ]
+        )
+        north, east = _north_and_east(self.right_ascension, self.declination)
+        y = -(np.cos(self.roll) * north + np.sin(self.roll) * east)
+        return from_matrix(np.stack([np.cross(y, z), y, z]))
+
+
+def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatArray, FloatArray]:
+    """Return the unit vectors (3,), (3,) towards north and east at a place of the sky."""
+    sine, cosine = np.sin(right_ascension), np.cos(right_ascension)
+    north = np.array([-np.sin(declination) * cosine, -np.sin(declination) * sine, np.cos(declination)])
+    return north, np.array([-sine, cosine, 0.0])
+
 
 # Each step leaves the bend's slope, a few percent, of the error before it.
-_STEPS = 8
+_BEND_STEPS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +165,29 @@ class SkyMap:
             directions = apparent(directions, self.velocity)
         wanted = self.camera.project(directions @ attitude_matrix(self.quaternion).T)
         points = wanted
-        for _ in range(_STEPS if self.bend.any() else 0):
+        for _ in range(_BEND_STEPS if self.bend.any() else 0):
             points = points + wanted - self.camera.project(bent(self.camera.unit_vectors(points), self.bend))
         return points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShortTrails:
+    """How stars that are nearly points move over the exposure.
+
+    Attributes:
+        turn: (3,) rad, of the camera over the exposure, its axes.
+        delay: exposures from one row's to the next's, and `delay_sigma`, its standard deviation.
+    """
+
+    turn: FloatArray
+    delay: float = 0.0
+    delay_sigma: float = 0.0
+
+    def of(self, camera: CameraModel, direction: FloatArray) -> FloatArray:
+        """Return by how much stars at `direction` (n, 3), camera axes, move: (n, 2) px."""
+        moved = 0.5 * np.cross(direction, self.turn)
+        return np.nan_to_num(camera.project(direction + moved) - camera.project(direction - moved))
+
+    def late(self, camera: CameraModel, points: FloatArray) -> FloatArray:
+        """Return by how much stars at `points` (n, 2) px are off for each exposure of delay: (n, 2) px."""
+        return self.of(camera, camera.unit_vectors(points)) * (points[:, 1:] - camera.centre[1])

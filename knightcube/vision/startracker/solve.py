@@ -19,26 +19,20 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to
 from knightcube.vision.camera.knowledge import CameraKnowledge
 from knightcube.vision.camera.lens import CameraModel, Lens, LensError
 from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.startracker.aberration import apparent
-from knightcube.vision.startracker.by_directions import attitude_by
 from knightcube.vision.startracker.detection import (
     Detections,
     DetectionSettings,
     FrameKind,
     measure_near,
 )
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
 from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings, identify
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.identification.tracking import track
 from knightcube.vision.startracker.identification.verification import expected_stars
-from knightcube.vision.startracker.image_fit import Unknowns, fit_in_image
+from knightcube.vision.startracker.image_fit import Unknowns, attitude_by, fit_in_image
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.lens_bend import known_bend, usual_bend
-from knightcube.vision.startracker.mid_exposure import timing_covariance
-from knightcube.vision.startracker.short_trails import ShortTrails
-from knightcube.vision.startracker.sky_map import SkyMap
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.startracker.sky_map import ShortTrails, SkyMap, apparent, known_bend, usual_bend
+from knightcube.vision.startracker.solution import FrameSolution, SolveStatus, timing_covariance
 from knightcube.vision.streaks.maximum_likelihood.course import Course
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings

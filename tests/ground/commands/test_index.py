@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.identification.identification import Status
 from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.index.sky_index import load
 from tests.ground.commands.in_process import command
 from tests.studies.bench.star_lists import ListKind, draw

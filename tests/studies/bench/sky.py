@@ -29,7 +29,7 @@ from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.pinhole import Pinhole
 from knightcube.vision.frame_job import solve_frame
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import FrameSolution
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame

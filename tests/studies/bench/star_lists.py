@@ -15,8 +15,8 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.index.guide_stars import GuideStars
+from knightcube.vision.startracker.identification.star_field import StarField
+from knightcube.vision.startracker.index.sky_index import GuideStars
 
 PIXELS = 1024
 

@@ -28,9 +28,9 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.startracker.identification.identification import Status
+from knightcube.vision.startracker.identification.attitude_fit import refine
 from knightcube.vision.startracker.identification.lost_in_space import identify
-from knightcube.vision.startracker.identification.refinement import refine
+from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
@@ -167,7 +167,7 @@ def memory_of_index() -> float:
     script = (
         "import resource, numpy as np\n"
         "from knightcube.vision.startracker.index.build import default_index\n"
-        "from knightcube.vision.startracker.identification.field import StarField\n"
+        "from knightcube.vision.startracker.identification.star_field import StarField\n"
         "from knightcube.vision.startracker.identification.lost_in_space import identify\n"
         "def now(): return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20\n"
         "before = now()\n"

@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.startracker.identification.identification import Identification
 from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.identification.star_field import Identification
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.guide_stars import GuideStars
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
 from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error

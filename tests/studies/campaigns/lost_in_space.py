@@ -21,13 +21,10 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.reference.star_identification import rate_matching
 from knightcube.reference.star_identification.known_sky import KnownSky
-from knightcube.reference.star_identification.methods import METHODS
+from knightcube.reference.star_identification.methods import METHODS, StarMotion, identify_by_rate
 from knightcube.reference.star_identification.pair_table import angles
-from knightcube.reference.star_identification.rate_matching import Motion
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.index.build import default_index
 from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, draw
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -111,14 +108,14 @@ def known_sky(field_deg: float) -> KnownSky:
     return sky
 
 
-def answer_of(name: str, field: StarField, sky: KnownSky, motion: Motion) -> Identification:
+def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> Identification:
     """Return the answer of a method, with all that it can use."""
     if name == "rate":
-        return rate_matching.identify(field, sky, motion=motion)
+        return identify_by_rate(field, sky, motion=motion)
     return METHODS[name].identify(field, sky)
 
 
-def moving(drawn: StarList, generator: np.random.Generator) -> Motion:
+def moving(drawn: StarList, generator: np.random.Generator) -> StarMotion:
     """Return the velocities of a list's points as the two ends of their streaks would give them."""
     field = drawn.field()
     axis = generator.standard_normal(3)
@@ -130,7 +127,7 @@ def moving(drawn: StarList, generator: np.random.Generator) -> Motion:
     wild = false[1::2]
     velocity[wild] = np.cross(field.direction[wild], BODY_RATE * generator.standard_normal((len(wild), 3)))
     sigma = np.sqrt(2.0) * field.sigma / EXPOSURE
-    return Motion(velocity + sigma[:, None] * generator.standard_normal(velocity.shape), sigma)
+    return StarMotion(velocity + sigma[:, None] * generator.standard_normal(velocity.shape), sigma)
 
 
 def verdict(answer: Identification, drawn: StarList) -> str:

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.identification.identification import Identification, Status
 from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.identification.star_field import Identification, Status
 from knightcube.vision.startracker.identification.verification import nothing
 from knightcube.vision.startracker.index.build import default_index
 from tests.studies.bench import starid_hard

@@ -5,20 +5,25 @@
 
 `sky` measures the background and its noise. `survey` finds the connected areas above the noise and decides
 whether the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits stars
-to their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches a
-frame, or the surroundings of predicted positions, for stars.
+to their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches
+a frame, or the surroundings of predicted positions, for stars.
 """
 
 from knightcube.vision.startracker.detection.detect import (
     Detections,
-    FrameKind,
-    FrameShape,
     Quality,
     detect,
     measure_areas,
     measure_near,
 )
-from knightcube.vision.startracker.detection.survey import DetectionSettings, Survey, kind_of_frame, survey
+from knightcube.vision.startracker.detection.survey import (
+    DetectionSettings,
+    FrameKind,
+    FrameShape,
+    Survey,
+    kind_of_frame,
+    survey,
+)
 
 __all__ = [
     "DetectionSettings",

@@ -7,7 +7,7 @@ star. `measure_near` reads only small windows around predicted positions, for tr
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import Enum, IntFlag
+from enum import IntFlag
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from knightcube.vision.startracker.detection.sky import KERNEL_NORM, Sky, correl
 from knightcube.vision.startracker.detection.survey import (
     Areas,
     DetectionSettings,
+    FrameKind,
     Survey,
     cluttered,
     frame_shape,
@@ -46,22 +47,6 @@ class Quality(IntFlag):
 
 
 REFUSED = int(Quality.HOT | Quality.EXTENDED | Quality.STREAK | Quality.CLUTTER)
-
-
-class FrameKind(Enum):
-    """The content of a frame: stars at rest, stars drawn out to streaks, or neither."""
-
-    POINTS = "points"
-    STREAKS = "streaks"
-    NEITHER = "neither"
-
-
-@dataclass(frozen=True, slots=True)
-class FrameShape:
-    """What kind of frame it is, and the median length of its streaks, px (about 0 for points)."""
-
-    kind: FrameKind
-    length: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,7 @@ the brightest areas tell a frame of points from a frame of streaks.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Literal, get_args
 
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.vision.frame.regions import label_pixels, moments
 from knightcube.vision.frame.saturation import saturation_of_bright
-from knightcube.vision.startracker.detection.detect import FrameKind, FrameShape
 from knightcube.vision.startracker.detection.sky import (
     BrightPixels,
     Sky,
@@ -83,6 +83,22 @@ class DetectionSettings:
 
 
 _BLOCK = 32
+
+
+class FrameKind(Enum):
+    """The content of a frame: stars at rest, stars drawn out to streaks, or neither."""
+
+    POINTS = "points"
+    STREAKS = "streaks"
+    NEITHER = "neither"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameShape:
+    """What kind of frame it is, and the median length of its streaks, px (about 0 for points)."""
+
+    kind: FrameKind
+    length: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

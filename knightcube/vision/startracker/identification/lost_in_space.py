@@ -1,36 +1,325 @@
-"""Lost in space: identifies the stars of a frame without prior information.
+"""Lost in space: identification of the stars of a frame without prior information.
 
-Every triangle of the brightest observed stars is looked up by shape, turning and size among those of the
-guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
+Every triangle of the brightest observed stars is looked up by shape, orientation and size among the triangles
+of guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
 occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
-field until one holds. If none does, triangles spread over all stars are looked up: of a thousand enough are
-of true stars to win the vote, though most stars and the brightest be false. Last the field is tried as a
-mirror shows it, and with a scale outside of a narrow range that was given as a hint.
+field until one is accepted. If none is, triangles spread over all stars are looked up: of a thousand, enough
+consist of true stars to win the vote even if most stars, including the brightest, are false. Finally the
+mirrored field is tried, and a scale outside of a narrow range that was given as a hint.
 
-The shape on the sphere depends on the scale of the image, though little: a wide range of scales is tried in
-steps, each narrow enough for the ratios of the sides to stay within the tolerance.
+The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of scales is
+divided into steps, each narrow enough for the side ratios to stay within the tolerance.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
-from knightcube.vision.startracker.identification.look_up import ScaleSteps, TriangleMatches, look_up
-from knightcube.vision.startracker.identification.observed_triangles import BatchSizes, batches_of
-from knightcube.vision.startracker.identification.refinement import stretched
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.vision.startracker.identification.attitude_fit import stretched
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.identification.verification import (
     VerificationSettings,
     nothing,
     verify_matrix,
 )
-from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.index.sky_index import (
+    CELL,
+    CELLS,
+    FINE,
+    LEAST_RATIO,
+    RUN_BITS,
+    SIZE_BITS,
+    SIZE_UNIT,
+    SkyIndex,
+)
+
+_BRIGHTEST = 12
+_NEIGHBOURS = 5
+_CENTRES = 40
+_MOST_STARS = 64
+# Of the field's width: larger triangles are in the index only if their stars are bright, smaller ones are
+# less sharp.
+_MIDDLE_SIZES = 0.3, 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSizes:
+    """Numbers of triangles that are looked up at once, batch after batch.
+
+    Attributes:
+        bright: of the brightest stars, at each step of scale; these solve most frames.
+        spread: of triangles spread over many stars, where the brightest are false.
+    """
+
+    bright: tuple[int, ...] = (60, 250)
+    spread: tuple[int, ...] = (300, 1000)
+
+
+def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
+    """Yield triangles (t, 3) and whether they are spread over many stars.
+
+    With many `steps` of scale a batch of the brightest is smaller, by the root of their number. The last
+    batch has triangles of neighbours too, for a list that is not in order of brightness.
+    """
+    brightest = triples(min(len(field), _BRIGHTEST))
+    begin = 0
+    for size in sizes.bright:
+        end = min(begin + max(20, int(size / steps**0.5)), len(brightest))
+        if end > begin:
+            yield brightest[begin:end], False
+        begin = end
+    if len(field) <= _BRIGHTEST and begin == len(brightest):
+        return
+    spread = np.split(middle_sized(field)[: sum(sizes.spread)], np.cumsum(sizes.spread)[:-1])
+    if len(field) > _BRIGHTEST:
+        spread[-1] = np.concatenate([spread[-1], neighbours(field)])
+    yield from ((triangles, True) for triangles in spread if len(triangles))
+
+
+def middle_sized(field: StarField) -> IntArray:
+    """Return triangles (t, 3) of middle size of the brightest stars, in a random order."""
+    triangles = triples(min(len(field), _MOST_STARS))
+    first, second, third = triangles.T
+    direction = field.direction[:_MOST_STARS]
+    cosine = direction @ direction.T
+    least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
+    longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
+    kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
+    # The same order in every run: the same list has the same answer.
+    return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
+
+
+@lru_cache(maxsize=32)
+def triples(count: int) -> IntArray:
+    """Return all triangles (t, 3) of `count` stars, in order of the faintest star of each."""
+    first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
+    ascending = (first < second) & (second < third)
+    triangles = np.stack([first[ascending], second[ascending], third[ascending]], axis=-1)
+    return np.asarray(triangles[np.lexsort(triangles.T)])
+
+
+def neighbours(field: StarField) -> IntArray:
+    """Return triangles (t, 3) of stars and their nearest neighbours, which need not be bright."""
+    cosines = field.direction[:_CENTRES] @ field.direction.T
+    near = np.argsort(-cosines, axis=1)[:, 1 : _NEIGHBOURS + 1]
+    one, two = np.triu_indices(_NEIGHBOURS, 1)
+    corners = np.stack(
+        np.broadcast_arrays(np.arange(len(near))[:, None], near[:, one], near[:, two]), axis=-1
+    ).reshape(-1, 3)
+    return np.unique(np.sort(corners, axis=1), axis=0)
+
+
+_LARGEST_SIZE = (1 << SIZE_BITS) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleSteps:
+    """Ranges of scale that together cover the lens's range, each narrow enough for one set of shapes.
+
+    Attributes:
+        middle: (s,) scale at which the shapes are computed.
+        lowest, highest: (s,) ends of each range.
+    """
+
+    middle: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.middle)
+
+    @classmethod
+    def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
+        """Return the steps for the scales of a field, with ratios of sides within `tolerance` in each.
+
+        At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
+        1 + t^2 / 2 across it, so the ratio of two sides at half the way to the corner varies by t^2 / 2.
+        """
+        lowest, highest = field.scale
+        half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
+        count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
+        edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
+        return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleMatches:
+    """Observed triangles that look like triangles of guide stars, corner by corner.
+
+    Attributes:
+        observed: (k, 3) uint32, numbers of observed stars.
+        star: (k, 3) uint32, numbers of guide stars.
+        scale: (k,) factor of the tangents that makes the longest sides equal.
+    """
+
+    observed: npt.NDArray[np.uint32]
+    star: npt.NDArray[np.uint32]
+    scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    @classmethod
+    def of(cls, parts: Sequence[TriangleMatches]) -> TriangleMatches:
+        """Return several as one."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.observed for part in parts]),
+            np.concatenate([part.star for part in parts]),
+            np.concatenate([part.scale for part in parts]),
+        )
+
+    def votes(self) -> IntArray:
+        """Return for each pair of each match (k, 3) how many matches of about the same scale have it."""
+        bins = np.log(self.scale) * _BINS_PER_LN_SCALE
+        bins -= bins.min()
+        bits = max(13, self.star.size.bit_length())
+        # A multiplicative hash: two pairs rarely share a slot, and if they do it is harmless.
+        code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
+        code += bins.astype(np.uint32)[:, None]
+        slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
+        return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot])
+
+
+_BINS_PER_LN_SCALE = 15.0
+
+
+def look_up(
+    field: StarField,
+    sky: SkyIndex,
+    steps: ScaleSteps,
+    triangles: IntArray,
+    tolerance: float,
+    distortion: float,
+    most: int,
+) -> tuple[TriangleMatches, int]:
+    """Return the matches of observed `triangles` (t, 3), and the number of index entries read.
+
+    Args:
+        field: the observed stars.
+        sky: the guide stars' triangles.
+        steps: ranges of scale.
+        triangles: numbers of observed stars.
+        tolerance: of a ratio of sides, in its sigmas.
+        distortion: additional error of a ratio.
+        most: entries that may be read; the first triangles take precedence.
+    """
+    corners, sides, left = _forms(field, triangles, steps)
+    size = np.maximum(sides[:, 2], SIZE_UNIT)
+    sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
+    step = np.tile(np.arange(len(steps)), len(triangles))
+    # The error of a difference of two directions, and of the side that it is divided by.
+    slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
+    ratio = sides[:, :2] / size[:, None]
+    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
+    corners, size, left = corners[usable], size[usable], left[usable]
+    slack, ratio, step = slack[usable], ratio[usable], step[usable]
+    lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
+    highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
+    query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
+    begin, count = _affordable(begin, end, most)
+    query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
+    # int32: the entries are the bulk of the work.
+    first = (begin - (np.cumsum(count) - count)).astype(np.int32)
+    entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
+    near = np.ones(len(entry), dtype=np.bool_)
+    for column, cells in enumerate((short, middle)):
+        lowest_place, width = _places(ratio[query, column], slack[query], cells)
+        place = sky.triangles.shape[:, column][entry]
+        # Below the lowest place the difference of the bytes wraps round to a large one.
+        near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
+    chosen = np.flatnonzero(near)
+    total = len(entry)
+    entry = entry[chosen]
+    query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
+    longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    # The runs hold some triangles too small or too large for the step.
+    fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
+    entry, query, longest = entry[fits], query[fits], longest[fits]
+    scale = longest / size[query] * steps.middle[step[query]]
+    star = sky.triangles.corners[entry].astype(np.uint32)
+    return TriangleMatches(corners[query].astype(np.uint32), star, scale), total
+
+
+def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return begin and length of the first runs, which hold `most` entries at most."""
+    count = end - begin
+    kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
+    return begin[:kept], count[:kept]
+
+
+def _places(
+    ratio: FloatArray, slack: FloatArray, cells: IntArray
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Return the lowest place in its cell that is within `slack` of each ratio, and how many follow it."""
+    # In units of the finest division of a ratio, from its middle.
+    wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
+    reach = slack * (CELLS * FINE) + 0.5
+    lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
+    highest = np.clip(np.floor(wanted + reach), lowest, FINE - 1)
+    return lowest.astype(np.uint8), (highest - lowest).astype(np.uint8)
+
+
+def _forms(
+    field: StarField, triangles: IntArray, steps: ScaleSteps
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return corners (t s, 3) in order of the sides opposite, sides (t s, 3), whether they turn left."""
+    x, y, z = field.direction.T
+    direction = np.empty((len(steps), len(field), 3))
+    direction[:, :, 0] = steps.middle[:, None] * x
+    direction[:, :, 1] = steps.middle[:, None] * y
+    direction[:, :, 2] = z
+    direction /= np.sqrt(np.einsum("sij,sij->si", direction, direction))[:, :, None]
+    first, second, third = triangles.T
+    one = np.stack([second, third, first], axis=-1)
+    two = np.stack([third, first, second], axis=-1)
+    cosine = (direction @ direction.transpose(0, 2, 1))[:, one, two]
+    sides = np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).transpose(1, 0, 2).reshape(-1, 3)
+    order = np.argsort(sides, axis=1)
+    rows = np.arange(len(sides))[:, None]
+    corners = np.repeat(triangles, len(steps), axis=0)[rows, order]
+    a, b, c = corners.T
+    u, v = x / z, y / z
+    left = (u[b] - u[a]) * (v[c] - v[a]) > (u[c] - u[a]) * (v[b] - v[a])
+    return corners, sides[rows, order], left
+
+
+def _runs(
+    sky: SkyIndex,
+    ratio: FloatArray,
+    slack: FloatArray,
+    left: BoolArray,
+    lowest: FloatArray,
+    highest: FloatArray,
+) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
+    """Return the runs of keys that hold triangles like the queries.
+
+    For each run: its query, the cells of the short and the middle ratio, its begin and end. A query's ratios
+    may lie in up to three cells each.
+    """
+    low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
+    high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
+    spans = high - low
+    widest = int(spans.max(initial=0)) + 1
+    here = np.arange(widest) <= spans[:, :, None]
+    # In order of the queries: the first triangles get the first of the entries that may be read.
+    query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
+    short = low[query, 0] + along_short
+    middle = low[query, 1] + along_middle
+    form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
+    first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    below = sky.triangles.below
+    begin, end = below[(form | first) >> RUN_BITS], below[((form | last) >> RUN_BITS) + 1]
+    return query, short, middle, begin, end
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,8 @@ import numpy.typing as npt
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
-from knightcube.vision.startracker.identification.refinement import refine, stretched
+from knightcube.vision.startracker.identification.attitude_fit import refine, stretched
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.identification.verification import (
     VerificationSettings,
     expected_stars,

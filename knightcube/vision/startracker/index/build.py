@@ -20,9 +20,15 @@ import numpy.typing as npt
 
 from knightcube.astro import catalogue
 from knightcube.errors import InputError, UsageError
-from knightcube.vision.startracker.index.guide_stars import GuideStars, choose_guide_stars
-from knightcube.vision.startracker.index.sky_index import PATH, SkyIndex, load, save
-from knightcube.vision.startracker.index.triangle_index import build as build_triangles
+from knightcube.vision.startracker.index.sky_index import (
+    PATH,
+    GuideStars,
+    SkyIndex,
+    build_triangles,
+    choose_guide_stars,
+    load,
+    save,
+)
 
 
 @dataclass(frozen=True, slots=True)

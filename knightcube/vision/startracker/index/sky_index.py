@@ -1,23 +1,295 @@
-"""The sky index of identification, one memory-mapped file: guide stars and their triangles.
+"""The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
 
-`python -m knightcube.vision.startracker.index.build` makes it (layout: `table_file`), the same bytes for
-the same stars and limits.
+Guide stars are the catalogue as a given lens images it (Michalski 3.3): proper motion is applied up to the
+epoch of observation, and stars that the image cannot resolve are merged into one star at their centre of
+light, with their joint magnitude. Aberration is not included: it depends on the velocity of the camera and is
+applied to the matched directions on board.
+
+A star belongs to the triangles at whose size it is among the brightest: with r its distance from the
+`rank`-th nearest of the stars brighter than itself, it is among the `rank` brightest of every circle around
+it that is smaller than r. A triangle is kept if its longest side is at most r of each of its stars. The field
+of view does not enter: a frame of any field of view finds about as many triangles of stars that are among its
+brightest. Every part of the sky has about as many such stars, and a dense region adds no triangles. Beside a
+cluster of bright stars no star is among the brightest of its circle. Therefore circles of every radius that
+cover the sky add the triangles of their `few` brightest stars.
+
+The key of a triangle consists of the ratios of the shortest and of the middle side to the longest, in cells
+of `CELL`; of whether the corners opposite the shortest, the middle and the longest side turn left or right;
+and of the longest side. The triangles of one cell within limits of size are one run of the sorted keys. Sides
+are chords.
+
+`python -m knightcube.vision.startracker.index.build` makes the index (file layout: `table_file`). The same
+stars and limits give the same bytes.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.catalogue import StarCatalogue
 from knightcube.vision.startracker.index import table_file
-from knightcube.vision.startracker.index.guide_stars import GuideStars
-from knightcube.vision.startracker.index.triangle_index import TriangleIndex
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GuideStars:
+    """Stars as the camera resolves them, brightest first.
+
+    Attributes:
+        hip: (n,) int32 Hipparcos number, of a merged group its brightest.
+        direction: (n, 3) unit vectors, ICRS, at `epoch`.
+        magnitude: (n,) Johnson V, joint where merged.
+        epoch: Julian year.
+    """
+
+    hip: npt.NDArray[np.int32]
+    direction: FloatArray
+    magnitude: FloatArray
+    epoch: float
+
+    def __len__(self) -> int:
+        return len(self.hip)
+
+    def brighter_than(self, magnitude: float) -> GuideStars:
+        """Return the stars with V below `magnitude`, without copying."""
+        count = int(np.searchsorted(self.magnitude, magnitude, side="left"))
+        return GuideStars(self.hip[:count], self.direction[:count], self.magnitude[:count], self.epoch)
+
+
+def choose_guide_stars(
+    catalogue: StarCatalogue, faintest: float, epoch: float, resolution: float
+) -> GuideStars:
+    """Return the stars with a joint V below `faintest` at Julian year `epoch`.
+
+    Stars closer together than `resolution` rad, directly or through others, are merged.
+    Raises ValueError when `epoch` is not finite.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
+    direction = catalogue.directions_at(epoch)
+    pairs = cKDTree(direction).query_pairs(2.0 * np.sin(0.5 * resolution), output_type="ndarray")
+    group = _connected(len(catalogue), pairs)
+    light = 10.0 ** (-0.4 * catalogue.magnitude)
+    joint = np.bincount(group, light, minlength=len(catalogue))
+    centre = np.stack(
+        [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
+    )
+    # A group bears the number of its first member, and the catalogue is in order of brightness.
+    first = np.flatnonzero(group == np.arange(len(catalogue)))
+    magnitude = -2.5 * np.log10(joint[first])
+    seen = np.flatnonzero(magnitude < faintest)
+    order = seen[np.argsort(magnitude[seen], kind="stable")]
+    members = first[order]
+    directions = centre[members] / np.linalg.norm(centre[members], axis=-1, keepdims=True)
+    return GuideStars(catalogue.hip[members], directions, magnitude[order], epoch)
+
+
+def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Return for each of `count` stars (count,) the lowest number of its connected group."""
+    group = np.arange(count)
+    while True:
+        lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
+        previous = group.copy()
+        np.minimum.at(group, pairs[:, 0], lowest)
+        np.minimum.at(group, pairs[:, 1], lowest)
+        if np.array_equal(previous, group):
+            return group
+
+
+CELLS = 80
+CELL = 1.0 / CELLS
+"""Ratios of sides from 0 to 1 are counted in cells of this width; a byte gives the place in the cell."""
+FINE = 256
+SIZE_BITS = 18
+SIZE_UNIT = 2.0**-SIZE_BITS
+"""Of the longest side's chord, which is below 1."""
+RUN_BITS = 12
+"""Keys are counted in steps of 2^12 units of size: about one key each."""
+TIE = 1e-9
+"""Relative tolerance of a side against a limit: the limits are sides themselves."""
+LEAST_RATIO = 0.1
+"""Of the shortest to the longest side: flatter triangles discriminate little better than a pair."""
+
+
+# Of the radius, between the centres of circles; and how many stars more than needed are looked through first.
+_CIRCLES_APART = 0.7
+_ENOUGH = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleIndex:
+    """Triangles in order of their keys.
+
+    Attributes:
+        key: (m,) uint32: cell of shape and turning, then size.
+        corners: (m, 3) uint16 numbers of guide stars, opposite the shortest, the middle, the longest side.
+        shape: (m, 2) uint8: where in the cell the two ratios are.
+    """
+
+    key: npt.NDArray[np.uint32]
+    corners: npt.NDArray[np.uint16]
+    shape: npt.NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.key)
+
+    @cached_property
+    def below(self) -> npt.NDArray[np.int32]:
+        """How many keys are below each multiple of 2^RUN_BITS (f,), so that runs need no search."""
+        run = self.key >> np.uint32(RUN_BITS)
+        count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
+        return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+
+
+def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
+    """Return for each star (n,), the brightest first, the chord to the `rank`-th nearest brighter one.
+
+    At most `farthest`, as for those that have fewer than `rank` brighter ones.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
+    count = len(direction)
+    result = np.full(count, farthest)
+    begin = 0
+    while begin < count:
+        end = min(max(2 * begin, 4 * rank), count)
+        # About half of the neighbours among twice as many stars are brighter: three times `rank` hold enough.
+        neighbours = min(4 * rank, end)
+        distance, number = cKDTree(direction[:end]).query(direction[begin:end], neighbours)
+        brighter = number < np.arange(begin, end)[:, None]
+        order = np.cumsum(brighter, axis=1)
+        enough = order[:, -1] >= rank
+        column = np.where(enough, np.argmax(order >= rank, axis=1), neighbours - 1)
+        found = distance[np.arange(end - begin), column]
+        if neighbours == end:
+            found[~enough] = farthest
+        result[begin:end] = np.minimum(found, farthest)
+        begin = end
+    return result
+
+
+def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
+    """Return the triangles of stars (n, 3), the brightest first.
+
+    Between sizes[i] and sizes[i + 1] (b + 1,), chords of the longest side, are those of ranks[i] (b,);
+    besides those of the `few` brightest stars of circles of these radii.
+    """
+    bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
+    found = [np.sort(_band(direction, *band), axis=1) for band in bands]
+    if few >= 3:
+        found += [_of_circles(direction, sizes[0], radius, few) for radius in sizes[:-1]]
+    return _indexed(direction, np.unique(np.concatenate(found), axis=0))
+
+
+def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
+    """Return the triangles (m, 3) of the `few` brightest stars of each of many circles over the whole sky.
+
+    Their longest sides are chords from `smallest` to the diameter.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
+    centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
+    # Most circles find enough among the brightest stars of the sky, the others among all.
+    brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
+    chosen = np.full((len(centres), few), len(direction))
+    for count in sorted({brightest, len(direction)}):
+        stars = direction[:count]
+        poor = np.flatnonzero(chosen[:, -1] == len(direction))
+        for circle, inside in zip(poor, cKDTree(stars).query_ball_point(centres[poor], radius), strict=True):
+            first = np.sort(inside)[:few]
+            chosen[circle, : len(first)] = first
+    one, two, three = np.array(list(combinations(range(few), 3))).T
+    corners = np.stack([chosen[:, one], chosen[:, two], chosen[:, three]], axis=-1).reshape(-1, 3)
+    corners = np.unique(corners[corners[:, 2] < len(direction)], axis=0)
+    place = direction[corners]
+    side = np.linalg.norm(place - np.roll(place, 1, axis=1), axis=-1)
+    longest = side.max(axis=1)
+    return np.asarray(corners[(longest >= smallest) & (side.min(axis=1) >= LEAST_RATIO * longest)])
+
+
+def evenly_spread(count: int) -> FloatArray:
+    """Return unit vectors (count, 3) spread evenly over the sphere: a spiral by the golden angle."""
+    place = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * place / count
+    turn = place * math.pi * (3.0 - math.sqrt(5.0))
+    across = np.sqrt(1.0 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
+
+
+def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
+    """Return the triangles (m, 3) of one band of sizes."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
+    limit = reach(direction, rank, largest)
+    able = np.flatnonzero(limit >= smallest)
+    # In order of reach, so that each triangle is found once: from its last star, the one of least reach.
+    able = able[np.argsort(-limit[able], kind="stable")]
+    limit, place = limit[able] * (1.0 + TIE), direction[able]
+    first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
+    close = np.linalg.norm(place[first] - place[last], axis=-1) <= limit[last]
+    first, last = first[close], last[close]
+    order = np.lexsort((first, last))
+    first = first[order]
+    count = np.bincount(last, minlength=len(able))
+    begin = np.cumsum(count) - count
+    found = []
+    for partners in range(2, int(count.max(initial=0)) + 1):
+        stars = np.flatnonzero(count == partners)
+        near = first[begin[stars, None] + np.arange(partners)]
+        one, two = np.triu_indices(partners, 1)
+        corners = np.stack(np.broadcast_arrays(stars[:, None], near[:, one], near[:, two]), axis=-1).reshape(
+            -1, 3
+        )
+        side = np.linalg.norm(place[corners] - place[np.roll(corners, 1, axis=1)], axis=-1)
+        longest = side.max(axis=1)
+        kept = (longest <= limit[corners[:, 0]]) & (longest >= smallest) & (longest < largest)
+        kept &= side.min(axis=1) >= LEAST_RATIO * longest
+        found.append(able[corners[kept]])
+    return np.concatenate([np.empty((0, 3), dtype=np.int64), *found])
+
+
+def _indexed(direction: FloatArray, corners: IntArray) -> TriangleIndex:
+    a, b, c = (direction[corners[:, column]] for column in range(3))
+    sides = np.stack(
+        [np.linalg.norm(b - c, axis=-1), np.linalg.norm(c - a, axis=-1), np.linalg.norm(a - b, axis=-1)], -1
+    )
+    order = np.argsort(sides, axis=-1)
+    sides = np.take_along_axis(sides, order, axis=-1)
+    corners = np.take_along_axis(corners, order, axis=-1)
+    a, b, c = (direction[corners[:, column]] for column in range(3))
+    left = np.einsum("ij,ij->i", np.cross(a, b), c) > 0.0
+    ratio = sides[:, :2] / sides[:, 2:]
+    key = keys(cell(ratio[:, 0]), cell(ratio[:, 1]), left, sides[:, 2])
+    sorting = np.lexsort((corners[:, 2], corners[:, 1], corners[:, 0], key))
+    shape = np.floor((ratio * CELLS - cell(ratio)) * FINE)
+    return TriangleIndex(
+        key[sorting],
+        corners[sorting].astype(np.uint16),
+        np.clip(shape, 0, FINE - 1)[sorting].astype(np.uint8),
+    )
+
+
+def cell(ratio: FloatArray) -> IntArray:
+    """Return the numbers of the cells that ratios of sides lie in."""
+    return np.clip(np.floor(ratio * CELLS), 0, CELLS - 1).astype(np.int64)
+
+
+def keys(
+    short: IntArray, middle: IntArray, left: npt.NDArray[np.bool_], size: FloatArray
+) -> npt.NDArray[np.uint32]:
+    """Return the keys of triangles: cells of the two ratios, turning, chord of the longest side."""
+    form = ((left * CELLS + short) * CELLS + middle).astype(np.int64)
+    step = np.clip(size / SIZE_UNIT, 0, (1 << SIZE_BITS) - 1).astype(np.int64)
+    return ((form << SIZE_BITS) | step).astype(np.uint32)
+
 
 _VERSION = 3
 KIND = table_file.Kind(

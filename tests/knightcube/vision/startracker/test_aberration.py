@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, SPEED_OF_LIGHT, earth_from_sun, earth_velocity
-from knightcube.vision.startracker.aberration import apparent
+from knightcube.vision.startracker.sky_map import apparent
 from sim_hal.worlds import sun
 
 _ARCSECOND = np.radians(1.0 / 3600.0)

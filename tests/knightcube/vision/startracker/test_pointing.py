@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from knightcube.astro.quaternion import IDENTITY, angle_between, attitude_matrix
-from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.sky_map import Pointing
 
 
 def test_the_identity_looks_at_the_north_celestial_pole() -> None:

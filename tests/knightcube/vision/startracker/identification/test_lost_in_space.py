@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
-from knightcube.vision.startracker.identification.field import StarField
-from knightcube.vision.startracker.identification.identification import Identification, Status
 from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings, identify
+from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.index.build import default_index
 from tests.pace import ordinary_seconds
 from tests.studies.bench.star_lists import ListKind, StarList, configurations, draw, draw_random

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.startracker.mid_exposure import (
+from knightcube.vision.startracker.solution import (
     ENDS,
     MEAN,
     MIDDLE,

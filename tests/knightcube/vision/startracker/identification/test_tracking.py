@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply, normalise
-from knightcube.vision.startracker.identification.identification import Status
+from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.identification.tracking import track
 from knightcube.vision.startracker.identification.verification import verify
 from knightcube.vision.startracker.index.build import default_index

@@ -7,8 +7,16 @@ import pytest
 from scipy.integrate import dblquad
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.reference.star_identification import planar_triangle, spherical_triangle
-from knightcube.reference.star_identification.triangle_table import ordered, side_lengths
+from knightcube.reference.star_identification.triangle_table import (
+    MeasuredShape,
+    Shape,
+    measured_planar_shape,
+    measured_spherical_shape,
+    ordered,
+    planar_shape,
+    side_lengths,
+    spherical_shape,
+)
 
 
 def _corners(seed: int, half_width: float = 0.12) -> FloatArray:
@@ -32,14 +40,14 @@ def _moment_of_plane_triangle(corners: FloatArray) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_plane_area_and_moment_are_those_of_vector_product_and_integral(seed: int) -> None:
     corners = _corners(seed)
-    area, moment = planar_triangle.shape(corners[None])
+    area, moment = planar_shape(corners[None])
     p, q, r = corners
     assert area[0] == pytest.approx(0.5 * np.linalg.norm(np.cross(q - p, r - p)), rel=1e-9)
     assert moment[0] == pytest.approx(_moment_of_plane_triangle(corners), rel=1e-8)
 
 
 def test_an_octant_has_the_area_of_an_eighth_of_the_sphere() -> None:
-    area, _ = spherical_triangle.shape(np.eye(3)[None])
+    area, _ = spherical_shape(np.eye(3)[None])
     assert area[0] == pytest.approx(np.pi / 2.0, rel=1e-14)
 
 
@@ -51,7 +59,7 @@ def test_spherical_area_is_that_of_the_sum_of_angles_and_of_equation_32(seed: in
     for at, one, other in ((p, q, r), (q, r, p), (r, p, q)):
         n1, n2 = np.cross(at, one), np.cross(at, other)
         excess += np.arctan2(np.linalg.norm(np.cross(n1, n2)), n1 @ n2)
-    area, _ = spherical_triangle.shape(corners[None])
+    area, _ = spherical_shape(corners[None])
     assert area[0] == pytest.approx(excess, rel=1e-10)
     a, b, c = np.arccos(p @ q), np.arccos(q @ r), np.arccos(r @ p)
     s = 0.5 * (a + b + c)
@@ -72,7 +80,7 @@ def test_spherical_moment_is_the_adaptive_integral_of_its_definition(seed: int) 
         return float(theta**2 * volume / np.linalg.norm(p) ** 3)
 
     integral = dblquad(element, 0.0, 1.0, 0.0, lambda u: 1.0 - u, epsabs=1e-15, epsrel=1e-9)[0]
-    assert spherical_triangle.shape(corners[None])[1][0] == pytest.approx(integral, rel=1e-8)
+    assert spherical_shape(corners[None])[1][0] == pytest.approx(integral, rel=1e-8)
 
 
 def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
@@ -89,40 +97,43 @@ def test_spherical_moment_is_the_sum_over_ever_smaller_triangles() -> None:
     centre = triangles.sum(axis=1)
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
     theta = 2.0 * np.arcsin(0.5 * np.linalg.norm(centre - middle, axis=-1))
-    total = float(np.sum(theta**2 * spherical_triangle.shape(triangles)[0]))
+    total = float(np.sum(theta**2 * spherical_shape(triangles)[0]))
     # A cut leaves a quarter of the error: 1/128 squared of the moment about, here.
-    assert spherical_triangle.shape(corners[None])[1][0] == pytest.approx(total, rel=2e-4)
+    assert spherical_shape(corners[None])[1][0] == pytest.approx(total, rel=2e-4)
 
 
-@pytest.mark.parametrize("kind", [planar_triangle, spherical_triangle])
+@pytest.mark.parametrize(
+    ("shape", "measured_shape"),
+    [(planar_shape, measured_planar_shape), (spherical_shape, measured_spherical_shape)],
+    ids=["planar", "spherical"],
+)
 @pytest.mark.parametrize("seed", range(3))
-def test_propagated_variances_are_those_of_a_monte_carlo(kind: object, seed: int) -> None:
-    """20,000 draws tell a standard deviation to 0.5 %; corners of unequal errors (eq. 40-48)."""
-    module = planar_triangle if kind is planar_triangle else spherical_triangle
+def test_propagated_variances_agree_with_a_monte_carlo(
+    shape: Shape, measured_shape: MeasuredShape, seed: int
+) -> None:
+    """20,000 draws give a standard deviation to 0.5 %; the corners have unequal errors (eq. 40-48)."""
     corners = _corners(seed)
     sigma = np.array([3e-5, 6e-5, 9e-5])
     rng = np.random.default_rng(seed)
     noisy = corners + sigma[:, None] * rng.standard_normal((20_000, 3, 3))
     noisy /= np.linalg.norm(noisy, axis=-1, keepdims=True)
-    areas, moments = module.shape(noisy)
-    told = module.measured_shape(corners[None], sigma[None])
-    assert told.sigma_area[0] == pytest.approx(areas.std(), rel=0.02)
-    assert told.sigma_moment[0] == pytest.approx(moments.std(), rel=0.02)
+    areas, moments = shape(noisy)
+    claimed = measured_shape(corners[None], sigma[None])
+    assert claimed.sigma_area[0] == pytest.approx(areas.std(), rel=0.02)
+    assert claimed.sigma_moment[0] == pytest.approx(moments.std(), rel=0.02)
 
 
 def test_a_plane_triangle_without_area_has_no_finite_variance() -> None:
     p, r = _corners(1)[:2]
-    told = planar_triangle.measured_shape(np.stack([p, r, r])[None], np.full((1, 3), 1e-5))
-    assert np.isinf(told.sigma_area[0])
-    assert np.isinf(told.sigma_moment[0])
+    claimed = measured_planar_shape(np.stack([p, r, r])[None], np.full((1, 3), 1e-5))
+    assert np.isinf(claimed.sigma_area[0])
+    assert np.isinf(claimed.sigma_moment[0])
 
 
 def test_shapes_do_not_change_when_the_camera_turns() -> None:
     turn, _ = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))
-    for module in (planar_triangle, spherical_triangle):
-        for before, after in zip(
-            module.shape(_corners(5)[None]), module.shape(_corners(5)[None] @ turn.T), strict=True
-        ):
+    for shape in (planar_shape, spherical_shape):
+        for before, after in zip(shape(_corners(5)[None]), shape(_corners(5)[None] @ turn.T), strict=True):
             np.testing.assert_allclose(after, before, rtol=1e-9)
 
 

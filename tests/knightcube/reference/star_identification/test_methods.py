@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,19 +12,23 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.catalogue import load
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
-from knightcube.reference.star_identification import angle_matching, polygon, pyramid, rate_matching
+from knightcube.reference.star_identification import methods
 from knightcube.reference.star_identification.known_sky import KnownSky
-from knightcube.reference.star_identification.methods import DEFAULT_METHOD, METHODS
-from knightcube.reference.star_identification.pyramid import cycled_triangles
-from knightcube.reference.star_identification.rate_matching import Motion, Previous, shared_rate
-from knightcube.reference.star_identification.search import search
-from knightcube.reference.star_identification.settings import DEFAULT
+from knightcube.reference.star_identification.methods import (
+    DEFAULT_METHOD,
+    METHODS,
+    PreviousAttitude,
+    StarMotion,
+    cycled_triangles,
+    identify_by_rate,
+    propose_angles,
+    propose_pyramids,
+    shared_rate,
+)
+from knightcube.reference.star_identification.search import DEFAULT, FieldUnknown, Propose, search
 from knightcube.reference.star_identification.triangle_table import side_lengths
-from knightcube.reference.star_identification.view import FieldUnknown
-from knightcube.vision.startracker.identification.identification import Identification, Status
-from knightcube.vision.startracker.index.guide_stars import choose_guide_stars
-from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.index.triangle_index import TriangleIndex
+from knightcube.vision.startracker.identification.star_field import Identification, Status
+from knightcube.vision.startracker.index.sky_index import SkyIndex, TriangleIndex, choose_guide_stars
 from tests.studies.bench.star_lists import ListKind, StarList, draw, draw_random
 
 CLASSICAL = sorted(set(METHODS) - {DEFAULT_METHOD})
@@ -95,20 +98,20 @@ def test_half_a_pixel_of_noise_is_survived(name: str) -> None:
 
 
 @pytest.mark.parametrize("known_deg", [0.0, 0.1])
-@pytest.mark.parametrize("method", [angle_matching, pyramid], ids=["angle", "pyramid"])
+@pytest.mark.parametrize("propose", [propose_angles, propose_pyramids], ids=["angle", "pyramid"])
 def test_a_list_of_no_sky_takes_no_more_work_than_the_budget_however_badly_the_scale_is_known(
-    method: ModuleType, known_deg: float, monkeypatch: pytest.MonkeyPatch
+    propose: Propose, known_deg: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     joined = []
-    join = polygon.matching_triangles
+    join = methods.matching_triangles
 
     def counting(*arguments: Any) -> Any:
         joined.append(arguments)
         return join(*arguments)
 
-    monkeypatch.setattr(method, "matching_triangles", counting)
+    monkeypatch.setattr(methods, "matching_triangles", counting)
     drawn = draw_random(_kind(known_deg=known_deg), 40, np.random.default_rng(4))
-    answer = search(drawn.field(), _sky(), method.propose)
+    answer = search(drawn.field(), _sky(), propose)
     assert answer.status is Status.NO_MATCH
     assert 0.8 * DEFAULT.joins <= len(joined) <= DEFAULT.joins
 
@@ -171,7 +174,7 @@ def test_the_triangle_tables_hold_only_triangles_that_the_field_can_show() -> No
     assert np.all(np.diff(sky.spherical.area.key) >= 0.0)
 
 
-def _motion(drawn: StarList, seed: int) -> tuple[Motion, FloatArray]:
+def _motion(drawn: StarList, seed: int) -> tuple[StarMotion, FloatArray]:
     """Return velocities under 1 deg/s, false points moving at their own will, and the rate."""
     rng = np.random.default_rng(seed)
     field = drawn.field()
@@ -180,7 +183,7 @@ def _motion(drawn: StarList, seed: int) -> tuple[Motion, FloatArray]:
     false = drawn.star < 0
     velocity[false] = 0.02 * rng.standard_normal((int(false.sum()), 3))
     sigma = field.sigma / 0.1
-    return Motion(velocity + sigma[:, None] * rng.standard_normal(velocity.shape), sigma), rate
+    return StarMotion(velocity + sigma[:, None] * rng.standard_normal(velocity.shape), sigma), rate
 
 
 @pytest.mark.parametrize("false", [2, 5, 10])
@@ -196,7 +199,7 @@ def test_points_that_do_not_share_the_stars_rate_are_left_out(false: int) -> Non
         strangers += int(shared.shares[~true].sum())
         off = shared.rate - rate
         assert off @ np.linalg.solve(shared.covariance, off) < 25.0  # chi-square of 3, one in 60,000
-        assert _right(rate_matching.identify(drawn.field(), _sky(), motion=motion), drawn)
+        assert _right(identify_by_rate(drawn.field(), _sky(), motion=motion), drawn)
     assert kept >= 0.99 * points
     assert strangers <= 0.1 * false * LISTS
 
@@ -215,22 +218,22 @@ def test_a_previous_attitude_turned_by_the_rate_names_too_few_stars_for_a_patter
     whole, rate = _motion(drawn, 8)
     few = np.arange(5)
     field = drawn.field().subset(few)
-    motion = Motion(whole.velocity[few], whole.sigma[few])
+    motion = StarMotion(whole.velocity[few], whole.sigma[few])
     elapsed = 0.05
     earlier = multiply(from_rotation_vector(-rate * elapsed), drawn.attitude)
-    previous = Previous(earlier, 1e-5, elapsed)
-    answer = rate_matching.identify(field, _sky(), motion=motion, previous=previous)
+    previous = PreviousAttitude(earlier, 1e-5, elapsed)
+    answer = identify_by_rate(field, _sky(), motion=motion, previous=previous)
     assert answer.status is Status.IDENTIFIED
     np.testing.assert_array_equal(answer.star, drawn.star[few])
 
 
 def test_a_wrong_previous_attitude_is_forgotten() -> None:
     drawn = _drawn(_kind(), 9)[0]
-    previous = Previous(np.array([0.0, 0.0, 0.0, 1.0]), 1e-5, 0.1)
-    assert _right(rate_matching.identify(drawn.field(), _sky(), previous=previous), drawn)
+    previous = PreviousAttitude(np.array([0.0, 0.0, 0.0, 1.0]), 1e-5, 0.1)
+    assert _right(identify_by_rate(drawn.field(), _sky(), previous=previous), drawn)
 
 
 def test_velocities_must_be_as_many_as_the_points() -> None:
     drawn = _drawn(_kind(), 10)[0]
     with pytest.raises(ValueError, match="one each"):
-        rate_matching.identify(drawn.field(), _sky(), motion=Motion(np.zeros((2, 3)), np.ones(2)))
+        identify_by_rate(drawn.field(), _sky(), motion=StarMotion(np.zeros((2, 3)), np.ones(2)))

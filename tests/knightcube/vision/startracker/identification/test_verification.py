@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.identification.chance import Chance, order_probability
+from knightcube.vision.startracker.identification.verification import Chance, order_probability
 
 
 @pytest.mark.parametrize("length", [1, 2, 3, 5])

@@ -13,10 +13,10 @@ from hypothesis.extra.numpy import arrays
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import InputError
-from knightcube.reference.star_identification import k_vector, pair_table
+from knightcube.reference.star_identification import pair_table
 from knightcube.reference.star_identification.pair_table import PairTable
 from knightcube.vision.startracker.index import table_file
-from knightcube.vision.startracker.index.guide_stars import GuideStars
+from knightcube.vision.startracker.index.sky_index import GuideStars
 
 _KEYS = arrays(
     np.float64,
@@ -37,7 +37,7 @@ def test_ranges_hold_the_keys_that_a_search_through_all_finds(
 ) -> None:
     """Many equal keys, few cells or many, ranges that are empty, reversed or beyond all keys."""
     key = np.sort(drawn)
-    index = k_vector.build(key, cells)
+    index = pair_table.build_k_vector(key, cells)
     start, stop = index.ranges([low for low, _ in ends], [high for _, high in ends])
     for (low, high), begin, end in zip(ends, start, stop, strict=True):
         assert list(range(begin, end)) == _found_by_hand(key, low, high)
@@ -50,7 +50,7 @@ def test_a_key_that_is_the_low_end_is_in_and_one_that_is_the_high_end_is_out(
 ) -> None:
     key = np.sort(drawn)
     low, high = sorted((key[first % len(key)], key[last % len(key)]))
-    start, stop = k_vector.build(key).ranges(low, high)
+    start, stop = pair_table.build_k_vector(key).ranges(low, high)
     assert list(range(start[0], stop[0])) == _found_by_hand(key, low, high)
 
 
@@ -59,30 +59,30 @@ def test_a_million_skewed_keys_agree_with_bisection() -> None:
     rng = np.random.default_rng(11)
     key = np.sort(rng.exponential(1.0, 1_000_000).astype(np.float32) ** 4)
     ends = np.concatenate([rng.choice(key, 400).astype(np.float64), rng.uniform(-1.0, 1.1 * key[-1], 400)])
-    start, _ = k_vector.build(key).ranges(ends, np.inf)
+    start, _ = pair_table.build_k_vector(key).ranges(ends, np.inf)
     np.testing.assert_array_equal(start, np.searchsorted(key.astype(np.float64), ends))
 
 
 def test_no_keys_have_empty_ranges_and_infinite_ends_hold_all_keys() -> None:
-    start, stop = k_vector.build(np.empty(0)).ranges([0.0], [1.0])
+    start, stop = pair_table.build_k_vector(np.empty(0)).ranges([0.0], [1.0])
     assert start == stop
-    start, stop = k_vector.build(np.array([1.0, 1.0, 1.0])).ranges(-np.inf, np.inf)
+    start, stop = pair_table.build_k_vector(np.array([1.0, 1.0, 1.0])).ranges(-np.inf, np.inf)
     assert (start[0], stop[0]) == (0, 3)
 
 
 def test_keys_out_of_order_and_ends_that_are_no_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="ascending"):
-        k_vector.build(np.array([2.0, 1.0]))
+        pair_table.build_k_vector(np.array([2.0, 1.0]))
     with pytest.raises(ValueError, match="finite"):
-        k_vector.build(np.array([1.0, np.nan]))
+        pair_table.build_k_vector(np.array([1.0, np.nan]))
     with pytest.raises(ValueError, match="at least one"):
-        k_vector.build(np.array([1.0]), 0)
+        pair_table.build_k_vector(np.array([1.0]), 0)
     with pytest.raises(ValueError, match="NaN"):
-        k_vector.build(np.array([1.0])).ranges(np.nan, 1.0)
+        pair_table.build_k_vector(np.array([1.0])).ranges(np.nan, 1.0)
 
 
 def test_members_of_ranges_stand_one_after_the_other_with_their_range() -> None:
-    place, owner = k_vector.members(np.array([3, 7, 0]), np.array([5, 7, 3]))
+    place, owner = pair_table.members(np.array([3, 7, 0]), np.array([5, 7, 3]))
     assert place.tolist() == [3, 4, 0, 1, 2]
     assert owner.tolist() == [0, 0, 2, 2, 2]
 
@@ -99,7 +99,7 @@ def _sky(count: int) -> GuideStars:
 @pytest.fixture(scope="module")
 def table() -> PairTable:
     """300 stars, pairs within 0.4 rad."""
-    return pair_table.build(_sky(300), 0.4)
+    return pair_table.build_pairs(_sky(300), 0.4)
 
 
 def test_the_table_has_every_pair_within_the_widest_angle_and_no_other(table: PairTable) -> None:
@@ -129,8 +129,8 @@ def test_a_range_of_angles_returns_its_pairs_both_ways_round(table: PairTable) -
 
 def test_a_table_comes_back_from_its_file_as_it_was(table: PairTable, tmp_path: Path) -> None:
     path = tmp_path / "pairs.table"
-    pair_table.save(table, path)
-    back = pair_table.load(path)
+    pair_table.save_pairs(table, path)
+    back = pair_table.load_pairs(path)
     np.testing.assert_array_equal(back.first, table.first)
     np.testing.assert_array_equal(back.second, table.second)
     np.testing.assert_array_equal(back.angle.key, table.angle.key)
@@ -145,18 +145,18 @@ def test_a_damaged_foreign_or_outdated_file_is_refused_with_its_name(
 ) -> None:
     path = tmp_path / "pairs.table"
     with pytest.raises(InputError, match=r"pairs\.table"):
-        pair_table.load(path)
-    pair_table.save(table, path)
+        pair_table.load_pairs(path)
+    pair_table.save_pairs(table, path)
     whole = path.read_bytes()
     path.write_bytes(whole[:-70] + bytes([whole[-70] ^ 1]) + whole[-69:])
     with pytest.raises(InputError, match="CRC-32"):
-        pair_table.load(path)
+        pair_table.load_pairs(path)
     path.write_bytes(b"\x00" * 100)
     with pytest.raises(InputError, match="no pair table"):
-        pair_table.load(path)
+        pair_table.load_pairs(path)
     table_file.save(path, replace(pair_table.KIND, version=pair_table.KIND.version + 1), {}, {})
     with pytest.raises(InputError, match="version"):
-        pair_table.load(path)
+        pair_table.load_pairs(path)
 
 
 def test_the_magnitude_limit_gives_the_wanted_number_of_stars_in_a_field() -> None:

@@ -12,16 +12,18 @@ from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.errors import InputError
 from knightcube.vision.startracker.index import build as index_build
 from knightcube.vision.startracker.index.build import IndexSettings, default_index
-from knightcube.vision.startracker.index.sky_index import PATH, load, save
-from knightcube.vision.startracker.index.triangle_index import (
+from knightcube.vision.startracker.index.sky_index import (
     CELLS,
     FINE,
     LEAST_RATIO,
+    PATH,
     SIZE_BITS,
     SIZE_UNIT,
     TIE,
-    build,
+    build_triangles,
+    load,
     reach,
+    save,
 )
 from tests.pace import ordinary_seconds
 
@@ -45,7 +47,7 @@ def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> 
 def test_the_triangles_are_those_of_enumeration() -> None:
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
-    found = {tuple(sorted(row)) for row in build(direction, sizes, ranks, 0).corners.tolist()}
+    found = {tuple(sorted(row)) for row in build_triangles(direction, sizes, ranks, 0).corners.tolist()}
     expected = set()
     limits = [reach(direction, rank, top) for rank, top in zip(ranks, sizes[1:], strict=True)]
     for a in range(60):
@@ -69,7 +71,7 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
     inside = np.flatnonzero(np.linalg.norm(direction - centre, axis=-1) < 0.25)
 
     def triangles(few: int) -> int:
-        corners = build(direction, sizes, ranks, few).corners
+        corners = build_triangles(direction, sizes, ranks, few).corners
         return int(np.isin(corners, inside).all(axis=1).sum())
 
     assert triangles(0) < 5
@@ -80,10 +82,10 @@ def test_a_sky_turned_has_the_same_triangles() -> None:
     """A star's reach is itself a side, to a neighbour: rounding has no say in which triangles end there."""
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
-    first = np.unique(np.sort(build(direction, sizes, ranks, 0).corners, axis=1), axis=0)
+    first = np.unique(np.sort(build_triangles(direction, sizes, ranks, 0).corners, axis=1), axis=0)
     for quaternion in normalise(np.random.default_rng(4).standard_normal((6, 4))):
         turned = direction @ attitude_matrix(quaternion).T
-        found = np.unique(np.sort(build(turned, sizes, ranks, 0).corners, axis=1), axis=0)
+        found = np.unique(np.sort(build_triangles(turned, sizes, ranks, 0).corners, axis=1), axis=0)
         np.testing.assert_array_equal(found, first)
 
 

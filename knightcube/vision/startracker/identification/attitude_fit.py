@@ -1,0 +1,322 @@
+"""Least-squares fits of attitude, scale and radial distortion to matched stars.
+
+`refine` solves Wahba's problem with one more unknown: the factor k of all tangents x/z, y/z, by which the
+assumed focal length is wrong. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation d
+about the camera axes and a small change of ln k they change by -[A r x] d + s dlnk, with
+s = (x z^2, y z^2, -z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood
+estimate for directions with errors of sigma rad along either axis across them.
+
+`fit_with_distortion` adds radial distortion, for a lens that is not calibrated. Such a lens shifts stars by
+some percent of their distance from the axis: a pinhole then fits a group of neighbours and misses the other
+stars, and its attitude error is larger than its residuals suggest. An image at the tangent t of the true
+direction appears at t (1 + c (t / R)^2), where R is the tangent of the corner (Brown 1966, the first radial
+term); c has the prior `PRIOR`. The match grows outwards from the stars that match first, as c is determined.
+Where the stars do not determine c, the covariance of the attitude includes its uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.attitude.wahba import AttitudeFix
+from knightcube.astro.directions import cross_matrices
+from knightcube.astro.quaternion import from_matrix
+from knightcube.vision.startracker.identification.star_field import StarField
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+
+# The rows of v @ _CROSS, reshaped to (3, 3), are the matrix [v x].
+_CROSS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
+)
+# A step d leaves an error of about d^2: a hundredth of the arcsecond that a star tracker sees.
+_SETTLED = 1e-4
+_MOST_STEPS = 6
+# Directions within about 1e-6 rad of one line leave the turn about it to rounding.
+_LEAST_INFORMATION = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """Attitude and scale of the least squares.
+
+    Attributes:
+        matrix: (3, 3) A, ICRS to camera.
+        scale: factor of the tangents.
+        covariance: (4, 4) of the turn about the camera's axes, rad^2, and of ln scale; (3, 3) when the scale
+            was held.
+        squares: (n,) |e|^2 / sigma^2 of each star.
+    """
+
+    matrix: FloatArray
+    scale: float
+    covariance: FloatArray
+    squares: FloatArray
+
+    @property
+    def scale_sigma(self) -> float:
+        """Relative standard deviation of the scale; 0 when it was held."""
+        return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
+
+    def fix(self) -> AttitudeFix:
+        """Return the attitude as the solvers of Wahba's problem do."""
+        turn = np.ascontiguousarray(self.covariance[:3, :3])
+        return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
+
+    def widened(self) -> Refinement:
+        """Return the same with the covariance that the residuals themselves bear out."""
+        factor = inflation(self.squares, len(self.covariance))
+        return replace(self, covariance=self.covariance * factor)
+
+
+def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
+    """Return unit vectors (n, 3) whose tangents x/z, y/z are `scale`, one or (n,), times `direction`'s."""
+    if isinstance(scale, float) and scale == 1.0:
+        return direction
+    x, y, z = direction.T
+    longer = np.empty_like(direction)
+    longer[:, 0], longer[:, 1], longer[:, 2] = scale * x, scale * y, z
+    longer /= np.sqrt(np.einsum("ij,ij->i", longer, longer))[:, None]
+    return longer
+
+
+def scale_slope(direction: FloatArray) -> FloatArray:
+    """Return by how much directions (n, 3) move per unit of ln scale, across themselves."""
+    squared = direction[:, 2:] * direction[:, 2:]
+    slope = direction * squared
+    slope[:, 2:] -= direction[:, 2:]
+    return np.asarray(slope)
+
+
+def inflation(squares: FloatArray, parameters: float) -> float:
+    """Return by how much the residuals say that the variances are too small; 1 where that may be chance.
+
+    `squares` (n,), each |e|^2 / sigma^2 of two components, together are a chi-square of 2n - `parameters`
+    degrees of freedom, of which three of its sigmas are left to chance.
+    """
+    freedom = 2 * len(squares) - parameters
+    if freedom <= 0:
+        return 1.0
+    excess = float(squares.sum()) / freedom
+    return excess if excess > 1.0 + 3.0 * math.sqrt(2.0 / freedom) else 1.0
+
+
+def refine(
+    observed: FloatArray,
+    reference: FloatArray,
+    sigma: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    free_scale: bool,
+) -> Refinement | None:
+    """Return attitude and scale that best turn `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+    `observed` and `sigma` are those at scale 1; `matrix` (3, 3) and `scale` are the start. None where the
+    stars do not determine the parameters, or the fit diverges.
+    """
+    parameters = 4 if free_scale else 3
+    weight = (1.0 / (sigma * scale))[:, None]
+    for _ in range(_MOST_STEPS):
+        b = stretched(observed, scale)
+        predicted = reference @ matrix.T
+        residual = ((b - predicted) * weight).reshape(-1)
+        slope = np.empty((len(b), 3, parameters))
+        slope[:, :, :3] = -(predicted @ _CROSS).reshape(-1, 3, 3)
+        if free_scale:
+            slope[:, :, 3] = scale_slope(b)
+        slope *= weight[:, :, None]
+        flat = slope.reshape(-1, parameters)
+        normal = flat.T @ flat
+        try:
+            covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        step = -(covariance @ (residual @ flat))
+        longest = float(np.abs(step).max())
+        if not _determined(normal, covariance) or not longest < 1.0:
+            return None
+        matrix = turned(matrix, step[:3])
+        if free_scale:
+            scale *= math.exp(float(step[3]))
+        if longest < _SETTLED:
+            break
+    # The residuals after the last step, squared.
+    left = (residual + flat @ step).reshape(-1, 3)
+    return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
+
+
+def _determined(normal: FloatArray, covariance: FloatArray) -> bool:
+    """Return whether every combination of parameters is determined beyond rounding.
+
+    The largest element of a positive definite matrix is on its diagonal.
+    """
+    largest = float(normal.max()) * float(covariance.max())
+    return 0.0 < largest * _LEAST_INFORMATION < 1.0
+
+
+def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return the attitude (3, 3) after a turn (3,) rad about the camera's own axes (Rodrigues)."""
+    x, y, z = (float(component) for component in turn)
+    angle = math.sqrt(x * x + y * y + z * z)
+    first = math.sin(angle) / angle if angle > 0.0 else 1.0
+    second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(matrix - (first * cross - second * (cross @ cross)) @ matrix)
+
+
+PRIOR = 0.05
+"""Standard deviation of c, the relative shift at the corner, of lenses that are not calibrated."""
+_MOST = 0.25
+_GROWTH_ROUNDS = 12
+_DISTORTION_STEPS = 6
+_DISTORTION_SETTLED = 1e-6
+# Half width of the gate while the match grows: of a star's sigma, and of the corner's tangent.
+_GATE_SIGMAS = 8.0
+_GATE_SHARE = 0.004
+# Deviations of the scatter beyond which a star is left out of the final fit.
+_OUTLIER = 4.0
+# Median of the square root of a chi-square of 2.
+_RAYLEIGH_MEDIAN = 1.1774
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DistortedFit:
+    """Matched stars, and the attitude with a distorted lens.
+
+    Attributes:
+        observed: (k,) numbers of observed stars.
+        star: (k,) numbers of guide stars.
+        refined: attitude, scale and their covariance, widened, with the distortion free.
+        distortion: c of the module's text.
+        seen: (n, 3) true directions, camera frame, of all stars of the field by this lens.
+        from_lens: (3, 3) rad^2, the part of the attitude's covariance that an uncertain c adds.
+    """
+
+    observed: IntArray
+    star: IntArray
+    refined: Refinement
+    distortion: float
+    seen: FloatArray
+    from_lens: FloatArray
+
+
+def fit_with_distortion(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    observed: IntArray,
+    star: IntArray,
+    start: Refinement,
+) -> DistortedFit | None:
+    """Return the match grown from `observed` and `star` (k,) at `start`; None if they fix no lens.
+
+    `expected` are the guide stars in and about the field, the brightest first.
+    """
+    corner = math.hypot(*field.half_width)
+    pose = _Pose(start.matrix, start.scale, 0.0)
+    reference = sky.stars.direction[expected]
+    seen: set[bytes] = set()
+    fitted = None
+    for _ in range(_GROWTH_ROUNDS):
+        fitted = _distorted_fit(field, sky, observed, star, pose, corner)
+        if fitted is None:
+            return None
+        pose = fitted[0]
+        if observed.tobytes() in seen:
+            break
+        seen.add(observed.tobytes())
+        cosines = pose.true(field.direction, corner) @ (pose.matrix @ reference.T)
+        nearest = cosines.argmax(axis=1)
+        rows = np.arange(len(field))
+        apart = np.sqrt(np.maximum(2.0 - 2.0 * cosines[rows, nearest], 0.0))
+        gate = np.maximum(_GATE_SIGMAS * field.sigma, _GATE_SHARE * corner) * pose.scale
+        within = np.flatnonzero((apart <= gate) & (cosines.argmax(axis=0)[nearest] == rows))
+        if len(within) < len(observed):
+            break
+        observed, star = within, expected[nearest[within]]
+    assert fitted is not None  # there was a round
+    squares = fitted[2]
+    spread = max(1.0, math.sqrt(float(np.median(squares))) / _RAYLEIGH_MEDIAN)
+    kept = squares <= (_OUTLIER * spread) ** 2
+    if kept.sum() >= 4 and not kept.all():
+        observed, star = observed[kept], star[kept]
+        fitted = _distorted_fit(field, sky, observed, star, pose, corner)
+        if fitted is None:
+            return None
+    pose, normal, squares = fitted
+    # Residuals beyond the sigmas widen the whole; the prior is not of their making.
+    normal[4, 4] -= PRIOR**-2
+    normal /= inflation(squares, 5)
+    normal[4, 4] += PRIOR**-2
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    from_lens = np.outer(covariance[:3, 4], covariance[:3, 4]) / covariance[4, 4]
+    refined = Refinement(pose.matrix, pose.scale, covariance[:4, :4], squares)
+    seen_by = pose.true(field.direction, corner)
+    return DistortedFit(observed, star, refined, pose.distortion, seen_by, from_lens)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """Attitude (3, 3), scale and distortion."""
+
+    matrix: FloatArray
+    scale: float
+    distortion: float
+
+    def true(self, direction: FloatArray, corner: float) -> FloatArray:
+        """Return the true directions (n, 3) of those observed (n, 3)."""
+        return stretched(direction, self.scale * self.ratio(direction, corner))
+
+    def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
+        """Return true over seen tangents (n,) at the scale: Newton's method on r (1 + c s^2 r^2) = 1."""
+        squared = self.distortion * _squared_tangent(direction) / corner**2
+        ratio = np.ones(len(direction))
+        for _ in range(4):
+            ratio -= (ratio * (1.0 + squared * ratio**2) - 1.0) / (1.0 + 3.0 * squared * ratio**2)
+        return ratio
+
+
+def _squared_tangent(direction: FloatArray) -> FloatArray:
+    return np.asarray((direction[:, 0] ** 2 + direction[:, 1] ** 2) / direction[:, 2] ** 2)
+
+
+def _distorted_fit(
+    field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _Pose, corner: float
+) -> tuple[_Pose, FloatArray, FloatArray] | None:
+    """Return the fit to the matched stars, its normal matrix (5, 5) with the prior, and squares (k,)."""
+    direction, reference = field.direction[observed], sky.stars.direction[star]
+    weight = 1.0 / (field.sigma[observed] * pose.scale)
+    for _ in range(_DISTORTION_STEPS):
+        ratio = pose.ratio(direction, corner)
+        seen = stretched(direction, pose.scale * ratio)
+        predicted = reference @ pose.matrix.T
+        residual = weight[:, None] * (seen - predicted)
+        slope = np.empty((len(seen), 3, 5))
+        # d(A r) for a turn d is -[A r x] d, of which the residual takes the negative.
+        slope[:, :, :3] = -cross_matrices(predicted)
+        slope[:, :, 3] = scale_slope(seen)
+        share = _squared_tangent(direction) * ratio**2 / corner**2
+        slope[:, :, 4] = slope[:, :, 3] * (-share / (1.0 + 3.0 * pose.distortion * share))[:, None]
+        slope *= weight[:, None, None]
+        flat = slope.reshape(-1, 5)
+        normal = flat.T @ flat
+        normal[4, 4] += PRIOR**-2
+        gradient = flat.T @ residual.ravel()
+        gradient[4] += pose.distortion / PRIOR**2
+        try:
+            step = -np.linalg.solve(normal, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        distortion = pose.distortion + float(step[4])
+        if not float(np.abs(step).max()) < 1.0 or abs(distortion) > _MOST:
+            return None
+        turn = np.asarray(step[:3], dtype=np.float64)
+        pose = _Pose(turned(pose.matrix, turn), pose.scale * math.exp(float(step[3])), distortion)
+        if np.abs(step).max() < _DISTORTION_SETTLED:
+            break
+    missed = weight[:, None] * (pose.true(direction, corner) - reference @ pose.matrix.T)
+    return pose, np.asarray(normal), np.einsum("ij,ij->i", missed, missed)
