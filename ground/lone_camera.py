@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.app.linux import linux_camera
+from flight.app.accepted_config import requested_config
+from flight.app.devices import linux_camera
 from flight.app.request import RunRequest
-from flight.app.requested_config import requested_config
 from flight.app.simulated import simulated_camera
 from flight.schema.devices import Camera
 from flight.schema.errors import ConfigError

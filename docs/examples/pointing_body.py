@@ -22,20 +22,19 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.testbed.body import (
+    UnitFeed,
     attitude_filter,
     brake_of,
     coil_watch,
     dipole_per_ampere,
     surrounding_field,
 )
-from flight.bodies.testbed.feed import UnitFeed
-from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
+from flight.bodies.testbed.thread import angular_acceleration_psd_of, plant_of
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
-from flight.loop.body import Body, BodyKind
-from flight.loop.control_output import COMMANDED, KEPT, CoilCommand, ControlOutput, Target
+from flight.loop.body import COMMANDED, KEPT, Body, BodyKind, CoilCommand, ControlOutput, Target
+from flight.loop.executive.executive import Cycle
 from flight.loop.executive.jobs import JobResult
-from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config

@@ -2,26 +2,115 @@
 
 `deploy/install.sh` writes the SHA-256 of an accepted configuration beside the file. A flight reads its file
 once, verifies these bytes against the sum and flies them: a flipped bit on the disk makes 1.05e-3 a 1.05e-7,
-which validation would not detect. A service keeps the accepted configurations that flew in its state folder
-(`kept_configs`). A file without a sum is flown as it stands, unless an accepted configuration is kept: then
-there was a sum.
+which validation would not detect. A file without a sum is flown as it stands, unless an accepted
+configuration is kept: then there was a sum.
+
+A service keeps the accepted configurations that flew, the newest and two older ones, in its state folder.
+Each is one file whose name holds its number and its SHA-256, put in place by one rename: a configuration
+never stands without its sum.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight.app.kept_configs import kept_configs
-from flight.loop.state.files import LARGEST_FILE, LinuxFiles
-from flight.loop.state.opening import service_folder
+import numpy as np
+
+from flight.app.request import RunRequest
+from flight.app.simulated import corrupted_text
+from flight.loop.state.keeper import service_folder
+from flight.loop.state.store import LARGEST_FILE, LinuxFiles, replace_file
 from flight.schema import reader as configuration
-from flight.schema.document import checked_length, no_such_file
+from flight.schema.document import checked_length, no_such_file, read_text
 from flight.schema.errors import ConfigError, UnreadConfigError
+from flight.schema.sections import Config
+from hal.interfaces.wires import Clock, Ticker
+from knightcube.errors import UsageError
+
+FOLDER = "flown"
+KEPT = 3
+GOOD_START_NS = 10_000_000_000
+"""After this flight time a configuration is kept."""
+
+_NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A configuration that flew."""
+
+    number: int
+    path: Path
+    text: str
+
+
+def kept_configs(folder: Path) -> list[Kept]:
+    """Return the whole configurations kept in a state folder, the newest first. Raises OSError."""
+    found = []
+    for number, path, digest in _named(folder):
+        with suppress(OSError, UnicodeDecodeError):
+            data = LinuxFiles().read(path)
+            if data is not None and hashlib.sha256(data).hexdigest() == digest:
+                found.append(Kept(number, path, data.decode("utf-8")))
+    return sorted(found, key=lambda kept: kept.number, reverse=True)
+
+
+class FlownConfig:
+    """Keeps the configuration of a flight that has started well."""
+
+    def __init__(self, text: str, folder: Path) -> None:
+        """Take the configuration's text as read, and the state folder."""
+        self._data = text.encode()
+        self._folder = folder
+        self._kept = False
+
+    def serve(self, clock: Clock) -> Ticker:
+        """Return the ticker that keeps the configuration, outside the loop, after `GOOD_START_NS`."""
+        return clock.ticker("configuration", GOOD_START_NS, self.keep)
+
+    def keep(self) -> None:
+        """Write the copy, unless it is the newest already; a failed write is retried next time."""
+        if self._kept:
+            return
+        with suppress(OSError):
+            place = self._folder / FOLDER
+            place.mkdir(exist_ok=True)
+            kept = kept_configs(self._folder)
+            if not kept or kept[0].text.encode() != self._data:
+                number = max((number for number, _, _ in _named(self._folder)), default=0) + 1
+                name = f"{number:06d}-{hashlib.sha256(self._data).hexdigest()}.yaml"
+                replace_file(LinuxFiles(), place / name, self._data)
+                kept = kept_configs(self._folder)
+            self._drop_others(kept)
+            self._kept = True
+
+    def _drop_others(self, kept: list[Kept]) -> None:
+        """Remove damaged copies, and all but the newest of each text; the newest `KEPT` texts stay."""
+        texts: dict[str, Path] = {}
+        for one in kept:
+            texts.setdefault(one.text, one.path)
+        staying = set(list(texts.values())[:KEPT])
+        for _, path, _ in _named(self._folder):
+            if path not in staying:
+                path.unlink(missing_ok=True)
+
+
+def _named(folder: Path) -> list[tuple[int, Path, str]]:
+    """Return number, path and digest of whatever has the name of a kept configuration. Raises OSError."""
+    place = folder / FOLDER
+    try:
+        paths = list(place.iterdir())
+    except FileNotFoundError:
+        return []
+    matches = ((_NAME.fullmatch(path.name), path) for path in paths)
+    return [(int(match[1]), path, match[2]) for match, path in matches if match]
+
 
 _CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
 _TRIES = 3
@@ -112,3 +201,24 @@ def _text(path: Path, data: bytes) -> str:
         return checked_length(data.decode("utf-8"), path)
     except UnicodeDecodeError as error:
         raise ConfigError(str(path), f"cannot be read: {error}") from error
+
+
+def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
+    """Return the configuration as text and as values, with the request's changes in the values.
+
+    `text` is the file as it was read; without it the file is read. Raises ConfigError for the file's
+    mistakes, UsageError for the request's.
+    """
+    text = read_text(request.config_path) if text is None else text
+    config = configuration.parse(text, str(request.config_path))
+    if request.faults and config.simulation is None:
+        raise UsageError("--fault: this configuration flies real devices, which break by themselves")
+    if request.faults:
+        spoiled = corrupted_text(request, text)
+        if spoiled != text:
+            text, config = spoiled, configuration.parse(spoiled, str(request.config_path))
+    if request.duration is not None:
+        if not (np.isfinite(request.duration) and request.duration > 0.0):
+            raise UsageError(f"--duration {request.duration}: must be a positive number of seconds")
+        config = config.shortened(request.duration)
+    return text, config

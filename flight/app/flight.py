@@ -10,30 +10,36 @@ from dataclasses import dataclass, replace
 from functools import partial
 from shutil import rmtree
 
-from flight.app.accepted_config import Chosen, accepted_config
-from flight.app.devices import check_settings
-from flight.app.ending_signals import EndingSignals
-from flight.app.kept_configs import FlownConfig
-from flight.app.linux import linux_rig
-from flight.app.mission_time import mission_zero, next_whole_second
+from flight.app.accepted_config import Chosen, FlownConfig, accepted_config, requested_config
+from flight.app.devices import check_settings, linux_rig
 from flight.app.opening import open_flight
-from flight.app.patient_start import Patience, patiently
-from flight.app.release import Release
 from flight.app.request import RunRequest, RunResult
-from flight.app.requested_config import requested_config
 from flight.app.run_folder import begin_folder
+from flight.app.service import EndingSignals, Patience, Release, patiently
 from flight.app.simulated import injected_faults, simulated_rig
 from flight.link import events
 from flight.link.telemetry.log import FlightLog
 from flight.loop.flight_loop import FlightLoop
-from flight.loop.progress import Progress
-from flight.loop.run_label import RunLabel
-from flight.loop.state.opening import service_folder
+from flight.loop.flight_status import Progress, RunLabel
+from flight.loop.state.keeper import service_folder
 from flight.schema import reader as configuration
 from flight.schema.document import read_text
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
+from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import UsageError
+
+_GRID_NS = 25_000_000
+
+
+def next_whole_second(clock: Clock) -> int:
+    """Return mission time zero in lock-step: the next whole second at least half a second ahead."""
+    return -(-(clock.now_ns() + SECOND_NS // 2) // SECOND_NS) * SECOND_NS
+
+
+def mission_zero(clock: Clock) -> int:
+    """Return mission time zero in real time: the third next slot of the 40 Hz grid."""
+    return (clock.now_ns() // _GRID_NS + 3) * _GRID_NS
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from flight.app.devices import unit_settings
-from flight.app.linux import linux_camera
+from flight.app.devices import linux_camera, unit_settings
 from flight.schema.devices import Camera
 from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight.loop.ending import Ending
+from flight.loop.flight_status import Ending
 
 
 @dataclass(frozen=True, slots=True)

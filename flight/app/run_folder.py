@@ -4,17 +4,29 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from flight.app.request import RunRequest
-from flight.app.utc_label import utc_text
 from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
+from hal.buses.clock import SystemClock
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
+
+
+def utc_ns() -> int:
+    """Return the machine's UTC, ns since 1970."""
+    return SystemClock().utc_ns()
+
+
+def utc_text() -> str:
+    """Return the machine's UTC as text, for names of folders."""
+    return f"{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
+
 
 _NEWEST = 4
 """Runs that are asked for the number of their boot."""

@@ -1,4 +1,6 @@
-"""One flight from its release to its end: starts the tasks, runs the executive, switches the coils off.
+"""The rate groups of the loop, in order of importance.
+
+One flight from its release to its end: starts the tasks, runs the executive, switches the coils off.
 
 `flight.app` opens and closes the devices and composes the tasks.
 """
@@ -11,30 +13,61 @@ from dataclasses import dataclass, field
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.loop.body import Body
-from flight.loop.control_output import ControlOutput, SteeringState
-from flight.loop.ending import Ending, ending
-from flight.loop.executive.executive import Executive
-from flight.loop.executive.rate_group import Cycle, RateGroup
+from flight.loop.body import Body, ControlOutput, SteeringState
+from flight.loop.executive.executive import Cycle, Executive, RateGroup, Task
 from flight.loop.fdir.resources import ResourceReader
-from flight.loop.progress import Progress
-from flight.loop.rate_groups import GroupTasks, Periods, rate_groups
-from flight.loop.run_label import RunLabel, record_run
+from flight.loop.flight_status import Ending, Progress, RunLabel, ending, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks.commanding import Commanding
 from flight.loop.tasks.control_cycle import ControlCycle
-from flight.loop.tasks.health_watch import HealthWatch
-from flight.loop.tasks.housekeeping import Housekeeping
+from flight.loop.tasks.health import CONTROL, HealthWatch, Housekeeping, PerformanceObserver
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl
-from flight.loop.tasks.navigation import Navigation
-from flight.loop.tasks.performance import PerformanceObserver
-from flight.loop.tasks.positioning import Positioning
-from flight.loop.tasks.sun_sensing import SunSensing
+from flight.loop.tasks.navigation import Navigation, Positioning, SunSensing
 from flight.loop.tasks.wide_imaging import WideImaging
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
+
+HEALTH_PERIOD_NS = SECOND_NS // 4
+COMMAND_PERIOD_NS = SECOND_NS // 10
+
+
+@dataclass(frozen=True, slots=True)
+class Periods:
+    """Periods from the configuration, ns; None for what is not done."""
+
+    control_ns: int
+    replan_ns: int | None
+    camera_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupTasks:
+    """The task of each rate group; None where there is nothing to do."""
+
+    control: Task
+    replan: Task
+    camera: Task | None
+    commands: Task | None
+    health: Task
+    housekeeping: Task
+
+
+def rate_groups(periods: Periods, tasks: GroupTasks) -> list[RateGroup]:
+    """Return the rate groups, control first."""
+    groups = [
+        RateGroup(CONTROL, periods.control_ns, tasks.control),
+    ]
+    if periods.replan_ns is not None:
+        groups.append(RateGroup("planning", periods.replan_ns, tasks.replan))
+    if tasks.camera is not None and periods.camera_ns is not None:
+        groups.append(RateGroup("camera", periods.camera_ns, tasks.camera))
+    if tasks.commands is not None:
+        groups.append(RateGroup("commands", COMMAND_PERIOD_NS, tasks.commands))
+    groups.append(RateGroup("health", HEALTH_PERIOD_NS, tasks.health))
+    groups.append(RateGroup("housekeeping", SECOND_NS, tasks.housekeeping))
+    return groups
 
 
 def nothing() -> None:

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobRunner
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.streams import Streams
+from flight.loop.fdir.facts import EventLog, Facts, Streams
 from hal.interfaces.devices import (
     FrameSource,
     GpsReceiver,

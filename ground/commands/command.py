@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.utc_label import utc_ns
+from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker, command_of
 from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
 from flight.link.commands.errors import CommandError

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flight.app.ending_signals import EndingSignals
+from flight.app.service import EndingSignals
 from flight.link.files.entity import Progress
 from flight.link.files.store import Store, files_folder
 from flight.link.process.directives import Directive

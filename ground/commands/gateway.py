@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from flight.app.ending_signals import EndingSignals
+from flight.app.service import EndingSignals
 from ground.link.command_stream import new_token
 from ground.link.gateway import ADDRESS, Gateway
 from ground.link.options import add_link_options, terminal_of

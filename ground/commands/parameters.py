@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.utc_label import utc_ns
+from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Command, DumpParameters, LoadParameters, shown
 from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from flight.app.utc_label import utc_ns
+from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from flight.link.process.directives import LIST

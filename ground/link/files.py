@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
-from flight.app.utc_label import utc_ns
+from flight.app.run_folder import utc_ns
 from flight.link.files.checksum import CRC32
 from flight.link.files.entity import GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.files.packets import DOWN, UP, UnitPacker, is_unit, unit_of

@@ -9,8 +9,7 @@ import numpy as np
 
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.packets import PacketArray, to_text
-from flight.loop.fdir.facts import FACTS
-from flight.loop.fdir.streams import StreamState
+from flight.loop.fdir.facts import FACTS, StreamState
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.app.release import TRIALS
+from flight.app.service import TRIALS
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import DEPLOY, ROOT, script
 

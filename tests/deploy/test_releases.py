@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.app.release import NAME, NOTE, TRIALS, Release
+from flight.app.service import NAME, NOTE, TRIALS, Release
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import script
 

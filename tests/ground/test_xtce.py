@@ -15,9 +15,8 @@ from flight.link.telemetry import states
 from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
-from flight.loop.control_output import SteeringState
-from flight.loop.fdir.facts import FACTS
-from flight.loop.fdir.streams import StreamState
+from flight.loop.body import SteeringState
+from flight.loop.fdir.facts import FACTS, StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
 from tests.flight.link.telemetry.samples import plain_contents

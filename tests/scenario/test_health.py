@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from flight.link.modes import Mode
-from flight.loop.fdir.facts import FACTS, IMU_POOR, TASK_FAILING
+from flight.loop.fdir.facts import FACTS, IMU_POOR, TASK_FAILING, StreamState
 from flight.loop.fdir.resources import ResourceSample
-from flight.loop.fdir.streams import StreamState
 from ground.telemetry.reader import Run
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly

@@ -12,7 +12,7 @@ from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.recorder import Recorder
-from flight.loop.executive.rate_group import RateGroup
+from flight.loop.executive.executive import RateGroup
 from flight.loop.fdir.facts import FACTS
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep

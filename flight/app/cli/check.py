@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flight.app.cli.summary import counts_text, summary_facts
+from flight.app.cli.run import counts_text, summary_facts
 from flight.app.request import RunRequest, RunResult
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path, names
@@ -50,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def check(options: argparse.Namespace) -> int:
     """Examine, print the verdict; 1 when the configuration is not ready to fly."""
     from flight.app.accepted_config import accepted_config  # noqa: PLC0415
-    from flight.app.composition.bodies import body_kind  # noqa: PLC0415 - the whole flight hangs on these
+    from flight.app.composition import body_kind  # noqa: PLC0415 - the whole flight hangs on these
     from flight.app.devices import check_settings  # noqa: PLC0415
     from flight.app.flight import placing  # noqa: PLC0415
     from flight.app.probing import probe  # noqa: PLC0415

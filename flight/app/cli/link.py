@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
-from flight.app.patient_start import Patience, StoppedError, patiently
+from flight.app.service import Patience, StoppedError, patiently
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine
 from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine

@@ -11,25 +11,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.bodies.orbit.brake import FieldBrake, expected_field
-from flight.bodies.orbit.coarse_sun import CoarseSunFeed
-from flight.bodies.orbit.feed import OrbitFeed
-from flight.bodies.orbit.filter import OrbitFilter
-from flight.bodies.orbit.learned import learned_of, start_from
-from flight.bodies.orbit.object_aim import ObjectAim, Sensor
-from flight.bodies.orbit.paths import PointingPaths
-from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
-from flight.bodies.orbit.replay import OrbitFilterSettings
-from flight.bodies.orbit.seeker import StringSeeker
-from flight.bodies.orbit.surroundings import Surroundings
-from flight.bodies.orbit.targets import PointingTargets
-from flight.bodies.orbit.tracker import PointingTracker
+from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, wide_feed_of
+from flight.bodies.orbit.control import FieldBrake, PointingTracker, StringSeeker, expected_field
+from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, learned_of, start_from
+from flight.bodies.orbit.filter_steps import OrbitFilterSettings
+from flight.bodies.orbit.guidance import (
+    ObjectAim,
+    PlannedCraft,
+    PointingPaths,
+    PointingPlanner,
+    PointingTargets,
+    Sensor,
+)
 from flight.bodies.orbit.view import OrbitView
-from flight.bodies.orbit.wide_feed import wide_feed_of
 from flight.link.modes import Mode
 from flight.loop.body import Body, BodyKind
-from flight.loop.fdir.coils.response import ResponseSettings
-from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.loop.fdir.coil_response import ResponseSettings
+from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.camera_model import camera_model

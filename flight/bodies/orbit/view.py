@@ -7,13 +7,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.bodies.orbit.brake import FieldBrake
+from flight.bodies.orbit.control import FieldBrake
+from flight.bodies.orbit.environment import Surroundings
 from flight.bodies.orbit.filter import OrbitFilter
-from flight.bodies.orbit.surroundings import Surroundings
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.orbit_definitions import NAVIGATION, SPIN
-from flight.loop.control_output import ControlOutput, Target
+from flight.loop.body import ControlOutput, Target
 from flight.loop.fdir import facts
 from flight.loop.services import Services
 from knightcube.gnc.estimation.estimate import Knowledge

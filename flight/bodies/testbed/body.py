@@ -5,31 +5,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
-from flight.bodies.testbed.brake import BdotBrake
 from flight.bodies.testbed.cage import CageField, CageFilter, CageTracker
-from flight.bodies.testbed.feed import UnitFeed
-from flight.bodies.testbed.planning import Planning, PlanningSettings, Strategy
-from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
-from flight.bodies.testbed.targets import ThreadTargets, TimedStep
-from flight.bodies.testbed.thread_estimate import ThreadReader
-from flight.bodies.testbed.tracker import ThreadTracker, controller_of
-from flight.bodies.testbed.view import ThreadView
+from flight.bodies.testbed.control import BdotBrake, ThreadTracker, controller_of
+from flight.bodies.testbed.guidance import Planning, PlanningSettings, Strategy, ThreadTargets, TimedStep
+from flight.bodies.testbed.thread import ThreadReader, angular_acceleration_psd_of, law_of, plant_of
+from flight.link import events
 from flight.link.modes import ORBITAL, Mode
-from flight.loop.body import Body, BodyKind, Tracker
-from flight.loop.fdir.coils.response import ResponseSettings
-from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.link.telemetry.definitions import CONTROL, TARGET
+from flight.loop.body import KEPT, Agreement, Body, BodyKind, ControlOutput, Target, Tracker
+from flight.loop.fdir.coil_response import ResponseSettings
+from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
-from flight.loop.state.content import Learned
-from flight.loop.state.learning import start_from
+from flight.loop.state.content import Learned, start_from
+from flight.schema.devices import InertialUnit
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
+from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import about_axis_y, attitude_matrix
+from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from knightcube.gnc.control.detumble import (
     Detumbler,
     DetumblerSettings,
@@ -39,11 +38,104 @@ from knightcube.gnc.control.detumble import (
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.filter_settings import FilterSettings, slow_prior
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
 from knightcube.gnc.guidance.one_axis import job as plan_job
 from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuidance
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import NODES
+
+
+class UnitFeed:
+    """Implements `flight.loop.body.Feed`: starts the filter from attitude and rate, and applies both."""
+
+    def __init__(self, filter_: AttitudeFilter, unit: InertialUnit) -> None:
+        self._filter = filter_
+        self._angle_covariance: FloatArray = np.eye(3) * unit.angle_noise**2
+        self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2
+
+    def accept(self, reading: ImuReading) -> Agreement:
+        """Start the filter from a reading, or apply its attitude and its rate."""
+        latency = self._filter.latency
+        time_ns = reading.time_ns - round(latency * SECOND_NS)
+        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
+        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
+        if not self._filter.started:
+            self._filter.start(attitude, rate)
+            return Agreement(True)
+        # Gated separately: a correct gyro keeps the rate while the attitude is rejected.
+        turned = self._filter.measure(attitude)
+        moved = self._filter.started and self._filter.measure(rate)
+        if turned and moved:
+            return Agreement(True)
+        angle = angle_about_axis_y(reading.quaternion)
+        return Agreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Return False: the unit's own attitude starts the filter."""
+        return False
+
+
+class ThreadView:
+    """Implements `flight.loop.body.BodyView`."""
+
+    def __init__(self, reader: ThreadReader, planning: Planning, services: Services) -> None:
+        self._read = reader.read
+        self._planning = planning
+        self._recorder = services.recorder
+        self._events = services.events
+
+    def record_cycle(self, output: ControlOutput) -> None:
+        """Record the control packet."""
+        estimate = self._read(output.estimate) if output.estimate is not None else None
+        steered, sample, written = output.steered, output.steered.reference, output.written
+        now_ns, nan = output.cycle.start_ns, math.nan
+        self._recorder.record(
+            CONTROL,
+            now_ns,
+            cycle=output.cycle.slot,
+            state=int(steered.state),
+            estimate_age=(now_ns - estimate.measured_ns) * 1e-9 if estimate else nan,
+            angle=estimate.angle if estimate else nan,
+            q2=estimate.q2 if estimate else nan,
+            rate=estimate.rate if estimate else nan,
+            angle_sigma=math.sqrt(estimate.covariance[0, 0]) if estimate else nan,
+            rate_sigma=math.sqrt(estimate.covariance[1, 1]) if estimate else nan,
+            target_q2=law_of(output.target).q2 if output.target else nan,
+            path_q2=math.sin(0.5 * sample.angle) if sample else nan,
+            path_rate=sample.rate if sample else nan,
+            path_acceleration=sample.acceleration if sample else nan,
+            plan=self._planning.flown,
+            current_command=steered.currents.tolist(),
+            current_written=written.current.tolist(),
+            saturated=int(written.saturated or steered.saturated),
+        )
+
+    def announce(self, target: Target, now_ns: int) -> None:
+        """Record and report a new target, unless the present attitude is held."""
+        if target.index == KEPT:
+            return
+        law = law_of(target)
+        self._recorder.record(TARGET, now_ns, index=target.index, q2=law.q2, rate=law.rate)
+        self._events.report(events.TARGET, now_ns, f"step {target.index}: q2 = {law.q2:+.2f}")
+
+    def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
+        """Return the body's fields of the mode packet."""
+        return {"target_q2": math.nan if wanted is None else law_of(wanted).q2}
+
+    def rate_text(self, rate: MeanRateMeasurement) -> str:
+        """Return a rate from streaks as text."""
+        return f"{rate.rate[1]:.5f} rad/s +- {math.sqrt(rate.covariance[1, 1]):.1e}"
+
+    def progress(self, output: ControlOutput | None) -> str:
+        """Return target and attitude as text, for the progress line."""
+        target, estimate = (None, None) if output is None else (output.target, output.estimate)
+        wanted = law_of(target).q2 if target else 0.0
+        if estimate is None:
+            return f"q2   -    -> {wanted:+.2f}"
+        now = self._read(estimate)
+        return f"q2 {now.q2:+.4f} -> {wanted:+.2f}  {now.rate:+.4f} rad/s"
+
 
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 

@@ -17,9 +17,8 @@ import math
 
 import numpy as np
 
-from flight.bodies.testbed.thread_estimate import ThreadReader
-from flight.loop.body import Tracker
-from flight.loop.control_output import CoilCommand
+from flight.bodies.testbed.thread import ThreadReader
+from flight.loop.body import CoilCommand, Tracker
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import Cage
 from hal.interfaces.wires import SECOND_NS, Clock

@@ -17,7 +17,7 @@ from flight.link.telemetry.definitions import COMMAND, MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from flight.link.telemetry.walk import walk
 
-_ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes.triggers)
+_ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes)
 
 
 class Stage(IntEnum):

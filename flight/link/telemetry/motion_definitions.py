@@ -91,7 +91,7 @@ MODE = Packet(
     (
         Field("before", "u1", "-", "mode until now", states=MODES),
         Field("mode", "u1", "-", "mode from now on", states=MODES),
-        Field("trigger", "S32", "-", "what led to it (flight.loop.modes.triggers)"),
+        Field("trigger", "S32", "-", "what led to it (flight.loop.modes)"),
         Field("reason", "S96", "-", "of the trigger: the event, the values"),
         Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
     ),

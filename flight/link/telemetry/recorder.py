@@ -75,7 +75,7 @@ class Recorder:
             self._performance.write(packed)
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event: the sink of `flight.loop.fdir.event_log.EventLog`."""
+        """Write an event: the sink of `flight.loop.fdir.facts.EventLog`."""
         packed = self.record(
             EVENT,
             time_ns,

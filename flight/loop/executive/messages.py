@@ -1,21 +1,167 @@
 """Messages between the control process and its workers: a value, its large arrays in shared memory.
 
-A worker trusts what the control process sends and unpickles it. What comes back is read as `values`: it may
-build dataclasses, enumerations and arrays of numbers, and call or import nothing. A worker whose memory is
-damaged can send a wrong value, never run code in the control process or end it.
+A worker trusts the control process and unpickles its messages. The worker's answer is read as plain values:
+it may build dataclasses, enumerations and arrays of numbers, and call or import nothing. A worker whose
+memory is damaged can send a wrong value, but never run code in the control process or end it. Pickle is no
+choice for answers: numpy's unpickling ends the process on some damaged messages.
+
+Plain values are MessagePack, read by msgspec. Numbers, texts, bytes and None are themselves; everything else
+is a list that begins with a tag. Arrays of numbers lie in buffers beside the bytes, which name type and
+shape. Dataclasses, named tuples and enumerations are built only of modules that are loaded, and without a
+call of their own code.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import enum
+import math
 import mmap
+import operator
 import pickle
 import struct
+import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from flight.loop.executive import values
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
 from knightcube.errors import FlightError
+
+Array = npt.NDArray[Any]
+_PLAIN = (bool, int, float, str, bytes, type(None))
+_CONTAINERS: dict[type, str] = {list: "list", tuple: "tuple", set: "set", frozenset: "frozenset"}
+_MAKERS: dict[str, Callable[[Any], Any]] = {name: kind for kind, name in _CONTAINERS.items()}
+_DTYPES = {np.dtype(kind).str for kind in "?bBhHiIlLefdFD"}
+_MOST_DIMENSIONS = 32
+
+
+def encode_values(value: Any) -> tuple[bytes, list[Array]]:
+    """Return the bytes of a value, and its arrays beside them. Raises FlightError for what is no value."""
+    arrays: list[Array] = []
+    tree = _tree(value, arrays)
+    try:
+        return msgspec.msgpack.encode(tree), arrays
+    except (OverflowError, UnicodeError) as error:
+        raise FlightError(f"no value to be sent: {error}") from error
+
+
+def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
+    """Undo `encode_values`, each array a view of its buffer. Damage raises an exception of any kind."""
+    return _Reader(buffers).made(msgspec.msgpack.decode(data))
+
+
+def _tree(value: Any, arrays: list[Array]) -> Any:
+    """Return plain lists and scalars for a value; its arrays are appended to `arrays`."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind in _CONTAINERS:
+        return [_CONTAINERS[kind], [_tree(item, arrays) for item in value]]
+    if kind is dict:
+        return ["dict", [[_tree(key, arrays), _tree(item, arrays)] for key, item in value.items()]]
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.str in _DTYPES:
+        arrays.append(np.ascontiguousarray(value))
+        return ["array" if isinstance(value, np.ndarray) else "scalar", value.dtype.str, list(value.shape)]
+    return _tree_of_class(value, f"{kind.__module__}:{kind.__qualname__}", arrays)
+
+
+def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
+    if isinstance(value, complex):
+        return ["complex", value.real, value.imag]
+    if isinstance(value, enum.Flag):
+        return ["flag", name, value.value]
+    if isinstance(value, enum.Enum):
+        return ["enum", name, value.name]
+    if (parts := _field_names(type(value))) is None:
+        raise FlightError(f"a {name!r} is no value that a worker may send")
+    return ["fields", name, [_tree(getattr(value, part), arrays) for part in parts]]
+
+
+class _Reader:
+    """Makes the value of a tree, whose arrays take the buffers one by one."""
+
+    def __init__(self, buffers: Sequence[bytearray]) -> None:
+        self._buffers = iter(buffers)
+
+    def made(self, tree: Any) -> Any:
+        if type(tree) in _PLAIN:
+            return tree
+        match tree:
+            case [str(tag), list(items)] if tag in _MAKERS:
+                return _MAKERS[tag](map(self.made, items))
+            case ["dict", list(items)]:
+                return {self.made(key): self.made(item) for key, item in items}
+            case ["fields", str(name), list(items)]:
+                return _built(name, [self.made(item) for item in items])
+        return self._single(tree)
+
+    def _single(self, tree: Any) -> Any:
+        match tree:
+            case ["complex", float(real), float(imaginary)]:
+                return complex(real, imaginary)
+            case ["array", str(dtype), list(shape)]:
+                return _array(dtype, shape, next(self._buffers))
+            case ["scalar", str(dtype), []]:
+                return _array(dtype, [], next(self._buffers))[()]
+            case ["flag" | "enum" as tag, str(name), member]:
+                return _member(name, tag, member)
+        raise FlightError(f"{str(tree)[:80]!r} is no value")
+
+
+def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
+    """Return an array of numbers that fills its buffer, and may be written to."""
+    if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
+        raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
+    if not all(type(length) is int and length >= 0 for length in shape):
+        raise FlightError("an array's shape is no list of lengths")
+    kind = np.dtype(dtype)
+    if math.prod(shape) * kind.itemsize != len(buffer):
+        raise FlightError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
+    if kind.kind == "b" and buffer.translate(None, b"\0\1"):
+        raise FlightError("a truth value is neither 0 nor 1")
+    return np.frombuffer(buffer, kind).reshape(shape) if buffer else np.zeros(shape, kind)
+
+
+def _built(name: str, items: list[Any]) -> Any:
+    kind: Any = _class(name)
+    parts = _field_names(kind)
+    if parts is None or len(parts) != len(items):
+        raise FlightError(f"{name!r} is no class of {len(items)} values")
+    if issubclass(kind, tuple):
+        return tuple.__new__(kind, items)
+    value = object.__new__(kind)
+    for part, item in zip(parts, items, strict=True):
+        object.__setattr__(value, part, item)
+    return value
+
+
+def _member(name: str, tag: str, member: Any) -> Any:
+    kind = _class(name)
+    if not issubclass(kind, enum.Enum) or issubclass(kind, enum.Flag) != (tag == "flag"):
+        raise FlightError(f"{name!r} is no {tag}")
+    if tag == "flag":
+        return kind(operator.index(member))
+    return kind[member]
+
+
+def _class(name: str) -> type:
+    module, _, qualified = name.partition(":")
+    found = getattr(sys.modules.get(module), qualified, None)
+    if not isinstance(found, type):
+        raise FlightError(f"{name!r} is no class that the control process has")
+    return found
+
+
+def _field_names(kind: Any) -> tuple[str, ...] | None:
+    """Return the names of what a dataclass or a named tuple holds; None for any other class."""
+    if dataclasses.is_dataclass(kind):
+        return tuple(field.name for field in dataclasses.fields(kind))
+    return kind._fields if issubclass(kind, tuple) and hasattr(kind, "_fields") else None
+
 
 SLAB_BYTES = 64 * 1024 * 1024
 """Shared memory for a job's arrays: only address space until used."""
@@ -44,14 +190,14 @@ def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
     """Do as `pack_trusted` for a reader who does not trust. Raises FlightError for what is no plain value."""
-    body, arrays = values.encode(value)
+    body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
     """Undo `pack_values` of a worker. Raises FlightError for damage."""
     try:
-        return values.decode(*_parts(message, slab))
+        return decode_values(*_parts(message, slab))
     except FlightError:
         raise
     except Exception as error:  # a damaged stream fails in any way

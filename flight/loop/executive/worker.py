@@ -1,4 +1,4 @@
-"""A worker process of `flight.loop.executive.processes`: serves one function until its socket closes.
+"""A worker process of `flight.loop.executive.worker_processes`: serves one function until its socket closes.
 
 The function's module may define `prepare`, for imports that only the worker needs: called before the first
 job. Run by the runner only, as `python -m flight.loop.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD

@@ -1,15 +1,32 @@
-"""The stored state: typed, bounded, validated. UTC is a label for people, never used in computations."""
+"""The stored state: its content, how it changes from boot to boot, and the learned parameters in it.
+
+The state is typed, bounded and validated. UTC is a label for people, never used in computations. Crashes are
+counted per operating time, the sum over all boots of monotonic running time: a wrong or stepped clock has no
+effect, and a board that crashes at once, repeatedly, does not age its crashes out.
+
+The learned parameters are the parts of an estimate that belong to the devices, not to the motion. The next
+boot starts from them, with the covariance increased by a fraction of the configured prior, for changes
+meanwhile. Values that the prior makes implausible are rejected.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
+from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import BIAS, FIELD_BIAS, LATENCY, PARAMETERS, Estimate
+from knightcube.gnc.estimation.rigid_body import Parameters
+from knightcube.gnc.estimation.slow_prior import SlowPrior
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Seconds = Annotated[float, Meta(ge=0.0)]
@@ -111,3 +128,167 @@ def check(state: StoredState) -> None:
         scale = float(np.max(np.abs(covariance)))
         if scale > 0.0 and float(np.linalg.eigvalsh(covariance / scale)[0]) < -1e-9:
             raise ValueError(f"{name}: the covariance has a negative eigenvalue")
+
+
+@dataclass(frozen=True, slots=True)
+class BootRecord:
+    """The history of earlier boots, as needed at the start.
+
+    Attributes:
+        boot_count: this boot's number, 1 the first.
+        unclean_recent: unclean shutdowns within the given window of operating time.
+        after_unclean: whether the previous boot ended uncleanly.
+        mode: the mode at the last stop; empty when there was none.
+    """
+
+    boot_count: int
+    unclean_recent: int
+    after_unclean: bool
+    mode: str
+
+
+@dataclass(frozen=True, slots=True)
+class Noted:
+    """What the loop has for the next write: the mode, what it learned, and the table of parameters."""
+
+    mode: str
+    learned: Mapping[str, Learned]
+    table: KeptTable
+
+
+def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
+    """Return the state of the next boot: running, and with a crash of the last boot recorded.
+
+    Parameters learned of other `devices` are discarded, and a loaded table that a crash left unproven.
+    """
+    unclean = state.unclean
+    if state.running:
+        unclean = (*unclean, UncleanShutdown(state.boot_count, state.operated, state.utc))[-REMEMBERED:]
+    return msgspec.structs.replace(
+        state,
+        boot_count=state.boot_count + 1,
+        running=True,
+        unclean=unclean,
+        utc=utc,
+        learned=state.learned if state.devices == devices else {},
+        devices=devices,
+        table=_trusted(state.table) if state.running else state.table,
+    )
+
+
+def _trusted(table: KeptTable) -> KeptTable:
+    """Return the table to fly after an unclean shutdown: the one before, where it is not proven."""
+    if table.proven:
+        return table
+    return msgspec.structs.replace(table, values=table.before, before={}, proven=True)
+
+
+def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
+    """Return the state `elapsed` s after the start `begun`; new learned parameters replace the old."""
+    return msgspec.structs.replace(
+        begun,
+        operated=begun.operated + max(elapsed, 0.0),
+        mode=noted.mode[:LONGEST_LABEL] or begun.mode,
+        learned={**begun.learned, **noted.learned},
+        table=noted.table,
+        utc=utc,
+    )
+
+
+def end_cleanly(state: StoredState) -> StoredState:
+    """Return the state after a clean end_cleanly."""
+    return msgspec.structs.replace(state, running=False)
+
+
+def boot_record(begun: StoredState, window: float) -> BootRecord:
+    """Return the boot record of the state of a new boot; `window` in s of operating time."""
+    recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
+    after = bool(begun.unclean) and begun.unclean[-1].boot == begun.boot_count - 1
+    return BootRecord(begun.boot_count, recent, after, begun.mode)
+
+
+GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
+
+_BELIEVED = 4.0
+"""Sigmas of the configured prior: learned values further from the prior are rejected."""
+
+
+def learned_of(estimate: Estimate) -> dict[str, Learned]:
+    """Return the estimate's slow parts by name, in its units and axes.
+
+    The gyro's bias; torsion, damping and coil gain of the plant; the age of the inertial unit's samples; the
+    magnetometer's bias. Cross-covariances are dropped.
+    """
+    parts: dict[str, tuple[FloatArray, slice]] = {
+        GYRO_BIAS: (estimate.bias, BIAS),
+        PLANT: (np.array(estimate.parameters), PARAMETERS),
+        IMU_LATENCY: (np.array([estimate.latency]), slice(LATENCY, LATENCY + 1)),
+        MAGNETOMETER_BIAS: (estimate.field_bias, FIELD_BIAS),
+    }
+    return {
+        name: Learned.of(values, estimate.covariance[where, where]) for name, (values, where) in parts.items()
+    }
+
+
+def digest_of(config: Config) -> str:
+    """Return a digest of the devices of a configuration."""
+    return f"{zlib.crc32(msgspec.json.encode(config.hardware())):08x}"
+
+
+def start_from(
+    learned: Mapping[str, Learned], configured: SlowPrior, changed: float
+) -> tuple[SlowPrior, list[str]]:
+    """Return the filter's prior, and why learned parameters were rejected.
+
+    `configured` is the prior without learning; since the last boot a value may have changed by the fraction
+    `changed` of its standard deviation in `configured`.
+    """
+    problems: list[str] = []
+
+    def accept(name: str, values: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if name not in learned:
+            return values, covariance
+        found, spread = learned[name].arrays()
+        problem = _problem(found, values, covariance)
+        if problem:
+            problems.append(f"{name} {found.tolist()}: {problem}")
+            return values, covariance
+        return _widened(found, spread, values, covariance, changed)
+
+    bias, bias_covariance = accept(GYRO_BIAS, configured.bias, configured.bias_covariance)
+    plant, plant_covariance = accept(PLANT, np.array(configured.parameters), configured.parameters_covariance)
+    age, age_covariance = accept(
+        IMU_LATENCY, np.array([configured.latency]), np.array([[configured.latency_variance]])
+    )
+    torsion, damping, gain = plant.tolist()
+    prior = dataclasses.replace(
+        configured,
+        bias=bias,
+        bias_covariance=bias_covariance,
+        parameters=Parameters(torsion, damping, gain),
+        parameters_covariance=plant_covariance,
+        latency=float(age[0]),
+        latency_variance=float(age_covariance[0, 0]),
+    )
+    return prior, problems
+
+
+def _problem(found: FloatArray, values: FloatArray, covariance: FloatArray) -> str:
+    """Return why a learned value is implausible; empty when plausible."""
+    if found.shape != values.shape:
+        return f"{len(values)} values are wanted"
+    sigma = np.sqrt(np.diag(covariance))
+    if np.any((sigma > 0.0) & (np.abs(found - values) > _BELIEVED * sigma)):
+        return f"not within {_BELIEVED:g} sigma of {values.tolist()} +- {sigma.tolist()}"
+    return ""
+
+
+def _widened(
+    found: FloatArray, spread: FloatArray, values: FloatArray, covariance: FloatArray, changed: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return learned values with the increased covariance; values not estimated stay as configured."""
+    variance = np.diag(covariance)
+    estimated = variance > 0.0
+    both = np.outer(estimated, estimated)
+    wide = np.where(both, spread, 0.0) + np.diag(changed**2 * variance)
+    return np.where(estimated, found, values), wide

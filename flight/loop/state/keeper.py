@@ -1,25 +1,39 @@
-"""Stores the state outside the loop: the control thread sets values in memory, a ticker's thread writes them.
+"""Opens the stored state of a boot, stores it outside the loop, and closes it at the flight's end.
 
-The disk is written at the start, before the loop, by the clock's ticker during the flight, and at the end,
-when the coils are at zero; a hanging disk delays only the ticker.
+The control thread sets values in memory, a ticker's thread writes them. The disk is written at the start,
+before the loop, by the clock's ticker during the flight, and at the end, when the coils are at zero; a
+hanging disk delays only the ticker.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 
 import msgspec
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.loop.state import history
-from flight.loop.state.content import KeptTable, Learned, StoredState
-from flight.loop.state.history import BootRecord, Noted
-from flight.loop.state.store import StateStore
+from flight.loop.state.content import (
+    BootRecord,
+    KeptTable,
+    Learned,
+    Noted,
+    StoredState,
+    begin_boot,
+    boot_record,
+    digest_of,
+    end_cleanly,
+    state_after,
+)
+from flight.loop.state.store import StateStore, newest_boot, note_boot
+from flight.schema.sections import Config
+from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
 
 _HUNG_DISK_S = 5.0
@@ -76,8 +90,8 @@ class StateKeeper:
         if boots > loaded.boot_count:
             notices.report(events.STATE_OLD, f"of boot {loaded.boot_count}, but boot {boots} was noted")
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
-        self._begun = history.begin(loaded, self._label(), devices)
-        self.record: BootRecord = history.boot_record(self._begun, window)
+        self._begun = begin_boot(loaded, self._label(), devices)
+        self.record: BootRecord = boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self.table = self._begun.table
         self._noted = Noted(self._begun.mode, {}, self.table)
@@ -137,16 +151,71 @@ class StateKeeper:
     def _put(self, ended: bool) -> None:
         noted = self._noted
         elapsed = (self._clock.now_ns() - self._begun_ns) * 1e-9
-        state = history.go_on(self._begun, elapsed, noted, self._label())
+        state = state_after(self._begun, elapsed, noted, self._label())
         try:
-            self._store.store(history.end(state) if ended else state)
+            self._store.store(end_cleanly(state) if ended else state)
         except ValueError as error:
             # Only the learned parameters are invalid; operating time and ending must still be stored.
             self._notices.report(events.STATE_UNWRITTEN, str(error))
             self._noted = replace(noted, learned={})
-            state = history.go_on(self._begun, elapsed, self._noted, self._label())
-            self._store.store(history.end(state) if ended else state)
+            state = state_after(self._begun, elapsed, self._noted, self._label())
+            self._store.store(end_cleanly(state) if ended else state)
 
     def _label(self) -> str:
         """Return UTC as text."""
         return f"{datetime.fromtimestamp(self._clock.utc_ns() * 1e-9, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
+    """Return the state's folder: as configured, else systemd's for a flight of real devices, else None."""
+    if config.state.folder is not None:
+        return Path(config.state.folder)
+    if config.simulation is not None:
+        return None
+    return service_folder(environment)
+
+
+def service_folder(environment: Mapping[str, str]) -> Path | None:
+    """Return the state folder that systemd gives a service, None without one."""
+    # systemd separates several folders by colons; the first is the application's own.
+    first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
+    return Path(first) if first else None
+
+
+def open_state(
+    config: Config,
+    environment: Mapping[str, str],
+    clock: Clock,
+    stack: ExitStack,
+    runs: Sequence[Path] = (),
+) -> StateKeeper | None:
+    """Count this boot; return None where no state is stored.
+
+    `runs` are the folders of the newest runs, this one the last: the boot's number is noted in them.
+    `stack` closes the state: cleanly, unless an exception passes. A DeviceError counts as clean: the device
+    is reported, and safe mode would not help.
+    """
+    folder = state_folder(config, environment)
+    if folder is None:
+        return None
+    with suppress(OSError):  # the first write will fail and be reported; the flight goes on
+        folder.mkdir(parents=True, exist_ok=True)
+    notices = Notices()
+    keeper = StateKeeper(
+        StateStore(folder, notices.report),
+        notices,
+        clock,
+        window=config.modes.crash_window,
+        devices=digest_of(config),
+        period_ns=round(config.state.period * 1e9),
+        boots=newest_boot([folder, *runs]),
+    )
+    if keeper.counted:
+        note_boot([folder, *runs[-1:]], keeper.record.boot_count)
+
+    def close(kind: type[BaseException] | None, *_: object) -> bool:
+        keeper.close(clean=kind is None or issubclass(kind, DeviceError))
+        return False
+
+    stack.push(close)
+    return keeper

@@ -10,20 +10,18 @@ import numpy as np
 
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE
-from flight.loop.body import PLANNER, Body
-from flight.loop.control_output import ControlOutput, Steered, Target
+from flight.loop.body import PLANNER, Body, ControlOutput, Steered, Target
+from flight.loop.executive.executive import Cycle
 from flight.loop.executive.jobs import JobResult
-from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir.coils.knowledge import CoilKnowledge
+from flight.loop.fdir.coil_watch import CoilKnowledge
 from flight.loop.services import Services
 from flight.loop.tasks import imaging as imaging_task
 from flight.loop.tasks import wide_imaging as wide_task
-from flight.loop.tasks.coil_drive import CoilDrive
+from flight.loop.tasks.health import PerformanceObserver
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl
 from flight.loop.tasks.navigation import Navigation
-from flight.loop.tasks.performance import PerformanceObserver
-from flight.loop.tasks.steering import Steering
+from flight.loop.tasks.steering import CoilDrive, Steering
 from flight.loop.tasks.wide_imaging import WideImaging
 from hal.interfaces.readings import ImuReading
 from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate

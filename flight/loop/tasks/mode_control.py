@@ -1,4 +1,10 @@
-"""Mode control: turns reactions, commands and achievements into triggers, and enters modes.
+"""A timer for how long a condition has held without interruption.
+
+Watches the attitude and the spin of a body that must acquire its attitude.
+
+Monitors the rate and the pointing error of a steered body.
+
+Mode control: turns reactions, commands and achievements into triggers, and enters modes.
 
 Entering a mode never waits for an estimate: a hold takes its attitude from the first cycle with an estimate.
 """
@@ -13,23 +19,144 @@ from flight.link import events
 from flight.link.events import EventKind, Reaction
 from flight.link.modes import ORBITAL, POINTING, STEERING, Mode
 from flight.link.telemetry.definitions import MODE
-from flight.loop.body import Body
-from flight.loop.control_output import Target
+from flight.loop.body import Body, Target, Targets
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.hold_timer import HoldTimer
-from flight.loop.modes.machine import Change, ModeMachine
-from flight.loop.modes.table import TRANSITIONS, Answer
-from flight.loop.modes.triggers import COMMANDS, STARTS, Trigger
+from flight.loop.modes import COMMANDS, KNOWN, STARTS, TRANSITIONS, Answer, Change, ModeMachine, Trigger
 from flight.loop.services import Services
-from flight.loop.tasks.attitude_watch import AttitudeWatch
-from flight.loop.tasks.pointing_watch import PointingWatch
 from flight.loop.tasks.steering import Steering
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Modes
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
+
+
+class HoldTimer:
+    """Detects that a condition has held for a given time."""
+
+    def __init__(self, seconds: float) -> None:
+        self._needed_ns = round(seconds * 1e9)
+        self._since_ns: int | None = None
+
+    def require(self, seconds: float) -> None:
+        """Ask for another time from now on."""
+        self._needed_ns = round(seconds * 1e9)
+
+    def update(self, holds: bool, now_ns: int) -> bool:
+        """Update whether the condition holds now; return whether the condition has held for long enough."""
+        if not holds:
+            self._since_ns = None
+            return False
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        return now_ns - self._since_ns >= self._needed_ns
+
+    def reset(self) -> None:
+        """Start from zero."""
+        self._since_ns = None
+
+
+class AttitudeWatch:
+    """Finds the triggers between acquisition and pointing, and when SAFE has to brake the body.
+
+    Attributes:
+        follows: the mode that follows the acquisition; None where the body rests.
+        brakes: whether a body in SAFE is being braked.
+        seeks: whether a body in SAFE turns to the Sun.
+    """
+
+    def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
+        """`low_rate` rad/s for `low_for` s ends the braking."""
+        self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
+        self.brakes = self.seeks = False
+        self._fast, self._low = settings.tumble_rate, low_rate
+        self._known = HoldTimer(settings.known_for)
+        self._lost = HoldTimer(settings.lost_for)
+        self._spins = HoldTimer(settings.known_for)
+        self._slow = HoldTimer(low_for)
+
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._fast = settings.tumble_rate
+        self._lost.require(settings.lost_for)
+        for timer in (self._known, self._spins):
+            timer.require(settings.known_for)
+
+    def reset(self) -> None:
+        """Begin again: another mode is entered."""
+        self.brakes = self.seeks = False
+        for timer in (self._known, self._lost, self._spins, self._slow):
+            timer.reset()
+
+    def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
+        """Return the trigger that is due; `known`: whether there is an attitude to steer by."""
+        if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
+            return KNOWN[self.follows]
+        if mode in POINTING and self._lost.update(not known, now_ns):
+            return Trigger.LOST
+        return None
+
+    def watch_safe(
+        self,
+        rate: float,
+        barred: bool,
+        brake: Callable[[int], None],
+        seek: Callable[[int], None],
+        now_ns: int,
+    ) -> None:
+        """Brake a body in SAFE that turns fast until it is slow, else have it seek the Sun.
+
+        Neither while `barred` by a latched fault. `brake` and `seek` are called when either begins.
+        """
+        if self.brakes:
+            self.brakes = not (barred or self._slow.update(rate < self._low, now_ns))
+        elif self._spins.update(rate > self._fast and not barred, now_ns):
+            self._slow.reset()
+            self.brakes = True
+            brake(now_ns)
+        seeks = not (barred or self.brakes)
+        if seeks and not self.seeks:
+            seek(now_ns)
+        self.seeks = seeks
+
+
+class PointingWatch:
+    """Updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
+
+    def __init__(self, settings: Modes, targets: Targets, facts_: Facts) -> None:
+        self._settings = settings
+        self._targets = targets
+        self._facts = facts_
+        self._off = HoldTimer(settings.hold_patience)
+
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._settings = settings
+        self._off.require(settings.hold_patience)
+
+    def reset(self) -> None:
+        """Restart the timer of the pointing error: another mode is entered."""
+        self._off.reset()
+
+    def watch_rate(self, rate: float, now_ns: int) -> None:
+        """Update TUMBLING from a rate, rad/s, not negative."""
+        limit = self._settings.tumble_rate
+        self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
+
+    def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
+        """Update both facts from the pointing error `off`, rad; return the error, 0 where `off` is None.
+
+        `off` is None while there is no attitude to be reached yet.
+        """
+        settings = self._settings
+        self.watch_rate(self._targets.speed(estimate), now_ns)
+        error = 0.0 if off is None else off
+        impossible = self._off.update(error > settings.hold_error, now_ns)
+        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
+        self._facts.update(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        return error
+
 
 SAFING_REACTIONS = {
     Reaction.SAFE: Trigger.REACT_SAFE,

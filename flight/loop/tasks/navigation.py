@@ -1,7 +1,7 @@
-"""Navigation: fuses readings of the inertial unit, rates from streaks and attitudes from stars.
+"""Navigation: passes readings of inertial unit, GPS receiver and solar cells to the body; monitors them.
 
-Also monitors the unit's line for silence (no bytes), corruption (bytes without valid packets) and implausible
-values.
+The inertial unit's line is monitored for silence (no bytes), corruption (bytes without valid packets) and
+implausible values. Rates from streaks and attitudes from stars enter the estimate at their own times.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.loop.body import Body
 from flight.loop.fdir import facts
-from flight.loop.fdir.coils.knowledge import CurrentValidity
+from flight.loop.fdir.coil_watch import CurrentValidity
 from flight.loop.services import Services
-from hal.interfaces.devices import InertialUnit
+from hal.interfaces.devices import GpsReceiver, InertialUnit, SolarStrings
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import CoilState, ImuLink, ImuReading
+from hal.interfaces.readings import CoilState, GpsReading, ImuLink, ImuReading, StringReading
+from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
@@ -190,3 +191,96 @@ class Navigation:
         if odd or endless:
             text = f"{odd} packets out of range, {endless} not finite"
             self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
+
+
+CLOCK_OFF_NS = SECOND_NS
+"""By which the wall clock may differ from the receiver's time."""
+
+
+class Positioning:
+    """Owns the receiver."""
+
+    def __init__(
+        self,
+        receiver: GpsReceiver,
+        accept: Callable[[GpsReading], bool],
+        max_age_ns: int,
+        services: Services,
+    ) -> None:
+        """`accept` returns whether the body uses a fix; without one for `max_age_ns` the receiver is lost."""
+        self._receiver = receiver
+        self._accept = accept
+        self._max_age_ns = max_age_ns
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
+        self._clock = services.clock
+        self._fixed_ns = 0
+
+    def begin(self, time_ns: int) -> None:
+        """Measure the age of the newest fix from `time_ns` on."""
+        self._fixed_ns = time_ns
+
+    def run(self, now_ns: int) -> None:
+        """Accept the fixes since the last call."""
+        error = ""
+        try:
+            readings = self._receiver.poll()
+        except DeviceError as lost:
+            readings, error = [], str(lost)
+        for reading in readings:
+            if not reading.valid:
+                continue
+            self._streams.note("gps", reading.time_ns)
+            if self._accept(reading):
+                self._fixed_ns = reading.time_ns
+                self._compare_clock(reading, now_ns)
+            else:
+                self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
+        age_ns = now_ns - self._fixed_ns
+        text = error or f"no fix of use for {age_ns * 1e-9:.0f} s"
+        lost_now = bool(error) or age_ns > self._max_age_ns
+        self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+
+    def _compare_clock(self, reading: GpsReading, now_ns: int) -> None:
+        """Report a wall clock that is wrong: before the first fix the place was found by it."""
+        clock = self._clock
+        off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
+        text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
+        self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
+
+
+class SunSensing:
+    """Owns the strings."""
+
+    def __init__(
+        self,
+        strings: SolarStrings,
+        accept: Callable[[StringReading], str | None],
+        max_age_ns: int,
+        services: Services,
+    ) -> None:
+        """`accept` is that of `flight.loop.body.Body.sun`; a reading older than `max_age_ns` is not used."""
+        self._strings = strings
+        self._accept = accept
+        self._max_age_ns = max_age_ns
+        self._facts = services.facts
+        self._read_ns = 0
+
+    def begin(self, time_ns: int) -> None:
+        """Measure the age of the newest reading from `time_ns` on."""
+        self._read_ns = time_ns
+
+    def run(self, now_ns: int) -> None:
+        """Accept the newest reading, once."""
+        reading = self._strings.latest()
+        if reading is not None and reading.time_ns > self._read_ns:
+            self._read_ns = reading.time_ns
+            if now_ns - reading.time_ns <= self._max_age_ns:
+                wrong = self._accept(reading)
+                if wrong is not None:
+                    self._facts.update(facts.SUN_UNCLEAR, bool(wrong), now_ns, wrong or "the Sun is seen")
+        age_ns = now_ns - self._read_ns
+        lost = age_ns > self._max_age_ns
+        text = self._strings.error() or f"no reading for {age_ns * 1e-9:.0f} s"
+        self._facts.update(facts.STRINGS_LOST, lost, now_ns, text if lost else "readings come again")

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flight.bodies.testbed.body import TESTBED
-from flight.loop.body import Body, BodyKind
-from flight.loop.control_output import CoilCommand, Reference
+from flight.loop.body import Body, BodyKind, CoilCommand, Reference
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flight.app.ending_signals import EndingSignals
+from flight.app.service import EndingSignals
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import ROOT
 from tests.ground.report.synthetic import Recipe, make_run

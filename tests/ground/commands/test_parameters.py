@@ -17,11 +17,9 @@ from flight.link.commands.values import LoadParameters
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.recorder import Recorder
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.streams import Streams
+from flight.loop.fdir.facts import EventLog, Facts, Streams
 from flight.loop.services import Services
-from flight.loop.tasks.parameters import Adopters, Parameters
+from flight.loop.tasks.commanding import Adopters, Parameters
 from flight.schema.sections import Health, Modes
 from tests.scenario.flights import demo_config
 

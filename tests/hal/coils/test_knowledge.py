@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.loop.fdir.coils.knowledge import STOOD_NS, CoilKnowledge, CurrentValidity
+from flight.loop.fdir.coil_watch import STOOD_NS, CoilKnowledge, CurrentValidity
 from hal.guardian.watch import SILENCE_NS
 from hal.interfaces.readings import CoilState
 

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from flight.app import watchers
+from flight.app import opening as watchers
 from hal.buses import real_time
 from hal.drivers.coil_settings import DEVICE as COILS
 

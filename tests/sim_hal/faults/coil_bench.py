@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.app.devices import coil_settings, unit_settings
-from flight.app.mission_time import next_whole_second
-from flight.loop.fdir.coils.response import ResponseSettings
-from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.app.flight import next_whole_second
+from flight.loop.fdir.coil_response import ResponseSettings
+from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from flight.schema import reader as configuration
 from flight.schema.testbed import TestbedConfig
 from hal.drivers.coils import PwmTorqueCoils

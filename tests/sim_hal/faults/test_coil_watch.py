@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.loop.fdir.coils.hypotheses import (
+from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
+from flight.loop.fdir.stuck_leg import NONE, StuckLeg, Supplied
+from flight.loop.fdir.supply_current import (
     MEAN,
     NEWEST,
     PLACE,
@@ -18,8 +20,6 @@ from flight.loop.fdir.coils.hypotheses import (
     predict,
     supply_currents,
 )
-from flight.loop.fdir.coils.stuck_leg import NONE, StuckLeg, Supplied
-from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from hal.interfaces.readings import ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
 from tests.sim_hal.faults.coil_bench import hold, observe

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.utc_label import utc_ns
+from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from ground.commands.command import exchange

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link import events
-from flight.loop.executive.attempts import BUDGET
+from flight.loop.executive.worker_processes import BUDGET
 from ground.telemetry.reader import read_run
 from hal.interfaces.wires import SECOND_NS
 from tests.hal.guardian import live_flight

@@ -17,7 +17,7 @@ from tests.studies.bench.lateness import Grid, on_grid, robbed, slope_per_hour, 
 from tests.studies.bench.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
-"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_time`)."""
+"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
 """s of flight: the slope of memory is fitted from the first on, over the second at least.

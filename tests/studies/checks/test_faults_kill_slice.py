@@ -9,8 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from flight.loop.state import history
-from flight.loop.state.content import StoredState
+from flight.loop.state.content import StoredState, begin_boot
 from flight.loop.state.store import COPIES, StateStore
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.campaigns import faults_kill
@@ -80,11 +79,11 @@ def test_a_log_with_a_torn_end_is_readable_and_one_with_a_hole_is_not(tmp_path: 
 def test_a_kill_that_was_not_remembered_and_a_torn_state_are_reported(tmp_path: Path) -> None:
     kept = board(tmp_path)
     store = StateStore(kept.state, lambda *_: None)
-    first = history.begin(StoredState(), "")
+    first = begin_boot(StoredState(), "")
     store.store(first)
     assert faults_kill._state_of(kept, counted=True) == {"whole": True, "counted": True}
     assert not faults_kill._state_of(kept, counted=True)["counted"], "the next boot did not count itself"
-    second = history.begin(first, "")
+    second = begin_boot(first, "")
     store.store(msgspec.structs.replace(second, unclean=()))
     assert not faults_kill._state_of(kept, counted=True)["counted"]
     store.store(second)

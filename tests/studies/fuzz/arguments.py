@@ -30,8 +30,8 @@ from unittest import mock
 
 from flight.app import cli
 from flight.app import flight as flown
+from flight.app.accepted_config import requested_config
 from flight.app.request import RunRequest, RunResult
-from flight.app.requested_config import requested_config
 from flight.link.telemetry.segments import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS

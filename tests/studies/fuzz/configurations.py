@@ -116,9 +116,9 @@ def _excerpt(draw: Draw, tree: dict[str, Any]) -> dict[str, Any]:
 
 def _set_up(config: Config) -> None:
     """Make of a configuration what a flight makes of it first."""
-    from flight.app.composition.workers import workers  # noqa: PLC0415
+    from flight.app.composition import workers  # noqa: PLC0415
     from flight.app.devices import coil_settings, unit_settings  # noqa: PLC0415 - the whole flight hangs on it
-    from flight.bodies.testbed.plant_model import plant_of  # noqa: PLC0415
+    from flight.bodies.testbed.thread import plant_of  # noqa: PLC0415
 
     coils, unit = coil_settings(config), unit_settings(config)
     workers(config)

@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.accepted_config import accepted_config, sum_file
-from flight.app.kept_configs import FOLDER as FLOWN
-from flight.app.kept_configs import kept_configs
-from flight.app.release import TRIALS, Release
+from flight.app.accepted_config import FOLDER as FLOWN
+from flight.app.accepted_config import accepted_config, kept_configs, sum_file
+from flight.app.service import TRIALS, Release
 from flight.link.process.timetable import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed

@@ -19,7 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 from flight.app.cli import main
-from flight.app.patient_start import Patience
+from flight.app.service import Patience
 from flight.link.process.station import Station
 from tests.flight.app.cli.linked_board import write_linked_config
 

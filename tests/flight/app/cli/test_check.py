@@ -16,7 +16,7 @@ import yaml
 
 from flight.app.cli.check import flight_problems
 from flight.app.request import RunResult
-from flight.loop.ending import Ending
+from flight.loop.flight_status import Ending
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import DEMO, ROOT
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter
-from flight.bodies.orbit.replay import OrbitFilterSettings
-from flight.bodies.orbit.steps import DipoleHistory
+from flight.bodies.orbit.filter_steps import DipoleHistory, OrbitFilterSettings
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

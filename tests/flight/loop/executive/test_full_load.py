@@ -21,9 +21,9 @@ import numpy.typing as npt
 import pytest
 
 from flight.app import opening
-from flight.app.composition.workers import workers
+from flight.app.composition import workers
 from flight.loop.executive.jobs import Worker
-from flight.loop.executive.supervisor import ProcessRunner
+from flight.loop.executive.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from hal.buses.clock import SystemClock
 from tests.hal.guardian.live_flight import ROOT

@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.loop.executive.attempts import BUDGET, STEADY_NS, Attempts
-from flight.loop.executive.jobs import Change, JobResult, JobRunner, Worker, WorkerNews
-from flight.loop.executive.lockstep import LockStepRunner
-from flight.loop.executive.supervisor import ProcessRunner
+from flight.loop.executive.jobs import Change, JobResult, JobRunner, LockStepRunner, Worker, WorkerNews
+from flight.loop.executive.worker_processes import BUDGET, STEADY_NS, Attempts, ProcessRunner
 from hal.buses.clock import SystemClock
 from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
@@ -195,7 +193,7 @@ def test_restarts_come_at_growing_intervals_within_a_budget_and_a_new_one_after_
 _ORPHANED = """
 import sys, time
 from flight.loop.executive.jobs import Worker
-from flight.loop.executive.supervisor import ProcessRunner
+from flight.loop.executive.worker_processes import ProcessRunner
 from hal.buses.clock import SystemClock
 from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
@@ -225,7 +223,7 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
 _STARTED = """
 import os, signal, time
 from flight.loop.executive.jobs import Worker
-from flight.loop.executive.processes import WorkerProcess
+from flight.loop.executive.worker_processes import WorkerProcess
 from tests.flight.loop.executive.odd_jobs import hang
 process = WorkerProcess(Worker("hang", hang, 0, 10**12)).process_id
 os.kill(process, signal.SIGSTOP)

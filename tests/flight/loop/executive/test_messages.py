@@ -15,8 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.loop.executive import values
-from flight.loop.executive.messages import message_length, pack_values, unpack_values
+from flight.loop.executive.messages import (
+    decode_values,
+    encode_values,
+    message_length,
+    pack_values,
+    unpack_values,
+)
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Lens
 from knightcube.vision.startracker.detection.detect import Quality
@@ -111,14 +116,14 @@ def test_bytes_that_are_no_value_of_ours_are_refused(tree: Any) -> None:
 
 
 def test_a_class_is_built_without_a_call_of_its_own_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, _ = values.encode(LENS)
+    data, _ = encode_values(LENS)
 
     def never(*_: object) -> None:
         raise AssertionError("it was called")
 
     for name in ("__init__", "__post_init__", "__setattr__"):
         monkeypatch.setattr(Lens, name, never, raising=False)
-    assert values.decode(data, []) == LENS
+    assert decode_values(data, []) == LENS
 
 
 @given(st.binary(max_size=200), st.integers(0, 400))

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.loop.fdir.coils.response import CoilResponse, ResponseSettings
-from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.loop.fdir.coil_response import CoilResponse, ResponseSettings
+from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from knightcube.astro.arrays import FloatArray
 
 FIELD = np.array([0.0, 0.0, 60e-6])

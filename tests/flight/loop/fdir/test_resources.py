@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from flight.loop.fdir import facts
-from flight.loop.fdir.board import Board
-from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceSample
+from flight.loop.fdir.resources import Board, ClockWatch, ResourceMonitor, ResourceSample
 from flight.schema.sections import Health
 from tests.flight.loop.fdir.test_facts import EventRecord
 

@@ -20,8 +20,7 @@ from hypothesis import strategies as st
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.state.content import Learned, StoredState, UncleanShutdown
-from flight.loop.state.files import LinuxFiles
-from flight.loop.state.store import COPIES, StateStore, decode, encode
+from flight.loop.state.store import COPIES, LinuxFiles, StateStore, decode, encode
 from tests.flight.loop.state.disk import Disk, PowerLostError
 
 FOLDER = Path("/state")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.tracker import controller_of
+from flight.bodies.testbed.control import controller_of
 from flight.schema.testbed import Control, Identification
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis.lq_tracker import LqTracker

@@ -1,1 +1,0 @@
-"""Builds settings and tasks from a configuration."""

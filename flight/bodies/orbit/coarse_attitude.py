@@ -1,0 +1,339 @@
+"""Coarse directions: solar cells with the magnetic field, and Sun and nadir of the wide cameras.
+
+They start the filter without a star, and update it while it is not fine.
+
+An attitude by field and solar cells has a covariance that covers every turn that is possible while any one
+cell fails (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for minutes: a
+measurement of theirs is used only if it is more accurate than the filter, so that repetition never reduces
+the filter's covariance. Two directions that contradict an estimate which no stars made fine, several times in
+a row, start the filter again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.schema.camera_model import camera_model
+from flight.schema.orbit_devices import WideCamera
+from hal.interfaces.readings import Frame, StringReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro import chi_square
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeError
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
+from knightcube.gnc.estimation.estimate import TURN, Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.horizon.response import LogarithmicResponse
+from knightcube.vision.sun.field_and_strings import FieldAndStrings, Sky, StringFix
+from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.wide_job import Sighted, WideFound, WideJob
+
+PERIOD_NS = 5 * SECOND_NS
+"""Between readings that are judged: more often they say nothing new."""
+OVERHEAD_ALBEDO = 0.2
+"""Light of an Earth lit from overhead, over the Sun's: an albedo of 0.3, two thirds of half the sky."""
+CLOUDS = 0.5
+"""By which share the Earth's light varies."""
+LEAST_ALBEDO = 0.02
+STUCK = 3
+"""Readings in a row that are the same to the last bit: their noise never is."""
+SUNLIT = 0.99
+"""Share of the Sun's disc from which the strings are expected to see it."""
+CONTRADICTED = 3
+"""Attitudes or rounds in a row that contradict an estimate that is not fine: the filter starts again."""
+GATE = 30.7
+"""Chi-square of three axes (1e-6) from which an attitude contradicts the estimate."""
+START_SIGMA = np.radians(5.0)
+"""rad, of the turn about the field, from which the filter starts."""
+STRENGTH_SIGMA = 5.0
+"""Sigmas by which the field may be stronger or weaker than its model says."""
+
+
+class CoarseSunFeed:
+    """Gives the filter the attitude by field and strings."""
+
+    def __init__(
+        self, strings: SolarStrings, period_ns: int, filter_: OrbitFilter, surroundings: Surroundings
+    ) -> None:
+        """`period_ns`: of a round of readings, which are not of one instant."""
+        self.strings = strings
+        self.newest: StringReading | None = None
+        self._turns = FieldAndStrings(strings)
+        self._period_ns = period_ns
+        self._filter = filter_
+        self._surroundings = surroundings
+        self._judged_ns = -PERIOD_NS
+        self._against = 0
+        self._last: list[float] = []
+        self._same = 0
+
+    def accept(self, reading: StringReading) -> str | None:
+        """Take a reading; return what it shows to be wrong, empty for nothing, None where not judged."""
+        self.newest = reading
+        time_ns = reading.time_ns - self._period_ns // 2
+        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        if around is None or sun is None or around.sunlit < SUNLIT:
+            return None
+        currents = reading.currents.tolist()
+        self._same, self._last = (self._same + 1 if currents == self._last else 0), currents
+        if self._same >= STUCK:
+            return "the strings give the same currents in every reading"
+        if time_ns - self._judged_ns < PERIOD_NS:
+            return None
+        heard = self._filter.heard_field()
+        turned = None if heard is None else self._filter.turned(heard[0].time_ns, time_ns)
+        if heard is None or turned is None:
+            return None
+        self._carry_on(time_ns)
+        (field, gyro), sky = heard, _sky(around, sun)
+        seen = attitude_matrix(turned) @ field.field
+        sigma = float(np.sqrt(field.covariance[0, 0]))
+        excess = float(np.linalg.norm(seen) - np.linalg.norm(sky.field))
+        if abs(excess) > STRENGTH_SIGMA * sigma:
+            self._turns.forget()
+            return f"the field is {excess * 1e6:+.1f} uT off its model: no attitude by it"
+        # A round is as long as a period: its readings are of a turning body.
+        blur = float(np.linalg.norm(gyro)) * self._period_ns / SECOND_NS / np.sqrt(12.0)
+        fix = self._turns.accept(reading.currents, seen, sigma, sky, blur)
+        if fix is not None and self._filter.knowledge is not Knowledge.FINE:
+            self._use(time_ns, fix, sun)
+        return self._turns.wrong
+
+    def _carry_on(self, time_ns: int) -> None:
+        """Carry the possible turns on to the time of a reading."""
+        since_ns, self._judged_ns = self._judged_ns, time_ns
+        turned = self._filter.turned(since_ns, time_ns)
+        if turned is None:
+            self._turns.forget()
+        else:
+            self._turns.turn(turned, (time_ns - since_ns) / SECOND_NS)
+
+    def _use(self, time_ns: int, fix: StringFix, sun: FloatArray) -> None:
+        """Start the filter from an attitude, or feed it the turn about the field."""
+        if not self._filter.runs or self._against >= CONTRADICTED:
+            doubted, self._against = self._against >= CONTRADICTED, 0
+            if fix.about <= START_SIGMA:
+                attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+                self._filter.begin(attitude, doubted=doubted)
+            return
+        then = self._filter.past(time_ns)
+        if then is None:  # the filter began after this reading
+            return
+        claim = then.covariance[TURN, TURN]
+        off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))
+        contradicts = float(off @ np.linalg.solve(claim + fix.covariance, off)) > GATE
+        self._against = self._against + 1 if contradicts else 0
+        if not contradicts and float(fix.axis @ claim @ fix.axis) > fix.about**2:
+            seen = attitude_matrix(fix.quaternion) @ sun
+            covariance = fix.about**2 * np.eye(3)
+            self._filter.measure_late([DirectionMeasurement(time_ns, seen, sun, covariance)], lambda _: None)
+
+
+def _sky(around: Around, sun: FloatArray) -> Sky:
+    """Return the directions and the light of the Earth below, with clouds that are not known."""
+    up = around.position / np.linalg.norm(around.position)
+    light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
+    return Sky(around.field, sun, -up, light, CLOUDS * light)
+
+
+DIRECTIONS_START_SIGMA = math.radians(15.0)
+"""rad, of the worst axis, to which an attitude starts the filter: less says where the Earth is, no more."""
+NEEDED_SIGMA = math.radians(0.05)
+"""rad, of the worst axis, beyond which directions of 0.01 to 0.04 deg are worth their work."""
+ROUGH_SIGMA = 0.3
+"""rad, to which an estimate helps to find the horizon."""
+IMPROBABLE = 1e-6
+"""Chance by which directions do not make one attitude."""
+STRINGS_AGE_NS = 2 * SECOND_NS
+FIELD_SIGMA = 0.03
+"""rad, at least, of the field's direction where the horizon is looked for."""
+
+
+class WideFeed:
+    """Implements `flight.loop.body.WideSight`."""
+
+    def __init__(
+        self,
+        cameras: Sequence[MountedCamera],
+        lens_error: float,
+        filter_: OrbitFilter,
+        surroundings: Surroundings,
+        sun: CoarseSunFeed | None,
+        response: LogarithmicResponse | None,
+    ) -> None:
+        """`lens_error` rad an axis is what calibration leaves; `sun` has the strings' newest reading.
+
+        `response` of all cameras to light; None: linear.
+        """
+        self._cameras = tuple(cameras)
+        self._lens = lens_error**2 * np.eye(3)
+        self._filter = filter_
+        self._surroundings = surroundings
+        self._sun = sun
+        self._response = response
+        self._against = 0
+
+    @property
+    def needed(self) -> bool:
+        """Whether the cameras are to be read often: in the shadow only while the attitude is lost."""
+        if self._filter.worst_sigma <= NEEDED_SIGMA:
+            return False
+        around = self._surroundings.at(self._filter.measured_ns)
+        dark = around is not None and around.sunlit <= 0.0
+        return not dark or self._filter.knowledge is Knowledge.LOST
+
+    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+        """Return the worker's job for frames of one instant, with what is known of their time."""
+        times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
+        time_ns = sum(times) // len(times)
+        pixels = {number: frame.pixels for number, frame in frames.items()}
+        return WideJob(pixels, self._cameras, self._known(time_ns), self._strings(time_ns), self._response)
+
+    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+        """Start the filter from Sun, nadir and field, or feed it; return whether Sun and nadir were used."""
+        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        if around is None or sun is None:
+            return False, False
+        down = -around.position / np.linalg.norm(around.position)
+        seen = [
+            None if one is None else Sight(one.direction, reference, one.covariance + self._lens)
+            for one, reference in ((found.sun, sun), (found.nadir, down))
+        ]
+        if not self._filter.runs or self._against >= CONTRADICTED:
+            began = self._begin(time_ns, [one for one in seen if one is not None])
+            return began and seen[0] is not None, began and seen[1] is not None
+        then = self._filter.past(time_ns)
+        if then is None:
+            return False, False
+        # The strings' own Sun reaches the filter with the field (`coarse_sun`).
+        mine = [None if _is_of_strings(found.sun) else seen[0], seen[1]]
+        claim, turn = then.covariance[TURN, TURN], attitude_matrix(then.quaternion)
+        refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
+        self._judge(mine, refused)
+        sun_used, nadir_used = (
+            one is not None and not against and _says_more(one, claim) and self._use(time_ns, one)
+            for one, against in zip(mine, refused, strict=True)
+        )
+        return sun_used, nadir_used
+
+    def _judge(self, seen: Sequence[Sight | None], refused: Sequence[bool]) -> None:
+        """Count the rounds in a row that contradict an estimate that no stars made fine."""
+        if self._filter.knowledge is Knowledge.FINE:
+            self._against = 0
+        elif any(one is not None for one in seen):
+            self._against = self._against + 1 if any(refused) else 0
+
+    def _begin(self, time_ns: int, seen: list[Sight]) -> bool:
+        """Start the filter from the attitude of all directions, where they fix one and agree."""
+        field = self._field_sight(time_ns)
+        sights = seen if field is None else [*seen, field]
+        if not seen or len(sights) < 2:
+            return False
+        try:
+            fix = optimum(sights)
+        except (AttitudeError, np.linalg.LinAlgError):
+            return False
+        if 2.0 * fix.loss > chi_square.bound(IMPROBABLE, 2 * len(sights) - 3):
+            return False
+        if math.sqrt(float(np.linalg.eigvalsh(fix.covariance)[-1])) > DIRECTIONS_START_SIGMA:
+            return False
+        doubted, self._against = self._against >= CONTRADICTED, 0
+        attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+        return self._filter.begin(attitude, doubted=doubted)
+
+    def _use(self, time_ns: int, sight: Sight) -> bool:
+        measured = DirectionMeasurement(time_ns, sight.observed, sight.reference, sight.covariance)
+        taken: list[bool] = []
+        self._filter.measure_late([measured], taken.extend)
+        return any(taken)
+
+    def _field_sight(self, time_ns: int) -> Sight | None:
+        """Return the direction of the magnetic field at a time, None without a recent one."""
+        heard = self._filter.heard_field()
+        turned = None if heard is None else self._filter.turned(heard[0].time_ns, time_ns)
+        around = self._surroundings.at(time_ns)
+        if heard is None or turned is None or around is None:
+            return None
+        try:
+            return field_sight(attitude_matrix(turned) @ heard[0].field, around.field, heard[0].covariance)
+        except AttitudeError:
+            return None
+
+    def _known(self, time_ns: int) -> HorizonKnowledge:
+        """Return what is known of place, Sun, field and attitude at a time, in body axes."""
+        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        if around is None or sun is None:
+            return HorizonKnowledge()
+        field = self._field_sight(time_ns)
+        sensed: tuple[SensedDirection, ...] = ()
+        if field is not None:
+            sensed = (SensedDirection(field.observed, field.reference, math.hypot(field.sigma, FIELD_SIGMA)),)
+        then, rough = self._filter.past(time_ns) if self._filter.runs else None, None
+        if then is not None:
+            sigma = math.sqrt(max(float(np.linalg.eigvalsh(then.covariance[TURN, TURN])[-1]), 0.0))
+            rough = RoughAttitude(then.quaternion, sigma) if sigma < ROUGH_SIGMA else None
+        return HorizonKnowledge(position=around.position, sun=sun, attitude=rough, sensed=sensed)
+
+    def _strings(self, time_ns: int) -> tuple[SolarStrings, FloatArray] | None:
+        newest = None if self._sun is None else self._sun.newest
+        if self._sun is None or newest is None or abs(newest.time_ns - time_ns) > STRINGS_AGE_NS:
+            return None
+        return self._sun.strings, newest.currents
+
+
+def wide_feed_of(
+    sections: Sequence[WideCamera],
+    filter_: OrbitFilter,
+    surroundings: Surroundings,
+    sun: CoarseSunFeed | None,
+) -> WideFeed:
+    """Return the feed of configured cameras."""
+    cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
+    error = math.radians(max(one.lens_error_deg for one in sections))
+    first, response = sections[0], None
+    if first.response == "logarithmic":
+        response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
+    return WideFeed(cameras, error, filter_, surroundings, sun, response)
+
+
+def _is_of_strings(sun: Sighted | None) -> bool:
+    return sun is not None and not sun.cameras
+
+
+def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a direction's departure (2,) from an attitude (3, 3), its covariance and the claim's (2, 2)."""
+    expected = turn @ sight.reference
+    across = tangent_basis(expected)
+    # A turn e moves the direction d by d x e.
+    rows = across @ np.cross(expected, np.eye(3)).T
+    return across @ sight.observed, across @ sight.covariance @ across.T, rows @ claim @ rows.T
+
+
+def _contradicts(sight: Sight, turn: FloatArray, claim: FloatArray) -> bool:
+    """Return whether a direction and an attitude with its claim (3, 3) exclude one another."""
+    off, own, known = _spread(sight, turn, claim)
+    behind = float(sight.observed @ turn @ sight.reference) < 0.0
+    return behind or float(off @ np.linalg.solve(own + known, off)) > chi_square.bound(IMPROBABLE, 2)
+
+
+def _says_more(sight: Sight, claim: FloatArray) -> bool:
+    """Return whether a direction is known better across some axis than the claim (3, 3) has it."""
+    across = tangent_basis(sight.observed)
+    rows = across @ np.cross(sight.observed, np.eye(3)).T
+    known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T
+    return float(np.linalg.eigvals(np.linalg.solve(own, known)).real.max()) > 1.0

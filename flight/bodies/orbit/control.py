@@ -1,0 +1,200 @@
+"""The control laws of a satellite in orbit: detumbling, turning to the Sun in SAFE, and pointing.
+
+Detumbling follows the momentum plan in the measured field, or in the field expected ahead. SAFE turns to the
+Sun by solar cells, gyro and measured field, without orbit, attitude or clock. Pointing follows the pointing
+law along its path; far off its path the body is held still instead
+(`knightcube.gnc.control.three_axes.astray`).
+
+While pointing, the coils pause at the beginning of each window, so that the magnetometer is read without
+their field; then one dipole, computed at the pause's end, is held. The dipole is increased to make up for the
+pause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.filter import FieldDoubt, OrbitFilter
+from flight.bodies.orbit.guidance import PathPoint
+from flight.link import events
+from flight.loop.body import CoilCommand
+from flight.loop.fdir.facts import EventLog
+from hal.interfaces.readings import StringReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler
+from knightcube.gnc.control.three_axes.pointing_law import damping_dipole
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.vision.sun.strings import SolarStrings, coarse_sun
+
+
+class FieldBrake:
+    """Commands the detumbler's dipole; implements `flight.loop.body.Brake`."""
+
+    def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
+        """Take n A of each coil, m^2."""
+        self.detumbler = detumbler
+        self._dipole_per_ampere = dipole_per_ampere
+        self._doubt = FieldDoubt()
+
+    def begin(self, now_ns: int) -> None:
+        """Begin with no knowledge of the field."""
+        self.detumbler.begin(now_ns)
+
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        if self._doubt.sees(field):
+            self.detumbler.sample(time_ns, field, rate)
+
+    def command(self, now_ns: int) -> CoilCommand:
+        """Return the command now: zero where the magnetometer is stuck."""
+        dipole = self.detumbler.dipole(now_ns)
+        if self._doubt.stuck:
+            dipole = np.zeros(3)
+            self.detumbler.acts(dipole)
+        return CoilCommand(dipole, dipole / self._dipole_per_ampere)
+
+    def sent(self, currents: FloatArray) -> None:
+        """Let the rate follow the currents (3,) A that flow: a coil that is left out turns nothing."""
+        self.detumbler.acts(currents * self._dipole_per_ampere)
+
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the field (3,) T in body axes at the last command; None before it is known."""
+        return self.detumbler.field
+
+
+def expected_field(
+    filter_: OrbitFilter, surroundings: Surroundings, instants: FloatArray
+) -> Callable[[int], FloatArray | None]:
+    """Return what gives the field (n, 3) T at `instants` (n,) s after a time, in the body axes of then.
+
+    It gives None while attitude or orbit are not known.
+    """
+    field = FieldAhead()
+
+    def expected(now_ns: int) -> FloatArray | None:
+        state = surroundings.state(now_ns)
+        if state is None or surroundings.at(now_ns) is None or not filter_.started:
+            return None
+        ahead = field.along(state, instants)
+        return np.asarray(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T)
+
+    return expected
+
+
+class StringSeeker:
+    """Commands the seeker's dipole and says whether it has a Sun; implements `flight.loop.body.Brake`."""
+
+    def __init__(
+        self, seeker: SunAcquisition, strings: SolarStrings, dipole_per_ampere: float, log: EventLog
+    ) -> None:
+        """Take n A of each coil, m^2."""
+        self._seeker, self._strings = seeker, strings
+        self._dipole_per_ampere = dipole_per_ampere
+        self._doubt = FieldDoubt()
+        self._events = log
+        self._found: bool | None = None
+        self._reason = "the strings give no readings"
+
+    def begin(self, now_ns: int) -> None:
+        """Begin with no knowledge of the field."""
+        self._seeker.begin(now_ns)
+
+    def see(self, reading: StringReading) -> None:
+        """Accept a reading of the strings, whatever the mode."""
+        found = coarse_sun(reading.currents, self._strings)
+        self._reason = found.reason
+        if found.direction is not None:
+            self._seeker.see(reading.time_ns, found.direction)
+
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        if self._doubt.sees(field):
+            self._seeker.sample(time_ns, field, rate)
+
+    def command(self, now_ns: int) -> CoilCommand:
+        """Return the command now; without a Sun it only holds the body still, by a stuck field nothing."""
+        found = self._seeker.sun is not None
+        if found is not self._found:
+            self._found = found
+            if found:
+                self._events.report(events.SUN_FOUND, now_ns, "by the solar strings")
+            else:
+                self._events.report(events.SUN_MISSED, now_ns, self._reason)
+        dipole = self._seeker.dipole(now_ns)
+        if self._doubt.stuck:
+            dipole = np.zeros(3)
+            self._seeker.acts(dipole)
+        return CoilCommand(dipole, dipole / self._dipole_per_ampere)
+
+    def sent(self, currents: FloatArray) -> None:
+        """Take what went to the coils (3,) A."""
+        self._seeker.acts(currents * self._dipole_per_ampere)
+
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the field (3,) T in body axes at the last reading; None before it is known."""
+        return self._seeker.field
+
+
+_NOTHING: FloatArray = np.zeros(3)
+
+
+class PointingTracker:
+    """Implements `flight.loop.body.Tracker`."""
+
+    def __init__(
+        self,
+        filter_: OrbitFilter,
+        surroundings: Surroundings,
+        pauses: WindowSchedule,
+        limit: float,
+        dipole_per_ampere: float,
+        inertia: FloatArray,
+    ) -> None:
+        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil; `inertia` (3,) kg m^2 of the body axes."""
+        self._inertia = inertia
+        self._filter, self._surroundings = filter_, surroundings
+        self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
+        self._held = CoilCommand(_NOTHING, _NOTHING)
+        self._window: tuple[int, object] | None = None
+
+    def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
+        """Return the command of the present window: zero in its pause."""
+        pauses, now_ns = self._pauses, reference.time_ns
+        if now_ns % pauses.period_ns < pauses.settle_ns + pauses.measure_ns:
+            return CoilCommand(_NOTHING, _NOTHING)
+        window = (now_ns // pauses.period_ns, reference.law)
+        if window != self._window:
+            self._window, self._held = window, self._command(estimate, reference)
+        return self._held
+
+    def reset(self) -> None:
+        """Forget the command that is held."""
+        self._window = None
+
+    def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
+        around = self._surroundings.at(reference.time_ns)
+        if around is None:
+            return CoilCommand(_NOTHING, _NOTHING)
+        residual = self._filter.residual_dipole
+        field = attitude_matrix(estimate.quaternion) @ around.field
+        quaternion, rate = estimate.quaternion, estimate.rate
+        found = reference.law.command(
+            reference.seconds, quaternion, rate, field, residual, self._filter.torque_sizes
+        )
+        dipole = found.dipole
+        if not reference.paths.led(found.turn, rate, reference.time_ns):
+            dipole = damping_dipole(self._inertia, rate, field) - residual
+        # The mean over the window is what was asked for.
+        dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
+        largest = float(np.abs(dipole).max())
+        saturated = largest > self._limit
+        if saturated:
+            dipole = dipole * (self._limit / largest)
+        return CoilCommand(dipole, dipole / self._dipole_per_ampere, saturated)

@@ -1,0 +1,487 @@
+"""Guidance of a satellite: targets, the path that is flown, and plans requested from the planner worker.
+
+A path is a table of the pointing law. A table is made when a target is set, when the attitude is known again,
+when the body leaves its path, and periodically: the orbit's prediction ages, and a free roll follows the
+body's own.
+
+A satellite that follows an object points to the place of the search, then to the track of the object. Without
+a track the boresight stays at the place of the search. Of several tracks the brightest is followed, until it
+ends. The body is steered by the track's prediction, so it goes on while the object is not detected.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.bodies.orbit.environment import Surroundings
+from flight.link import events
+from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
+from flight.loop.executive.executive import Cycle
+from flight.loop.executive.jobs import JobResult
+from flight.loop.fdir.facts import EventLog
+from flight.loop.services import Services
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, attitude_matrix
+from knightcube.errors import UsageError
+from knightcube.gnc.control.three_axes.pointing_job import STEADY, ObjectDirection, PointingJob, SlewRequest
+from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference, BodyAxes
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.tracking.tracker import Track
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPoint:
+    """The path at one time of the clock, `seconds` after its origin; implements `Reference` of the loop."""
+
+    paths: PointingPaths
+    law: PointingLaw
+    time_ns: int
+    seconds: float
+
+    @property
+    def motion(self) -> AttitudeReference:
+        """The wanted motion."""
+        return self.law.reference(self.seconds)
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """(4,) ICRS into body."""
+        return self.motion.quaternion
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """(3,) rad/s, body axes."""
+        return self.motion.rate
+
+
+class PointingPaths:
+    """Implements `flight.loop.body.Paths`.
+
+    Attributes:
+        off: rad, how far the body was off the path at the last command; zero for a new path.
+        astray: whether it is held still because of that.
+    """
+
+    def __init__(self, limit: float, fastest: float) -> None:
+        """`limit` A m^2 of each coil, mean over a window; `fastest` rad/s, of no path to be reached."""
+        self._limit, self._fastest = limit, fastest
+        self._law: PointingLaw | None = None
+        self._target: PointingTarget | None = None
+        self._origin_ns = 0
+        self._arrival_ns: int | None = None
+        self.off = 0.0
+        self.astray = PathRecovery()
+
+    def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
+        """Fly a table, or its part that is slow enough; return why it is refused, empty when it is flown."""
+        parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
+        if not all(np.isfinite(part).all() for part in parts):
+            return "it holds values that are not finite"
+        flown = table.below(self._fastest)
+        if flown is None:
+            turn, most = np.rad2deg([table.fastest, self._fastest])
+            return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
+        self._law, self._target, self._origin_ns = PointingLaw(flown, self._limit), target, origin_ns
+        self.off, self._arrival_ns = 0.0, None
+        self.astray.planned()
+        if table.slew is not None:
+            self._arrival_ns = origin_ns + round((self._law.span[0] + table.slew.horizon) * SECOND_NS)
+        return ""
+
+    def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
+        """Take the turn (3,) off the path and the rate (3,); return whether it is flown: not while astray."""
+        self.off = float(np.linalg.norm(turn))
+        self.astray.see(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
+        return self.astray.since is None
+
+    def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:
+        """Return whether a slew to a target is flown and not over."""
+        return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
+
+    def has_arrived(self, now_ns: int) -> bool:
+        """Return whether a slew is over: once for each."""
+        over = self._arrival_ns is not None and now_ns >= self._arrival_ns
+        if over:
+            self._arrival_ns = None
+        return over
+
+    def sample(self, now_ns: int) -> PathPoint | None:
+        """Return the path now; None without one, or after its end."""
+        if self._law is None:
+            return None
+        seconds = (now_ns - self._origin_ns) / SECOND_NS
+        return PathPoint(self, self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
+
+    def attitude(self, target: PointingTarget, now_ns: int) -> FloatArray | None:
+        """Return the attitude (4,) of a target now; None while no path to this target is flown."""
+        point = self.sample(now_ns)
+        if point is None or target != self._target:
+            return None
+        return point.law.wanted(point.seconds).quaternion
+
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether there is a path: all of it is followed."""
+        return self.sample(now_ns) is not None
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Return False: the coils rest after the end of a path."""
+        return False
+
+    def release(self) -> None:
+        """Discard the path."""
+        self._law = self._target = self._arrival_ns = None
+        self.astray.planned()
+
+
+@dataclass(frozen=True, slots=True)
+class PointingLawOf:
+    """The attitude of a target over time, by the path that is flown to it; implements `AttitudeLaw`."""
+
+    target: PointingTarget
+    paths: PointingPaths
+
+    @property
+    def text(self) -> str:
+        """The target as text."""
+        return self.target.text
+
+    def quaternion(self, now_ns: int) -> FloatArray:
+        """Return the attitude (4,), ICRS into body; NaN before the first path to the target."""
+        found = self.paths.attitude(self.target, now_ns)
+        return np.full(4, np.nan) if found is None else found
+
+
+def target_of(target: Target) -> PointingTarget:
+    """Return the pointing target of a target of this body."""
+    law = target.law
+    assert isinstance(law, PointingLawOf), "only the satellite's own targets reach its planner"
+    return law.target
+
+
+class PointingTargets:
+    """Implements `flight.loop.body.Targets`."""
+
+    def __init__(
+        self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
+    ) -> None:
+        """Take the configured targets, each with its mission time in s, in order; the first is at 0."""
+        self._looks_for_objects = looks_for_objects
+        self._paths = paths
+        self._times = [round(at * 1e9) for at, _ in timed]
+        self._steps = [Target(k, PointingLawOf(target, paths)) for k, (_, target) in enumerate(timed)]
+
+    def configured(self, mission_time_ns: int) -> Target:
+        """Return the configured target in force at a mission time."""
+        return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
+
+    def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
+        """Return the target of command `number`. Raises UsageError for a q2."""
+        if not isinstance(wanted, PointingTarget):
+            raise UsageError("a satellite points to a goal, not to a q2")
+        if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
+            raise UsageError("no star camera looks for objects: `camera: {star_tracker: {}, objects: {}}`")
+        return Target(COMMANDED + number, PointingLawOf(wanted, self._paths))
+
+    def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
+        """Return the present attitude as a target."""
+        qx, qy, qz, qw = estimate.quaternion.tolist()
+        return Target(KEPT, PointingLawOf(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
+
+    def can_hold(self, estimate: Estimate) -> bool:
+        """Return True: every attitude can be held in the mean over a revolution."""
+        return True
+
+    def speed(self, estimate: Estimate) -> float:
+        """Return the rate, rad/s."""
+        return float(np.linalg.norm(estimate.rate))
+
+    def error(self, estimate: Estimate, target: Target) -> float:
+        """Return the angle between body and target, rad; zero before there is a path."""
+        wanted = target.law.quaternion(estimate.time_ns)
+        return 0.0 if np.isnan(wanted[0]) else float(angle_between(estimate.quaternion, wanted))
+
+    def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
+        """Return None: coils alone reach a target when the field allows."""
+        return None
+
+
+EFFORT = 0.25
+"""Of the coils' limit: the dipole that costs as much as the error of pointing that costs one."""
+ROLL = math.radians(20.0)
+"""rad about the boresight that cost as much: the field has no corners that matter."""
+RATE = math.radians(1.0)
+"""rad/s off the object's that cost as much: a body that rolls fast blurs the stars at the field's edge."""
+FORESIGHT = 30.0
+"""s ahead that an object is judged to leave the field; farther off a young track is not believed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensor:
+    """The star camera: its boresight (3,), body axes, and rad from there to the nearest edge."""
+
+    boresight: FloatArray
+    half_field: float
+
+
+class ObjectAim:
+    """Directs the planner's jobs while the target is an object.
+
+    Attributes:
+        seeks: whether it is.
+        moved: whether there is news for the planner.
+    """
+
+    def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
+        """`sensor` None: none looks for objects; `limit` A m^2 of each coil."""
+        self._sensor, self._limit, self._events = sensor, limit, log
+        self._target: PointingTarget | None = None
+        self._place: FloatArray | None = None
+        self._tracks: tuple[Track, ...] = ()
+        self._followed = 0
+        self._escapes = False
+        self.seeks = self.moved = False
+
+    def aim(self, target: PointingTarget) -> None:
+        """Set the target."""
+        if target == self._target:
+            return
+        self._target, self._place = target, None
+        self._followed, self._escapes, self.moved = 0, False, False
+        self.seeks = target.goal is Goal.OBJECT and self._sensor is not None
+
+    def accept(self, tracks: Sequence[Track], now_ns: int) -> None:
+        """Accept the confirmed tracks after a frame, and choose the one to follow."""
+        self._tracks = tuple(tracks)
+        if not self.seeks:
+            return
+        before = self._followed
+        if self._track() is None:
+            found = min(tracks, key=lambda track: np.nan_to_num(track.magnitude, nan=99.0), default=None)
+            self._followed, self._escapes = 0 if found is None else found.number, False
+            if found is not None:
+                text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
+                self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
+            elif before:
+                self._place = None  # looked for again where the body is by then, or where it was ordered
+        self.moved = self.moved or before > 0 or self._followed > 0
+
+    def directed(self, job: PointingJob) -> PointingJob:
+        """Return a job for the body's target, with what is pointed to where that is an object."""
+        sensor = self._sensor
+        self.moved = False
+        if not self.seeks or sensor is None:
+            return job
+        boresight = sensor.boresight
+        axes = BodyAxes(boresight, np.eye(3)[int(np.argmin(np.abs(boresight)))])
+        track = self._track()
+        if track is None:
+            place = self._searched(job.quaternion)
+            # Another axis would make it cheap to turn the boresight away.
+            weights = replace(job.weights, roll=ROLL, axis=boresight)
+            return replace(
+                job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
+            )
+        line = track.line
+        weights = replace(job.weights, dipole=EFFORT * self._limit, roll=ROLL, rate=RATE, axis=boresight)
+        since = (line.time_ns - job.origin_ns) / SECOND_NS
+        sight = ObjectDirection(line.direction, line.velocity, since)
+        return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
+
+    def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
+        """Report an object that the path of a table does not keep in the field."""
+        sensor, sight = self._sensor, job.sight
+        if sensor is None or sight is None or not sight.velocity.any():
+            return
+        near = table.path.times <= FORESIGHT
+        shown, wanted = (
+            attitude_matrix(motion.quaternion[near]).transpose(0, 2, 1) @ sensor.boresight
+            for motion in (table.path, table.wanted)
+        )
+        off = np.arccos(np.clip(np.sum(shown * wanted, axis=1), -1.0, 1.0))
+        outside = np.flatnonzero(off > sensor.half_field)
+        if len(outside) and not self._escapes:
+            first = int(outside[0])
+            fastest, needed, made = np.degrees(
+                [
+                    np.linalg.norm(values[near], axis=1).max()
+                    for values in (table.wanted.rate, table.wanted.acceleration, table.path.acceleration)
+                ]
+            )
+            text = (
+                f"object {self._followed} leaves the field in {table.path.times[first]:.0f} s: up to "
+                f"{fastest:.2f} deg/s and {needed:.4f} deg/s^2, the body makes {made:.4f}"
+            )
+            self._events.report(events.OBJECT_ESCAPES, now_ns, text)
+        self._escapes = bool(len(outside))
+
+    def _track(self) -> Track | None:
+        """Return the track that is followed, None when it has ended or none is."""
+        return next((track for track in self._tracks if track.number == self._followed > 0), None)
+
+    def _searched(self, quaternion: FloatArray) -> FloatArray:
+        """Return the direction (3,) of the search: the ordered one, or that of the camera when it began."""
+        if self._place is None:
+            assert self._target is not None
+            assert self._sensor is not None
+            if self._target.numbers:
+                right, up = self._target.numbers
+                across = math.cos(up)
+                place = [across * math.cos(right), across * math.sin(right), math.sin(up)]
+                self._place = np.array(place)
+            else:
+                self._place = attitude_matrix(quaternion).T @ self._sensor.boresight
+        return self._place
+
+
+AGAIN_NS = 10_000_000_000
+"""After a plan that failed, or while no orbit is known, the next is asked for after this time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedCraft:
+    """What the planner believes of the craft.
+
+    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action;
+    `slew` is how slews are wanted.
+    """
+
+    inertia: FloatArray
+    axes: BodyAxes
+    weights: PointingWeights
+    limit: float
+    slew: SlewRequest
+
+
+class PointingPlanner:
+    """Implements `flight.loop.body.Planner`."""
+
+    def __init__(
+        self,
+        craft: PlannedCraft,
+        paths: PointingPaths,
+        surroundings: Surroundings,
+        disturbed: Callable[[], tuple[FloatArray, FloatArray]],
+        objects: ObjectAim,
+        services: Services,
+    ) -> None:
+        """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
+        self._craft, self._paths, self._surroundings = craft, paths, surroundings
+        self._disturbed, self._objects = disturbed, objects
+        self._jobs, self._events = services.jobs, services.events
+        self._job: PointingJob | None = None
+        self._wanted = self._held = False
+        self._after_ns = 0
+        self._count = self._accepted = self._refused = 0
+
+    def busy_since_ns(self) -> int | None:
+        """Return since when the worker has been planning, None while idle."""
+        return None if self._job is None else self._job.origin_ns
+
+    def aim(self, target: Target, now_ns: int) -> None:
+        """Request a plan for a new target; the present path is flown until then."""
+        self._wanted, self._after_ns = True, now_ns
+
+    def request(self, now_ns: int) -> None:
+        """Request a plan."""
+        self._wanted = True
+
+    def resume(self, now_ns: int) -> None:
+        """Do nothing: the path goes on while there is no control."""
+
+    def replan(self, cycle: Cycle) -> None:
+        """Request the periodic plan: the task of the replanning rate group."""
+        self._wanted = True
+
+    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
+        """Submit the requested job to the worker."""
+        goal, astray = target_of(target), self._paths.astray
+        self._objects.aim(goal)
+        if astray.since is not None:
+            self._hold_still(now_ns)
+            if not astray.ready:
+                return
+        elif self._paths.is_slewing(now_ns, goal):
+            return  # the rest of a slew planned again costs many times its heat
+        if self._paths.has_arrived(now_ns):
+            text = f"{math.degrees(self._paths.off):.2f} deg off its path"
+            self._events.report(events.SLEW_ENDED, now_ns, text)
+            self._wanted = True
+        wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
+        if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
+            return
+        orbit, craft = self._surroundings.state(now_ns), self._craft
+        if orbit is None:
+            self._fail("no plan: the orbit is not known", now_ns)
+            return
+        sizes, residual = self._disturbed()
+        job = PointingJob(
+            self._count + 1,
+            now_ns,
+            orbit,
+            craft.inertia,
+            craft.axes,
+            craft.weights,
+            goal,
+            estimate.quaternion,
+            estimate.rate,
+            sizes,
+            craft.limit,
+            self._slew(goal, residual, now_ns),
+        )
+        job = self._objects.directed(job)
+        if self._jobs.submit(PLANNER, job):
+            self._wanted, self._job, self._count = False, job, job.number
+            self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
+
+    def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
+        """Return how a slew to a goal is wanted; None for a body on a path to it.
+
+        A path leaves its goal for a time where it meets torques along the field: no reason for a slew.
+        """
+        on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
+        return None if on_path else replace(self._craft.slew, residual=residual)
+
+    def _hold_still(self, now_ns: int) -> None:
+        """Report once that the body is held still."""
+        if not self._held:
+            text = f"{math.degrees(self._paths.off):.0f} deg off its path: held still, then planned for"
+            self._events.report(events.ASTRAY, now_ns, text)
+        self._held = True
+
+    def finish(self, result: JobResult, now_ns: int) -> None:
+        """Fly the worker's plan."""
+        job, self._job = self._job, None
+        if job is None:
+            return
+        if result.outcome != "done":
+            self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
+        elif self._paths.astray.since is not None and not self._paths.astray.ready:
+            self._wanted = True  # planned before the body went astray: another one once it is slow
+        elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
+            self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
+        else:
+            self._accepted, self._held = self._accepted + 1, False
+            self._objects.judge(job, result.value, now_ns)
+            if (slew := result.value.slew) is not None:
+                fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
+                text = f"to {job.target.text} in {slew.horizon:.0f} s, {fastest:.2f} deg/s at most"
+                self._events.report(events.SLEW_BEGUN, now_ns, text)
+
+    def counts(self) -> tuple[int, int]:
+        """Return how many plans were accepted and refused since the start."""
+        return self._accepted, self._refused
+
+    def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
+        """Report a plan that is not flown, and ask for another one after `wait_ns`: none for an object."""
+        self._refused += 1
+        self._wanted, self._after_ns = True, now_ns + wait_ns
+        self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -1,1 +1,0 @@
-"""Fault detection of the coils and their bridges."""

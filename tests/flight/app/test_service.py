@@ -1,0 +1,141 @@
+"""Only a configuration judged wrong ends a board's start; all else is waited for, the coils at zero."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flight.app import service as patient_start
+from flight.app.cli import main
+from flight.app.request import RunRequest
+from flight.app.service import Patience, StoppedError, patiently, pauses
+from flight.link.telemetry.packets import to_text
+from flight.loop.state.store import StateStore
+from flight.schema.errors import ConfigError, UnreadConfigError
+from ground.telemetry.reader import read_run
+from hal.interfaces.errors import NotResponding
+from knightcube.errors import UsageError
+from tests.hal.guardian.live_flight import write_config
+from tests.manual_clock import ManualClock
+
+
+def test_it_waits_twice_as_long_each_time_up_to_half_a_minute() -> None:
+    first = pauses()
+    found = [next(first) for _ in range(12)]
+    assert found[:8] == [0.2 * 2**number for number in range(8)]
+    assert found[8:] == [30.0] * 4
+
+
+class Attempts:
+    """Attempts that fail in turn; what each opened is closed before the next."""
+
+    def __init__(self, *failures: BaseException) -> None:
+        self.failures = list(failures)
+        self.open = 0
+
+    def judge(self) -> str:
+        if self.failures and isinstance(self.failures[0], ConfigError):
+            raise self.failures.pop(0)
+        return "right"
+
+    def __call__(self, judged: str, stack: ExitStack) -> str:
+        assert (judged, self.open) == ("right", 0)
+        self.open += 1
+        stack.callback(self.close)
+        if self.failures:
+            raise self.failures.pop(0)
+        return "flies"
+
+    def close(self) -> None:
+        self.open -= 1
+
+
+def test_what_may_pass_is_waited_for_and_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = ManualClock(0)
+    attempts = Attempts(
+        OSError(5, "Input/output error"),
+        NotResponding("i2c", "another flight"),
+        UnreadConfigError("flight.yaml", "no such file"),
+        UsageError("commands.udp: not up yet"),
+    )
+    patience = Patience(lambda: False, clock)
+    with ExitStack() as stack:
+        assert patiently(attempts.judge, attempts, stack, patience) == "flies"
+        assert attempts.open == 1
+    assert attempts.open == 0
+    assert clock.now_ns() == pytest.approx(3e9)
+    assert patience.summary() == "begun at try 5 after 3.0 s: commands.udp: not up yet"
+    assert capsys.readouterr().err.count("flight: cannot begin yet: ") == 4
+
+
+@pytest.mark.parametrize("error", [ConfigError("flight.yaml:3", "`coils` is wrong"), ZeroDivisionError()])
+def test_a_configuration_judged_wrong_ends_the_start_and_a_defect_the_process(error: Exception) -> None:
+    attempts = Attempts(error)
+    with ExitStack() as stack, pytest.raises(type(error)):
+        patiently(attempts.judge, attempts, stack, Patience(lambda: False, ManualClock()))
+
+
+def test_a_signal_ends_the_wait() -> None:
+    attempts = Attempts(UsageError("not up yet"))
+    with ExitStack() as stack, pytest.raises(StoppedError, match="not up yet"):
+        patiently(attempts.judge, attempts, stack, Patience(lambda: True, ManualClock()))
+
+
+@pytest.fixture
+def board(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the words that fly a board; its pauses are short."""
+    monkeypatch.setattr(patient_start, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(patient_start, "LONGEST_PAUSE_S", 0.05)
+    config = write_config(tmp_path)
+    with config.open("a", encoding="utf-8") as file:
+        file.write(f"\ncommands: {{socket: {tmp_path}/later/commands}}\n")
+        file.write(f"\nstate: {{folder: {tmp_path}/state}}\n")
+    return ["run", str(config), "--archive", str(tmp_path / "runs"), "--duration", "1"]
+
+
+def test_a_board_waits_for_its_socket_folder_and_leaves_no_run_and_no_boot_of_the_wait(
+    board: list[str], tmp_path: Path
+) -> None:
+    """On a bench the same is an error at once."""
+    bench = [*board[:2], "--out", str(tmp_path / "bench"), "--duration", "1"]
+    assert main(bench) == 2
+    timer = threading.Timer(0.3, (tmp_path / "later").mkdir)
+    timer.start()
+    assert main(board) == 0
+    timer.join()
+    (run,) = (tmp_path / "runs").iterdir()
+    events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(run)["event"]}
+    assert events["start-waited"].startswith("begun at try ")
+    assert StateStore(tmp_path / "state", lambda *_: None).load().boot_count == 1
+
+
+def test_a_board_that_is_stopped_while_it_waits_ends_well(
+    board: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object) -> Any:
+        raise StoppedError("stopped before the flight began")
+
+    monkeypatch.setattr(Patience, "wait", stop)
+    assert main(board) == 0
+    assert "stopped before the flight began" in capsys.readouterr().err
+
+
+def test_a_board_whose_configuration_is_wrong_ends_with_status_2(board: list[str]) -> None:
+    Path(board[1]).write_text("name: wrong\n", encoding="utf-8")
+    assert main(board) == 2
+
+
+def test_an_error_of_the_disk_at_the_end_of_a_boards_flight_is_no_mistake_of_the_users(
+    board: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(request: RunRequest, _: object) -> None:
+        raise OSError(5, "Input/output error", str(request.out))
+
+    monkeypatch.setattr("flight.app.flight.fly", end)
+    assert main(board) == 1

@@ -1,0 +1,177 @@
+"""The wide cameras: Sun and nadir start the filter, feed it where they say more, and correct a wrong one."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from flight.bodies.orbit.coarse_attitude import CONTRADICTED, WideFeed
+from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.filter_steps import OrbitFilterSettings
+from hal.interfaces.readings import Frame, ImuReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
+    angle_between,
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+)
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.wide_job import Sighted, WideFound
+
+FIELD = np.array([1e-5, 2e-5, 3e-5])
+POSITION = np.array([4e6, -4e6, 3.9e6])
+DOWN = -POSITION / np.linalg.norm(POSITION)
+SUN = np.array([0.6, -0.48, 0.64])
+LENS = np.radians(0.02)
+CAMERA = MountedCamera(Pinhole.from_field_of_view(64, 64, 1.0), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+class Still:
+    """A satellite at rest that hears the field each tenth of a second, its filter, and its cameras' feed."""
+
+    def __init__(self, seed: int) -> None:
+        self.attitude = normalise(np.random.default_rng(seed).standard_normal(4))
+        settings = OrbitFilterSettings(
+            inertia=1e-3 * np.eye(3),
+            dipole_per_ampere=1.0,
+            dipole_limit=0.1,
+            gyro_noise=1e-4,
+            field_noise=1e-7,
+            unknown_psd=1e-8,
+            settle_ns=0,
+            history_ns=12 * SECOND_NS,
+        )
+        self.filter = OrbitFilter(settings, self.at)
+        self.feed = WideFeed([CAMERA], LENS, self.filter, cast(Surroundings, self), None, None)
+        self.now_ns = 0
+        self.sunlit = 1.0
+
+    def at(self, _: int) -> Around:
+        nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
+        return Around(FIELD, POSITION, nothing, self.sunlit)
+
+    def sun(self, _: int) -> FloatArray:
+        return SUN
+
+    def rest(self, seconds: int) -> None:
+        field = attitude_matrix(self.attitude) @ FIELD
+        for _ in range(10 * seconds):
+            self.now_ns += SECOND_NS // 10
+            self.filter.command(self.now_ns, np.zeros(3))
+            times = (self.now_ns, self.now_ns, self.now_ns)
+            self.filter.accept(ImuReading(*times, self.attitude, np.zeros(3), field, np.zeros(3)))
+
+    def seen(self, sigma: float, sun: bool = True, nadir: bool = True, turn: float = 0.0) -> WideFound:
+        """Return what the cameras show of a body that is turned by `turn` rad from where it is."""
+        body = attitude_matrix(multiply(from_rotation_vector(np.array([turn, 0.0, 0.0])), self.attitude))
+
+        def sighted(direction: FloatArray) -> Sighted:
+            return Sighted(body @ direction, sigma**2 * np.eye(3), (0,))
+
+        return WideFound(sighted(SUN) if sun else None, sighted(DOWN) if nadir else None)
+
+    def look(self, found: WideFound) -> tuple[bool, bool]:
+        return self.feed.accept(self.now_ns - SECOND_NS, found)
+
+    @property
+    def error(self) -> float:
+        return float(angle_between(self.filter.at(self.now_ns).quaternion, self.attitude))
+
+
+def test_sun_and_nadir_start_the_filter_and_one_direction_with_the_field_does() -> None:
+    for sun, nadir in ((True, True), (True, False), (False, True)):
+        craft = Still(1)
+        craft.rest(3)
+        assert craft.feed.needed
+        assert craft.look(craft.seen(1e-3, sun, nadir)) == (sun, nadir)
+        assert craft.filter.started
+        assert craft.error < np.radians(3.0), "the field is known to a degree"
+
+
+def test_a_nadir_of_eleven_degrees_starts_it_too_and_alone_says_nothing() -> None:
+    craft = Still(2)
+    craft.rest(3)
+    assert craft.look(WideFound(None, None)) == (False, False)
+    assert craft.look(craft.seen(np.radians(11.0), sun=False)) == (False, True)
+    assert craft.filter.runs
+
+
+def test_a_direction_is_used_only_where_it_says_more_so_that_repetition_does_not_narrow_the_claim() -> None:
+    craft = Still(3)
+    craft.rest(3)
+    craft.look(craft.seen(1e-3))
+    used = []
+    for _ in range(60):
+        craft.rest(2)
+        used.append(craft.look(craft.seen(3e-3)))
+    assert not all(sun for sun, _ in used[30:])
+    assert craft.filter.worst_sigma > 0.4 * 3e-3, "sixty that count would make it a quarter"
+
+
+def test_in_the_shadow_the_cameras_are_read_often_only_while_the_attitude_is_lost() -> None:
+    for sunlit, often in ((1.0, True), (0.0, False)):
+        craft = Still(7)
+        craft.sunlit = sunlit
+        craft.rest(3)
+        assert craft.feed.needed
+        craft.look(craft.seen(0.01))
+        assert craft.filter.knowledge is Knowledge.COARSE
+        assert craft.feed.needed is often
+
+
+def test_one_false_horizon_is_refused_and_three_in_a_row_start_a_coarse_estimate_again() -> None:
+    craft = Still(4)
+    craft.rest(3)
+    wrong = multiply(from_rotation_vector(np.array([0.2, 0.0, 0.0])), craft.attitude)
+    craft.filter.begin(AttitudeMeasurement(craft.now_ns - SECOND_NS, wrong, 0.01**2 * np.eye(3)))
+    assert craft.filter.knowledge is Knowledge.COARSE
+    craft.rest(2)
+    rounds = []
+    for _ in range(CONTRADICTED + 2):
+        craft.rest(1)
+        rounds.append(craft.look(craft.seen(1e-3)))
+    # The Sun agrees: it lies near the axis of the error.
+    assert not any(nadir for _, nadir in rounds[:CONTRADICTED])
+    assert rounds[-1] == (True, True)
+    assert craft.error < 0.01
+    assert craft.filter.restarts == 1
+
+
+def test_the_strings_own_sun_is_not_fed_twice() -> None:
+    craft = Still(5)
+    craft.rest(3)
+    craft.look(craft.seen(1e-2))
+    craft.rest(1)
+    found = craft.seen(1e-4, nadir=False)
+    assert found.sun is not None
+    strings = WideFound(Sighted(found.sun.direction, found.sun.covariance, ()), None)
+    assert craft.look(strings) == (False, False)
+    assert craft.look(found) == (True, False)
+
+
+def test_the_worker_is_told_what_is_known_in_body_axes() -> None:
+    craft = Still(6)
+    craft.rest(3)
+    frame = Frame(1, craft.now_ns - SECOND_NS, 0, craft.now_ns, np.zeros((64, 64), np.uint8))
+    job = craft.feed.job({0: frame})
+    assert job.knowledge.attitude is None
+    body = attitude_matrix(craft.attitude)
+    np.testing.assert_allclose(
+        job.knowledge.sensed[0].camera, body @ FIELD / np.linalg.norm(FIELD), atol=1e-3
+    )
+    craft.look(craft.seen(1e-3))
+    craft.rest(2)
+    frame = Frame(2, craft.now_ns - SECOND_NS, 0, craft.now_ns, np.zeros((64, 64), np.uint8))
+    rough = craft.feed.job({0: frame}).knowledge.attitude
+    assert rough is not None
+    assert angle_between(rough.quaternion, craft.attitude) < 0.01

@@ -1,0 +1,78 @@
+"""SAFE's seeker takes the strings' Sun, and says once whether there is one and why not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.bodies.orbit.control import StringSeeker
+from flight.link.events import EventKind
+from flight.loop.fdir.facts import EventLog
+from hal.interfaces.readings import StringReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.estimation.carried_sun import MEMORY
+from knightcube.vision.sun.strings import SolarStrings
+
+SUN = np.array([0.36, 0.48, 0.8])
+FIELD = np.array([2e-5, 0.0, 3e-5])
+
+
+class Seen:
+    """The seeker with the events that it reported."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, str]] = []
+        law = SunAcquisition(
+            WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
+            SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
+        )
+        self.seeker = StringSeeker(law, SolarStrings(), 0.648, EventLog(self._tell))
+        self.seeker.begin(0)
+
+    def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:
+        self.told.append((kind.name, text))
+
+    def fly(self, begin: int, end: int, currents: FloatArray | None, noise: float = 1e-9) -> bool:
+        """Let seconds pass with readings of the strings; return whether the coils acted in the last."""
+        acted = False
+        for tenth in range(10 * begin + 1, 10 * end):
+            now_ns = tenth * SECOND_NS // 10
+            if currents is not None and tenth % 10 == 0:
+                self.seeker.see(StringReading(now_ns, currents))
+            self.seeker.sample(now_ns, FIELD + noise * (tenth % 2), np.zeros(3))
+            command = self.seeker.command(now_ns)
+            acted = (acted and tenth < 10 * end - 20) or bool(command.currents.any())
+            np.testing.assert_allclose(command.currents * 0.648, command.dipole)
+        return acted
+
+
+def test_it_says_that_the_sun_is_found_and_turns_to_it() -> None:
+    seen = Seen()
+    assert seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
+    assert [name for name, _ in seen.told] == ["sun-missed", "sun-found"]
+    assert seen.told[0][1] == "the strings give no readings"
+
+
+def test_by_a_field_that_is_stuck_it_does_nothing_until_the_field_lives_again() -> None:
+    seen, lit = Seen(), np.maximum(np.concatenate([SUN, -SUN]), 0.0)
+    assert seen.fly(0, 6, lit)
+    assert not seen.fly(6, 12, lit, noise=0.0)
+    assert seen.fly(12, 18, lit)
+
+
+def test_in_the_dark_it_says_why_and_no_current_flows_in_a_body_that_does_not_turn() -> None:
+    seen = Seen()
+    assert not seen.fly(0, 6, np.zeros(6))
+    assert [name for name, _ in seen.told] == ["sun-missed"]
+
+
+def test_a_sun_that_has_gone_is_remembered_for_a_while_and_its_loss_told_with_the_reason() -> None:
+    seen = Seen()
+    seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
+    seen.fly(6, int(MEMORY), np.zeros(6))
+    assert seen.told[-1][0] == "sun-found"
+    seen.fly(int(MEMORY), int(MEMORY) + 10, np.zeros(6))
+    assert seen.told[-1][0] == "sun-missed"
+    assert "no string has" in seen.told[-1][1]

@@ -1,0 +1,122 @@
+"""What surrounds the satellite by belief: from elements or fixes, interpolated, false fixes refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, Surroundings
+from flight.schema import reader as configuration
+from flight.schema.orbit import as_orbit
+from hal.interfaces.readings import GpsReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.geomagnetism import field
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
+from sim_hal.clock import SimClock
+from tests.scenario.flights import CONFIG
+
+UTC_NS = round(datetime.fromisoformat("2026-03-20T12:00:00Z").timestamp()) * SECOND_NS
+UNIX_EPOCH, DAY = 2_440_587.5, 86_400.0
+
+
+@pytest.fixture
+def elements() -> TwoLineElements:
+    config = as_orbit(configuration.load(CONFIG.parent / "orbit.yaml"))
+    assert config.elements is not None
+    return TwoLineElements(*config.elements)
+
+
+def reading(elements: TwoLineElements, time_ns: int, shift: FloatArray | None = None) -> GpsReading:
+    """Return a fix at `time_ns` of a clock that begins at `UTC_NS`."""
+    utc_ns = UTC_NS + time_ns
+    date = UNIX_EPOCH + utc_ns / (DAY * SECOND_NS)
+    state, turn = elements.at(date), celestial_to_terrestrial(date)
+    position = turn @ state.position
+    velocity = turn @ state.velocity - np.cross([0.0, 0.0, ROTATION_RATE], position)
+    place = position + (0.0 if shift is None else shift)
+    began_ns = time_ns + GPS_DELAY_NS
+    return GpsReading(began_ns, began_ns, utc_ns, place, velocity, 5.0, 0.05, 9, True)
+
+
+def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -> None:
+    known = Surroundings(elements, SimClock(UTC_NS))
+    for seconds in (0.0, 15.0, 31.0, 500.0):
+        now_ns = round(seconds * SECOND_NS)
+        date = known.julian_date(now_ns)
+        expected = elements.at(date)
+        found = known.at(now_ns)
+        assert found is not None
+        assert found.position == pytest.approx(expected.position, abs=30.0)
+        assert found.field == pytest.approx(field(date, expected.position), abs=1e-8)
+        velocity = known.velocity(now_ns)
+        assert velocity is not None
+        assert 2.0e4 < np.linalg.norm(velocity) < 4.0e4
+
+
+def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLineElements) -> None:
+    known = Surroundings(None, SimClock(UTC_NS + 300 * SECOND_NS))
+    assert known.at(0) is None
+    assert known.velocity(0) is None
+    assert known.ephemeris(0, 100.0) is None
+    assert known.fix(reading(elements, 10 * SECOND_NS))
+    found = known.at(12 * SECOND_NS)
+    assert found is not None
+    expected = elements.at(UNIX_EPOCH + (UTC_NS + 12 * SECOND_NS) / (DAY * SECOND_NS))
+    assert found.position == pytest.approx(expected.position, abs=50.0), "the receiver's time, not the host's"
+
+
+def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements: TwoLineElements) -> None:
+    known = Surroundings(elements, SimClock(UTC_NS))
+    shift = np.array([3e4, 0.0, 0.0])
+    answers = [known.fix(reading(elements, k * SECOND_NS, shift)) for k in range(CONTRADICTED + 5)]
+    assert not any(answers)
+    assert known.refused == CONTRADICTED + 5
+    assert known.fix(reading(elements, 60 * SECOND_NS))
+
+
+def test_without_elements_a_first_fix_that_was_false_is_given_up(elements: TwoLineElements) -> None:
+    known = Surroundings(None, SimClock(UTC_NS))
+    assert known.fix(reading(elements, 0, np.array([3e4, 0.0, 0.0])))
+    answers = [known.fix(reading(elements, k * SECOND_NS)) for k in range(1, CONTRADICTED + 2)]
+    assert answers == [False] * CONTRADICTED + [True]
+
+
+def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLineElements) -> None:
+    known = Surroundings(None, SimClock(UTC_NS))
+    assert not known.fix(replace(reading(elements, 0), valid=False))
+    assert known.refused == 0
+
+
+def test_a_long_prediction_has_the_times_of_the_clock(elements: TwoLineElements) -> None:
+    known = Surroundings(elements, SimClock(UTC_NS))
+    ahead = known.ephemeris(5 * SECOND_NS, 100.0)
+    assert ahead is not None
+    assert known.seconds_into(ahead, 45 * SECOND_NS) == pytest.approx(40.0, abs=1e-3)
+    found = known.at(45 * SECOND_NS)
+    assert found is not None
+    assert ahead.position_at(np.array([40.0]))[0] == pytest.approx(found.position, abs=5.0)
+
+
+def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements: TwoLineElements) -> None:
+    known, frozen = Surroundings(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
+    assert known.fix(frozen)
+    for seconds in range(11, 60):
+        time_ns = seconds * SECOND_NS + GPS_DELAY_NS
+        assert not known.fix(replace(frozen, time_ns=time_ns, arrival_ns=time_ns))
+    date = UNIX_EPOCH + (UTC_NS + 60 * SECOND_NS) / (DAY * SECOND_NS)
+    assert known.julian_date(60 * SECOND_NS) == pytest.approx(date, abs=1e-8), "the time goes on"
+
+
+def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while(elements: TwoLineElements) -> None:
+    known, late_ns = Surroundings(elements, SimClock(UTC_NS)), 2 * SECOND_NS
+    assert known.fix(reading(elements, 10 * SECOND_NS))
+    used = []
+    for seconds in range(11, 60):
+        sent = reading(elements, seconds * SECOND_NS)
+        used.append(known.fix(replace(sent, time_ns=sent.time_ns + late_ns)))
+    assert used.index(True) == CONTRADICTED

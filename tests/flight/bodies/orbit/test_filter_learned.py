@@ -1,0 +1,90 @@
+"""What the satellite's filter learned is the prior of the next boot, less sure by its age."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.bodies.orbit.filter import (
+    ERRORS,
+    LEARNED_AT,
+    PARTS,
+    SOURCES,
+    UNKNOWN_AGE,
+    learned_of,
+    start_from,
+)
+from flight.loop.state.content import Learned, StoredState
+from flight.loop.state.store import decode, encode
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
+from knightcube.gnc.estimation.free_motion import DIPOLE, GYRO, SLOW, SUNLIT
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+
+SETTINGS = FreeFilterSettings()
+START, WALK = SETTINGS.of_slow(0), SETTINGS.of_slow(1)
+THEN, CHANGED = 1.78e9, 0.05
+
+
+def known(share: float = 0.1) -> SlowStates:
+    """Return states known to a share of their first deviations, the dipole's two parts correlated."""
+    sigma = share * START
+    together = np.eye(len(sigma))
+    dark, lit = DIPOLE.start - GYRO.start, SUNLIT.start - GYRO.start
+    together[dark, lit] = together[lit, dark] = -0.8
+    return SlowStates(0.5 * START, np.outer(sigma, sigma) * together)
+
+
+def stored(slow: SlowStates) -> dict[str, Learned]:
+    """Return what comes back from the disk."""
+    return decode(encode(1, StoredState(learned=learned_of(slow, THEN)))).state.learned
+
+
+def grown(age: float) -> FloatArray:
+    """Return the variances of states that were known to a tenth, after an age, s."""
+    return np.asarray((0.1 * START) ** 2 + WALK**2 * age + (CHANGED * START) ** 2)
+
+
+def test_states_come_back_with_a_covariance_grown_by_their_age() -> None:
+    for age in (0.0, 3_600.0):
+        prior, problems = start_from(stored(known()), SETTINGS, CHANGED, THEN + age)
+        assert not problems
+        assert np.array_equal(prior.values, known().values)
+        assert np.allclose(np.diag(prior.covariance), grown(age), rtol=1e-12)
+        at = PARTS[SOURCES]
+        off = prior.covariance[np.ix_(at, at)] - known().covariance[np.ix_(at, at)]
+        assert np.allclose(off, np.diag(np.diag(off)), atol=1e-20), "dipole and sunlit part stay correlated"
+
+
+def test_a_clock_put_back_counts_as_a_day() -> None:
+    prior, problems = start_from(stored(known()), SETTINGS, CHANGED, THEN - 5.0)
+    assert not problems
+    assert np.allclose(np.diag(prior.covariance), grown(UNKNOWN_AGE), rtol=1e-12)
+
+
+def test_without_a_time_or_far_from_what_is_expected_nothing_is_believed() -> None:
+    nothing = SlowStates(np.zeros(len(START)), np.diag(START**2))
+    timeless = {name: one for name, one in stored(known()).items() if name != LEARNED_AT}
+    wild = stored(SlowStates(5.0 * START, known().covariance))
+    for learned, refused in (({}, 0), (timeless, 0), (wild, len(PARTS))):
+        prior, problems = start_from(learned, SETTINGS, CHANGED, THEN)
+        assert len(problems) == refused
+        assert np.array_equal(prior.values, nothing.values)
+        assert np.array_equal(prior.covariance, nothing.covariance)
+    part = {**stored(known()), ERRORS: wild[ERRORS]}
+    prior, problems = start_from(part, SETTINGS, CHANGED, THEN)
+    assert len(problems) == 1
+    assert np.array_equal(prior.values[PARTS[SOURCES]], known().values[PARTS[SOURCES]])
+
+
+def test_the_filter_starts_from_them_and_a_contradiction_takes_their_claim_away() -> None:
+    prior, _ = start_from(stored(known()), SETTINGS, CHANGED, THEN)
+    found = FreeFilter(np.diag([0.0066, 0.0333, 0.0333]), SETTINGS, prior)
+    gyro = np.array([1e-3, 2e-3, 3e-3])
+    still, sure = np.array([0.0, 0.0, 0.0, 1.0]), 1e-8 * np.eye(3)
+    found.start(still, sure, gyro)
+    assert np.allclose(found.gyro_bias, 0.5e-3)
+    assert np.allclose(found.rate, gyro - 0.5e-3)
+    assert np.allclose(found.covariance[SLOW, SLOW], prior.covariance)
+    found.start(still, sure, gyro, doubted=True)
+    assert np.allclose(np.diag(found.covariance)[SLOW], START**2)
+    assert np.allclose(found.gyro_bias, 0.5e-3), "as a guess it stays"

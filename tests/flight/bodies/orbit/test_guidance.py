@@ -1,0 +1,118 @@
+"""What is planned when: slews for new targets and bodies astray, a path again; which part of it is flown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.guidance import (
+    ObjectAim,
+    PlannedCraft,
+    PointingLawOf,
+    PointingPaths,
+    PointingPlanner,
+)
+from flight.loop.body import Target
+from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
+from knightcube.gnc.control.three_axes.pointing_law import LEAVING
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from tests.flight.bodies.orbit.test_guidance_astray import AWAY, NADIR, STILL, table
+from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+
+assert table  # a fixture
+RESIDUAL = np.array([1e-3, 0.0, 0.0])
+WISH = SlewRequest(300.0, np.ones(3), np.zeros(3), Z)
+SUN = PointingTarget(Goal.SUN)
+
+
+@pytest.fixture
+def paths() -> PointingPaths:
+    return PointingPaths(LIMIT, 0.1)
+
+
+def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int) -> PointingJob:
+    """Return the job that a planner submits for a goal when asked for a plan."""
+    (job,) = submitted(paths, goal, now_ns, requested=True)
+    return job
+
+
+def submitted(
+    paths: PointingPaths, goal: PointingTarget, now_ns: int, *, requested: bool
+) -> list[PointingJob]:
+    """Return the jobs that a planner submits for a goal."""
+    jobs: list[PointingJob] = []
+
+    def submit(_: str, job: PointingJob) -> bool:
+        jobs.append(job)
+        return True
+
+    services = SimpleNamespace(
+        jobs=SimpleNamespace(submit=submit),
+        events=SimpleNamespace(report=lambda *_: None),
+    )
+    craft = PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, LIMIT, WISH)
+    planner = PointingPlanner(
+        craft,
+        paths,
+        cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
+        lambda: (np.zeros(9), RESIDUAL),
+        ObjectAim(None, LIMIT, cast(Any, services.events)),
+        cast(Any, services),
+    )
+    if requested:
+        planner.request(now_ns)
+    estimate = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
+    planner.serve(cast(Any, estimate), Target(0, PointingLawOf(goal, paths)), now_ns)
+    return jobs
+
+
+def test_a_path_that_leaves_its_target_for_a_time_is_no_reason_for_a_slew(
+    table: Any, paths: PointingPaths
+) -> None:
+    before = planned(paths, NADIR, 0).slew
+    assert before is not None
+    assert before.residual is RESIDUAL
+    paths.offer(table, NADIR, 0)
+    assert planned(paths, NADIR, SECOND_NS).slew is None
+    assert planned(paths, SUN, SECOND_NS).slew is not None
+
+
+def test_a_body_astray_is_slewed_back(table: Any, paths: PointingPaths) -> None:
+    paths.offer(table, NADIR, 0)
+    paths.led(AWAY, STILL, SECOND_NS)
+    assert planned(paths, NADIR, 2 * SECOND_NS).slew is not None
+
+
+def test_a_body_that_leaves_its_path_is_planned_for_again(table: Any, paths: PointingPaths) -> None:
+    paths.offer(table, NADIR, 0)
+    paths.led(0.9 * LEAVING * X, STILL, SECOND_NS)
+    assert not submitted(paths, NADIR, 2 * SECOND_NS, requested=False)
+    paths.led(1.1 * LEAVING * X, STILL, 3 * SECOND_NS)
+    (job,) = submitted(paths, NADIR, 4 * SECOND_NS, requested=False)
+    assert job.slew is None
+
+
+def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, paths: PointingPaths) -> None:
+    count = len(table.dipole)
+    late, soon = (replace(table, path=_fast_from(table.path, part * count // 10)) for part in (6, 2))
+    assert paths.offer(late, NADIR, 0) == ""
+    sample = paths.sample(SECOND_NS)
+    assert sample is not None
+    first, last = sample.law.span
+    assert first == table.path.times[0]
+    assert last == table.path.times[6 * count // 10 - 1]
+    assert "braked" in paths.offer(soon, NADIR, 0)
+    assert sample.law is paths.sample(SECOND_NS).law  # type: ignore[union-attr] # it was not replaced
+
+
+def _fast_from(path: AttitudeReferences, place: int) -> AttitudeReferences:
+    """Return a path that turns at 0.2 rad/s from an instant on."""
+    rate = path.rate.copy()
+    rate[place:] = [0.2, 0.0, 0.0]
+    return replace(path, rate=rate)

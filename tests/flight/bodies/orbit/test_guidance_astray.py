@@ -1,0 +1,48 @@
+"""Far off its path a body is held still, told once, and planned for again only when it is slow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.guidance import PointingPaths
+from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.control.three_axes.pointing_law import FAR, SLOW
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LAW, LIMIT, ORBIT, STEP, WEIGHTS
+
+NADIR = PointingTarget(Goal.NADIR, roll=0.0)
+NEAR, AWAY = np.array([0.5 * FAR, 0.0, 0.0]), np.array([0.0, 1.2 * FAR, 0.0])
+STILL, QUICK = np.array([0.5 * SLOW, 0.0, 0.0]), np.array([0.0, 0.0, 3.0 * SLOW])
+
+
+@pytest.fixture(scope="module")
+def table() -> PointingTable:
+    times = STEP * np.arange(1.0, 20.0)
+    wanted = references(LAW, ORBIT, times)
+    return table_along(wanted, ORBIT.field_at(times), ORBIT.position_at(times), INERTIA, WEIGHTS)
+
+
+def test_the_path_is_flown_until_the_body_is_far_off_and_again_with_a_new_plan(table: PointingTable) -> None:
+    paths = PointingPaths(LIMIT, 0.1)
+    assert not paths.offer(table, NADIR, 0)
+    assert paths.led(NEAR, QUICK, SECOND_NS)
+    assert not paths.led(AWAY, QUICK, 2 * SECOND_NS)
+    assert not paths.led(NEAR, QUICK, 3 * SECOND_NS), "not led back from afar, though it came nearer"
+    before = paths.astray.ready
+    assert not paths.led(NEAR, STILL, 4 * SECOND_NS)
+    assert (before, paths.astray.ready) == (False, True)
+    assert not paths.offer(table, NADIR, 5 * SECOND_NS)
+    assert paths.led(NEAR, STILL, 6 * SECOND_NS)
+
+
+def test_a_refused_plan_leaves_the_body_held_still(table: PointingTable) -> None:
+    paths = PointingPaths(LIMIT, 0.1)
+    paths.offer(table, NADIR, 0)
+    paths.led(AWAY, QUICK, SECOND_NS)
+    assert paths.offer(replace(table, gain=np.full(table.gain.shape, np.nan)), NADIR, 2 * SECOND_NS)
+    assert not paths.led(NEAR, STILL, 3 * SECOND_NS)

@@ -1,0 +1,152 @@
+"""Reactions and the transition table agree: every answer of the table can happen.
+
+The transition table is complete, every mode can be reached, and safe from everywhere.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import pytest
+
+from flight.link.modes import Mode
+from flight.loop.fdir.facts import FACTS
+from flight.loop.modes import (
+    COMMANDS,
+    SAFING,
+    STARTS,
+    TRANSITIONS,
+    Answer,
+    Change,
+    ModeMachine,
+    Row,
+    Table,
+    Trigger,
+    check,
+)
+from flight.loop.tasks.mode_control import SAFING_REACTIONS
+from knightcube.errors import FlightError
+
+
+@pytest.mark.parametrize("mode", list(Mode))
+def test_every_reaction_that_leads_out_of_a_mode_belongs_to_a_fact_watched_in_it(mode: Mode) -> None:
+    for reaction, trigger in SAFING_REACTIONS.items():
+        if isinstance(TRANSITIONS[mode][trigger], Mode):
+            watched = [fact for fact in FACTS if fact.begins.reaction is reaction and mode in fact.modes]
+            assert watched, f"nothing in {mode.label} can bring about {reaction.name.lower()}"
+
+
+UNSAFE = [mode for mode in Mode if mode is not Mode.SAFE]
+Broken = dict[Mode, dict[Trigger, Mode | Answer]]
+
+
+def copied() -> Broken:
+    return {mode: dict(row) for mode, row in TRANSITIONS.items()}
+
+
+def in_mode(mode: Mode, table: Table = TRANSITIONS) -> ModeMachine:
+    machine = ModeMachine(table=table)
+    machine.mode = mode
+    return machine
+
+
+def test_the_table_that_flies_is_sound() -> None:
+    check(TRANSITIONS)
+
+
+@pytest.mark.parametrize(("mode", "trigger"), list(product(Mode, SAFING)))
+def test_whatever_asks_for_safe_gets_it_from_every_mode(mode: Mode, trigger: Trigger) -> None:
+    machine = in_mode(mode)
+    machine.fire(trigger, 7)
+    assert machine.mode is Mode.SAFE
+
+
+@pytest.mark.parametrize(("mode", "trigger"), list(product(Mode, Trigger)))
+def test_every_trigger_has_an_answer_in_every_mode_and_the_machine_follows_it(
+    mode: Mode, trigger: Trigger
+) -> None:
+    machine = in_mode(mode)
+    answer = machine.answer(trigger)
+    change = machine.fire(trigger, 42)
+    if isinstance(answer, Answer):
+        assert change is None
+        assert (machine.mode, machine.since_ns) == (mode, 0)
+    else:
+        assert change == Change(mode, answer, trigger)
+        assert (machine.mode, machine.since_ns) == (answer, 42)
+
+
+def test_only_commands_are_ever_refused_and_only_while_booting() -> None:
+    refused = {
+        (mode, trigger)
+        for mode, row in TRANSITIONS.items()
+        for trigger in row
+        if row[trigger] is Answer.REFUSE
+    }
+    assert refused == {(Mode.BOOT, trigger) for trigger in set(COMMANDS.values()) - {Trigger.COMMAND_SAFE}}
+
+
+def test_nothing_but_a_command_leads_out_of_safe() -> None:
+    leads_out = {t for t, to in TRANSITIONS[Mode.SAFE].items() if isinstance(to, Mode)}
+    assert leads_out == set(COMMANDS.values()) - {Trigger.COMMAND_SAFE}
+
+
+def test_boot_is_for_the_start_only() -> None:
+    machine = ModeMachine()
+    assert machine.mode is Mode.BOOT
+    for mode, trigger in STARTS.items():
+        assert in_mode(Mode.BOOT).fire(trigger, 0) == Change(Mode.BOOT, mode, trigger)
+        for elsewhere in set(Mode) - {Mode.BOOT}:
+            assert in_mode(elsewhere).fire(trigger, 0) is None
+
+
+@pytest.mark.parametrize(("mode", "trigger"), list(product(Mode, Trigger)))
+def test_a_table_with_a_hole_is_refused_by_name(mode: Mode, trigger: Trigger) -> None:
+    table = copied()
+    del table[mode][trigger]
+    with pytest.raises(FlightError, match=f"{mode.label} has no answer to '{trigger.value}'"):
+        ModeMachine(table=table)
+
+
+def test_a_table_without_a_row_is_refused() -> None:
+    table = copied()
+    del table[Mode.SLEW]
+    with pytest.raises(FlightError, match="slew has no row"):
+        check(table)
+
+
+@pytest.mark.parametrize(("mode", "trigger"), list(product(UNSAFE, SAFING)))
+def test_a_table_that_keeps_a_mode_from_safe_is_refused(mode: Mode, trigger: Trigger) -> None:
+    for wrong in (Answer.STAY, Answer.REFUSE, Mode.HOLD):
+        table = copied()
+        table[mode][trigger] = wrong
+        with pytest.raises(FlightError, match=f"does not lead from {mode.label} to safe"):
+            check(table)
+
+
+def test_a_dead_end_is_refused() -> None:
+    table = copied()
+    row: Row = {t: (Answer.STAY if isinstance(to, Mode) else to) for t, to in table[Mode.SAFE].items()}
+    with pytest.raises(FlightError, match="safe is a dead end"):
+        check({**table, Mode.SAFE: row})
+
+
+def test_a_mode_that_nothing_leads_to_is_refused() -> None:
+    def without_slew(row: Row) -> Row:
+        return {t: (Answer.STAY if to is Mode.SLEW else to) for t, to in row.items()}
+
+    with pytest.raises(FlightError, match="slew cannot be reached"):
+        check({mode: without_slew(row) for mode, row in TRANSITIONS.items()})
+
+
+def test_a_way_back_to_boot_is_refused() -> None:
+    table = copied()
+    table[Mode.HOLD][Trigger.ARRIVED] = Mode.BOOT
+    with pytest.raises(FlightError, match="hold leads back to boot"):
+        check(table)
+
+
+def test_labels_lead_back_to_their_modes() -> None:
+    assert [Mode.named(mode.label) for mode in Mode] == list(Mode)
+    with pytest.raises(ValueError, match="'fly' is no mode: boot, safe"):
+        Mode.named("fly")
