@@ -1,0 +1,40 @@
+"""`python -m tests.studies NAME [arguments]`: run a study, for instance `campaigns faults`."""
+
+from __future__ import annotations
+
+import pkgutil
+import runpy
+import sys
+from pathlib import Path
+
+_FOLDER = Path(__file__).parent
+_NOT_STUDIES = {"__main__", "checks"}
+
+
+def names() -> list[str]:
+    """Return the names of the studies: modules and packages of this folder that can be run."""
+    return [
+        found.name
+        for found in pkgutil.iter_modules([str(_FOLDER)])
+        if found.name not in _NOT_STUDIES
+        and (not found.ispkg or (_FOLDER / found.name / "__main__.py").exists())
+        and (
+            found.ispkg
+            or '__name__ == "__main__"' in (_FOLDER / f"{found.name}.py").read_text(encoding="utf-8")
+        )
+    ]
+
+
+def main() -> int:
+    """Run the study named first on the command line with the rest of the line."""
+    if len(sys.argv) < 2 or sys.argv[1] not in names():
+        asked = f"there is no study {sys.argv[1]!r}; " if len(sys.argv) > 1 else ""
+        print(f"{asked}studies: {', '.join(names())}", file=sys.stderr)  # noqa: T201 - a command
+        return 2
+    name = sys.argv.pop(1)
+    runpy.run_module(f"tests.studies.{name}", run_name="__main__", alter_sys=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

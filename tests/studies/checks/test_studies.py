@@ -1,0 +1,31 @@
+"""`python -m tests.studies NAME` runs the study of that name, and lists the studies otherwise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def _run(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tests.studies", *words]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", ["campaigns", "bench", "same_bytes", "house", "fuzz"])
+def test_a_study_gets_the_rest_of_the_line(name: str) -> None:
+    done = _run(name, "--help")
+    assert done.returncode == 0
+    assert "usage:" in done.stdout
+
+
+def test_an_unknown_study_is_wrong_use_and_the_known_ones_are_listed() -> None:
+    done = _run("nosuch")
+    assert done.returncode == 2
+    assert "there is no study 'nosuch'" in done.stderr
+    assert "campaigns" in done.stderr
+    assert "checks" not in done.stderr
