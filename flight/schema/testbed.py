@@ -44,7 +44,7 @@ class BdotDetumble(Detumble, frozen=True, kw_only=True):
 class Guidance(Section, frozen=True, kw_only=True):
     """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies.
 
-    `cost` is the energy that paths save: the coil's heat R I^2, or V |I| taken from the supply.
+    `cost` is the energy that paths save: R I^2 of the mean current, or V |I| taken from the supply.
     """
 
     strategy: Literal["goal", "receding", "step"] = "goal"

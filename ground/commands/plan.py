@@ -60,7 +60,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cost",
         choices=[cost.value for cost in PathCost],
-        help="energy to save: heat R I^2, or supply V |I|",
+        help="energy to save: R I^2 of the mean current (heat), or V |I| from the supply",
     )
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     parser.add_argument(
@@ -125,7 +125,7 @@ def _facts(made: Plan, plant: SingleAxisPlant, solved_s: float) -> dict[str, obj
         "horizon_s": made.horizon,
         "energy_J": made.energy,
         "supply_energy_J": made.supplied,
-        "mean_power_W": made.energy / made.horizon,
+        "mean_supply_power_W": made.supplied / made.horizon,
         "peak_current_A": made.peak_current,
         "current_limit_A": plant.current_limit,
         "evaluations": made.evaluations,
@@ -145,7 +145,7 @@ def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
         f"horizon:       {made.horizon:.3f} s{stretched}\n"
         f"energy:        {made.energy:.5f} J, integral of R I^2\n"
         f"supply:        {made.supplied:.5f} J, integral of V |I|\n"
-        f"mean power:    {1e3 * made.energy / made.horizon:.2f} mW\n"
+        f"mean supply:   {1e3 * made.supplied / made.horizon:.2f} mW\n"
         f"peak current:  {made.peak_current:.4f} A of {plant.current_limit:.4f} A\n"
         f"solved in:     {1e3 * solved_s:.1f} ms, {made.evaluations} evaluations\n"
     )

@@ -191,7 +191,7 @@ def _facts(made: OrderedSlew, order: SlewOrder, at: datetime, solved_s: float) -
         "horizon_asked_s": plan.horizon_asked,
         "horizon_s": plan.horizon,
         "energy_J": plan.energy,
-        "mean_power_W": plan.energy / plan.horizon,
+        "mean_heat_W": plan.energy / plan.horizon,
         "peak_of_limit": plan.peak,
         "turn_deg": math.degrees(float(angle_between(path.quaternion[0], path.quaternion[-1]))),
         # The path's quaternion is continuous: past half a turn its scalar part has changed its sign.

@@ -66,9 +66,10 @@ def _figures(summary: Object) -> Iterator[tuple[str, tuple[float | None, str]]]:
         yield f"{name}: rise", (step["rise_s"], "s")
         yield f"{name}: settling", (step["settling_s"], "s")
     power = summary["power"]
-    yield "average R I^2", (_scaled(power["average_w"], 1e3), "mW")
-    yield "average supply, V |I|", (_scaled(power["supply_average_w"], 1e3), "mW")
-    yield "energy R I^2", (power["energy_j"], "J")
+    yield "supply at the coils, V |I|, average", (_scaled(power["supply_average_w"], 1e3), "mW")
+    yield "supply at the bus, average", (_scaled(power["bus_average_w"], 1e3), "mW")
+    yield "R I^2, heat of steady currents, average", (_scaled(power["heat_average_w"], 1e3), "mW")
+    yield "R I^2, heat of steady currents, energy", (power["heat_j"], "J")
     yield from _sensing(summary)
     yield from _loop(summary)
 

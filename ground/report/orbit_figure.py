@@ -74,15 +74,21 @@ def _dipole(ax: Axes, run: Run) -> None:
 
 
 def _power(ax: Axes, scene: Scene) -> None:
-    if scene.power is not None:
-        edges = np.arange(scene.power.time[0], scene.power.end + SMOOTHED, SMOOTHED)
-        place = np.digitize(scene.power.time, edges) - 1
-        spent = np.bincount(place, scene.power.heat * scene.power.spans, len(edges) - 1)
-        spans = np.bincount(place, scene.power.spans, len(edges) - 1)
-        mean = 1e3 * spent / np.where(spans > 0.0, spans, np.nan)
-        ax.stairs(np.maximum(mean, 1e-3), edges, color=panels.VERMILLION, linewidth=1.0)
+    found = scene.power
+    if found is not None:
+        edges = np.arange(found.time[0], found.end + SMOOTHED, SMOOTHED)
+        place = np.digitize(found.time, edges) - 1
+        spans = np.bincount(place, found.spans, len(edges) - 1)
+        for name, power, colour in (
+            ("supply, V |I|", found.supply, panels.VERMILLION),
+            ("R I²", found.heat, panels.GREEN),
+        ):
+            spent = np.bincount(place, power * found.spans, len(edges) - 1)
+            mean = 1e3 * spent / np.where(spans > 0.0, spans, np.nan)
+            ax.stairs(np.maximum(mean, 1e-3), edges, color=colour, linewidth=1.0, label=name)
         ax.set_yscale("log")
-    panels.style(ax, "R I², mW", f"Heat in the coils, mean over {SMOOTHED:g} s", "")
+    panels.style(ax, "power, mW", f"Coil power, mean over {SMOOTHED:g} s", "")
+    panels.legend(ax)
 
 
 def _field(ax: Axes, run: Run) -> None:

@@ -108,28 +108,29 @@ def current(ax: Axes, scene: Scene) -> None:
 
 
 def power(ax: Axes, scene: Scene) -> None:
-    """Draw the supply power V |I| and its average so far beside the thesis's 0.10 W (Sease Figure 5.11)."""
+    """Draw the supply power with the thesis's 0.10 W (Sease Figure 5.11), and the average R I^2."""
     found = scene.power
     if found is None:
         return
-    time, spans = found.time, found.spans
-    average = np.cumsum(found.supply * spans) / np.cumsum(spans)
-    heat = found.energy / found.duration
+    time, ends = found.time, found.time + found.spans
     ax.fill_between(time, found.supply, step="post", color=BLUE, alpha=0.35, linewidth=0.0)
-    ax.step(time, found.supply, where="post", color=BLUE, linewidth=0.7, label="supply, $V |I|$")
-    ax.plot(
-        time + spans,
-        average,
-        color=BLACK,
-        linewidth=1.6,
-        label=f"average so far, at last {1e3 * average[-1]:.1f} mW (heat {1e3 * heat:.1f} mW)",
-    )
+    ax.step(time, found.supply, where="post", color=BLUE, linewidth=0.7, label="$V |I|$ at the coils")
+    averages = [
+        (ends, found.average_so_far(found.supply), BLACK, "average"),
+        (ends, found.average_so_far(found.heat), GREEN, "average $R I^2$"),
+    ]
+    measured_at, measured = scene.bus_power
+    if len(measured):
+        so_far = np.cumsum(measured) / np.arange(1, len(measured) + 1)
+        averages.insert(1, (measured_at, so_far, PURPLE, "average at the bus"))
+    for times, average, colour, name in averages:
+        ax.plot(times, average, color=colour, linewidth=1.6, label=f"{name}, {1e3 * average[-1]:.1f} mW")
     ax.axhline(
-        limits.AVERAGE_POWER_LIMIT_W,
+        limits.AVERAGE_SUPPLY_POWER_LIMIT_W,
         color=VERMILLION,
         linewidth=1.2,
         linestyle=(0, (5, 2)),
-        label="thesis, 0.10 W",
+        label="thesis, 100 mW",
     )
     ax.set_ylim(bottom=0.0)
     style(ax, "power, W", "Power from the coils' supply")
@@ -142,7 +143,7 @@ def compared(axes: Sequence[Axes], scene: Scene, name: str, colour: str) -> None
     axes[0].plot(flown.time, flown.q2, color=colour, linewidth=1.4, label=name)
     axes[1].plot(flown.time, 1e3 * flown.rate, color=colour, linewidth=1.0, label=name)
     if power is not None:
-        average = np.cumsum(power.supply * power.spans) / np.cumsum(power.spans)
+        average = power.average_so_far(power.supply)
         axes[2].plot(power.time + power.spans, 1e3 * average, color=colour, linewidth=1.4, label=name)
 
 

@@ -101,7 +101,8 @@ def _figures(
         "axis_rms_rad": _rms(off),
         "axis_worst_rad": float(off.max()) if len(off) else math.nan,
         "all_axes_rms_rad": _rms(np.linalg.norm(found.error[settled], axis=1)),
-        "power_w": _mean_power(power, begin, end),
+        "supply_w": math.nan if power is None else _mean(power, power.supply, begin, end),
+        "heat_w": math.nan if power is None else _mean(power, power.heat, begin, end),
     }
 
 
@@ -113,13 +114,11 @@ def _aims(run: Run) -> list[tuple[float, str]]:
     return aims or [(-math.inf, "-")]
 
 
-def _mean_power(power: CoilPower | None, begin: float, end: float) -> float:
-    """Return the mean of R I^2, W, from `begin` to `end`; NaN where it is not known."""
-    if power is None:
-        return math.nan
+def _mean(power: CoilPower, values: FloatArray, begin: float, end: float) -> float:
+    """Return the mean of the power's supply or heat from `begin` to `end`, W; NaN without an interval."""
     inside = (power.time >= begin) & (power.time < end)
     spans = power.spans[inside]
-    return float(power.heat[inside] @ spans / spans.sum()) if inside.any() else math.nan
+    return float(values[inside] @ spans / spans.sum()) if inside.any() else math.nan
 
 
 def _rms(values: FloatArray) -> float:

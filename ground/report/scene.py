@@ -10,7 +10,15 @@ import numpy as np
 from flight.link.telemetry.packets import PacketArray
 from ground.report import performance as limits
 from ground.report.sensing import covariance_matrices, mean_rates, with_rate
-from ground.report.signals import Attitude, CoilPower, coil_power, estimated_attitude, seconds, true_attitude
+from ground.report.signals import (
+    Attitude,
+    CoilPower,
+    bus_power,
+    coil_power,
+    estimated_attitude,
+    seconds,
+    true_attitude,
+)
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.one_axis.path import lgl_rule
@@ -41,6 +49,11 @@ class Scene:
     def power(self) -> CoilPower | None:
         """The coils' power."""
         return coil_power(self.run)
+
+    @cached_property
+    def bus_power(self) -> tuple[FloatArray, FloatArray]:
+        """Times (n,), s, and power (n,), W, of the monitor in the coils' supply."""
+        return bus_power(self.run)
 
     @cached_property
     def end(self) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.coil_power import steady_heat, supply_power
 
 
 @dataclass(frozen=True)
@@ -26,17 +27,13 @@ class Attitude:
 
 @dataclass(frozen=True)
 class CoilPower:
-    """Power that the coils' supply delivered, and heat in the coils.
-
-    The bridges chop the supply, which delivers V |I|: V is the supply voltage at the coils, I the mean
-    current of a PWM period. The thesis's 0.10 W is a supply power and is compared with V |I|. R I^2, the
-    thesis's cost function, is smaller at every current below the largest.
+    """The power of all coils together over the intervals of a run (`knightcube.coil_power`).
 
     Attributes:
         time: (n,) s, the beginning of each interval; the last one ends at `end`.
         end: s.
-        supply: (n,) W, mean of V |I| over each interval.
-        heat: (n,) W, mean of R I^2 over each interval.
+        supply: (n,) W, mean of V |I| over each interval: what the coils take from their supply.
+        heat: (n,) W, mean of R I^2 over each interval: the heat of steady currents, the planner's cost.
         source: "truth", or "written" for the currents on the wire.
     """
 
@@ -52,14 +49,21 @@ class CoilPower:
         return np.diff(np.append(self.time, self.end))
 
     @property
-    def energy(self) -> float:
-        """The integral of R I^2, J."""
-        return float(self.heat @ self.spans)
-
-    @property
     def duration(self) -> float:
         """The time covered, s."""
         return float(np.sum(self.spans))
+
+    def energy(self, power: FloatArray) -> float:
+        """Return the integral of `supply` or `heat`, J."""
+        return float(power @ self.spans)
+
+    def average(self, power: FloatArray) -> float:
+        """Return the mean of `supply` or `heat` over the run, W."""
+        return self.energy(power) / self.duration
+
+    def average_so_far(self, power: FloatArray) -> FloatArray:
+        """Return the mean of `supply` or `heat` from the start to the end of each interval (n,), W."""
+        return np.asarray(np.cumsum(power * self.spans) / np.cumsum(self.spans))
 
 
 def seconds(packets: PacketArray) -> FloatArray:
@@ -99,13 +103,24 @@ def coil_power(run: Run) -> CoilPower | None:
     return _true_power(run["truth"]) or _written_power(run["control"], run["run"])
 
 
+def bus_power(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return the times (n,), s, and the power (n,), W, that a monitor in the coils' supply measured.
+
+    The power is the voltage of the bus, before the losses of the bridges, times the current of all coils.
+    Both arrays are empty without a monitor.
+    """
+    packets = run["housekeeping"]
+    packets = packets[np.isfinite(packets["coil_power"])]
+    return seconds(packets), packets["coil_power"].astype(float)
+
+
 def _true_power(truth: PacketArray) -> CoilPower | None:
     time = seconds(truth)
     if len(time) < 2 or not np.all(np.diff(time) > 0.0):
         return None
     spans = np.diff(time)
-    heat = np.diff(truth["energy"]) / spans
     supply = np.diff(truth["supply_energy"]) / spans
+    heat = np.diff(truth["energy"]) / spans
     return CoilPower(time[:-1], float(time[-1]), supply, heat, "truth")
 
 
@@ -116,6 +131,6 @@ def _written_power(control: PacketArray, run: PacketArray) -> CoilPower | None:
         return None
     resistance = np.nan_to_num(run["coil_resistance"][0].astype(float))
     current = control["current_written"][:-1].astype(float)
-    heat = current**2 @ resistance
-    supply = float(run["supply_voltage"][0]) * np.sum(np.abs(current), axis=1)
+    supply = supply_power(current, float(run["supply_voltage"][0])).sum(axis=1)
+    heat = steady_heat(current, resistance).sum(axis=1)
     return CoilPower(time[:-1], float(time[-1]), supply, heat, "written")

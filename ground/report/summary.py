@@ -33,7 +33,7 @@ from ground.report.performance import Command, Response, commands, interrupted, 
 from ground.report.pointing import pointing
 from ground.report.requirements import judge, required
 from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
-from ground.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
+from ground.report.signals import Attitude, bus_power, coil_power, estimated_attitude, seconds, true_attitude
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 
@@ -216,10 +216,12 @@ def _step_row(command: Command, found: Response | None) -> Object:
 
 
 def _power(run: Run, notes: list[str]) -> Object:
-    """Return average and peak power of the coils and the largest currents."""
+    """Return the coils' power from their supply, R I^2 of their mean currents, and the largest currents."""
     written = np.abs(run["control"]["current_written"])
     actual = np.abs(run["truth"]["current"])
+    _, measured = bus_power(run)
     found: Object = {
+        "bus_average_w": float(measured.mean()) if len(measured) else math.nan,
         "peak_current_a": float(written.max()) if written.size else math.nan,
         "peak_current_actual_a": float(actual.max()) if actual.size else math.nan,
     }
@@ -229,30 +231,21 @@ def _power(run: Run, notes: list[str]) -> Object:
         return {
             **found,
             "source": None,
-            "average_w": math.nan,
-            "peak_w": math.nan,
             "supply_average_w": math.nan,
             "supply_peak_w": math.nan,
-            "bus_average_w": math.nan,
-            "energy_j": math.nan,
+            "supply_j": math.nan,
+            "heat_average_w": math.nan,
+            "heat_j": math.nan,
         }
     return {
         **found,
         "source": power.source,
-        "average_w": power.energy / power.duration,
-        "peak_w": float(power.heat.max()),
-        "supply_average_w": float(power.supply @ power.spans) / power.duration,
+        "supply_average_w": power.average(power.supply),
         "supply_peak_w": float(power.supply.max()),
-        "bus_average_w": _bus_power(run),
-        "energy_j": power.energy,
+        "supply_j": power.energy(power.supply),
+        "heat_average_w": power.average(power.heat),
+        "heat_j": power.energy(power.heat),
     }
-
-
-def _bus_power(run: Run) -> float:
-    """Return the mean power, W, that the monitor in the coils' supply measured; NaN without a monitor."""
-    measured = run["housekeeping"]["coil_power"]
-    known = measured[np.isfinite(measured)]
-    return float(known.mean()) if len(known) else math.nan
 
 
 def _against_thesis(steps: list[tuple[Command, Response]], power: Object) -> list[Object]:
@@ -269,6 +262,9 @@ def _against_thesis(steps: list[tuple[Command, Response]], power: Object) -> lis
         judge("overshoot", [r.overshoot_percent for r in responses], limits.OVERSHOOT_LIMIT_PERCENT, "%"),
         judge("rise time", judged, limits.RISE_LIMIT_S, "s"),
         judge("settling time", [r.settling_s for r in responses], limits.SETTLING_LIMIT_S, "s"),
-        judge("average supply power", [power["supply_average_w"]], limits.AVERAGE_POWER_LIMIT_W, "W"),
+        *(
+            judge(f"average supply power at the {place}", [average], limits.AVERAGE_SUPPLY_POWER_LIMIT_W, "W")
+            for place, average in (("coils", power["supply_average_w"]), ("bus", power["bus_average_w"]))
+        ),
         judge("largest current", [power["peak_current_a"]], limits.CURRENT_LIMIT_A, "A"),
     ]

@@ -156,11 +156,12 @@ def _pointing(found: Object | None) -> list[str]:
             number(aim["begin_s"], 1),
             number(aim["duration_s"], 1),
             *(number(aim[name], 2, degrees) for name in errors),
-            number(aim["power_w"], 2, 1e3),
+            number(aim["supply_w"], 2, 1e3),
+            number(aim["heat_w"], 2, 1e3),
         ]
         for aim in found["targets"]
     ]
-    head = ["pointing to", "from s", "for s", "axis deg rms", "at most", "all axes deg rms", "R I^2 mW"]
+    head = ["pointing to", "from s", "for s", "axis deg rms", "at most", "all axes", "V |I| mW", "R I^2 mW"]
     return [
         f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
         *table(head, rows),
@@ -213,17 +214,24 @@ def _power(power: Object, compared: bool) -> list[str]:
         (power["peak_current_actual_a"], "in the coils (truth)"),
     )
     largest = [f"{number(value, 4)} A {where}" for value, where in currents if value is not None]
-    thesis = ("   (thesis: on the order of 100 mW)", "   (thesis: about 0.5 W)")
-    average, peak = thesis if compared else ("", "")
+    thesis = "on average on the order of 100 mW, at most about 0.5 W"
+    rows = [
+        (
+            "supply power V |I| at the coils",
+            f"on average {number(power['supply_average_w'], 1, 1e3)} mW, "
+            f"at most {number(power['supply_peak_w'], 3)} W, {number(power['supply_j'], 2)} J in all",
+        ),
+        ("supply power measured at the bus", f"on average {number(power['bus_average_w'], 1, 1e3)} mW"),
+        *([("consumption stated in the thesis", thesis)] if compared else []),
+        (
+            "R I^2, heat of steady currents",
+            f"on average {number(power['heat_average_w'], 3, 1e3)} mW, {number(power['heat_j'], 3)} J in all",
+        ),
+        ("largest current", ", ".join(largest)),
+    ]
     return [
         f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
-        f"  supply, V |I|   {number(power['supply_average_w'], 1, 1e3)} mW on average at the coils{average}",
-        f"                  {number(power['bus_average_w'], 1, 1e3)} mW on average at the bus "
-        "(monitor, once a second)",
-        f"                  {number(power['supply_peak_w'], 3)} W at most{peak}",
-        f"  heat, R I^2     {number(power['average_w'], 3, 1e3)} mW on average, "
-        f"{number(power['peak_w'], 3)} W at most, {number(power['energy_j'], 3)} J in all",
-        f"  largest current {', '.join(largest)}",
+        *(f"  {name:34}{text}" for name, text in rows),
     ]
 
 

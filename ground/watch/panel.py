@@ -60,7 +60,7 @@ def _facts(view: View) -> list[tuple[str, RenderableType]]:
         supply = [view.value("housekeeping", name) for name in ("coil_voltage", "coil_current", "coil_power")]
         volts, amperes, watts = supply
         text = f"{_figure(volts, 2)} V  {_figure(1e3 * amperes, 1)} mA  {_figure(1e3 * watts, 1)} mW"
-        rows.append(("supply", Text(text)))
+        rows.append(("coil bus", Text(text)))
         frames, rates = (int(view.value("housekeeping", name)) for name in ("frames", "streak_rates"))
         rows.append(("camera", Text(f"{frames} frames, {rates} rates into the estimate")))
     if "health" in view.newest:

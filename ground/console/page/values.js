@@ -74,8 +74,8 @@ export class Health {
       add("slots lost", String(health.slips), health.slips > 0 ? "warn" : "good", this.fields.get("health.slips"));
     }
     if (supply) {
-      number("coil supply", "housekeeping.coil_voltage", 1, 2, "V");
-      number("coil power at the bus", "housekeeping.coil_power", 1e3, 1, "mW");
+      number("coil bus voltage", "housekeeping.coil_voltage", 1, 2, "V");
+      number("coil bus power", "housekeeping.coil_power", 1e3, 1, "mW");
       add("records lost", String(supply.records_lost), supply.records_lost > 0 ? "warn" : "good", this.fields.get("housekeeping.records_lost"));
     }
     number("processor", "health.cpu_share", 100, 0, "%");

@@ -29,7 +29,10 @@ STREAK_ERROR = 2e-4  # of each streak rate about the thread, rad/s, alternating 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What to fly: `duration` of `planned` s, `hold` s a target, at `rate_hz`, with or without extras."""
+    """What to fly: `duration` of `planned` s, `hold` s a target, at `rate_hz`, with or without extras.
+
+    `bus_power`, W, is what a monitor in the coils' supply measures each second, None without a monitor.
+    """
 
     duration: float = 700.0
     planned: float = 700.0
@@ -40,6 +43,7 @@ class Recipe:
     identity: bool = True
     performance: bool = True
     commands: bool = True
+    bus_power: float | None = 0.05
 
 
 def second_order(t: FloatArray, damping: float, frequency: float) -> FloatArray:
@@ -93,6 +97,8 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
             logs["flight"].write(_streak(packer, stamp, i // frame, exposed))
             logs["flight"].write(_stars(packer, stamp, i // frame, q2[i]))
         logs["flight"].write(_control(packer, stamp, i, q2[i], rate[i], current[i]))
+        if recipe.bus_power is not None and i % round(recipe.rate_hz) == 0:
+            logs["flight"].write(_housekeeping(packer, stamp, recipe.bus_power))
         if recipe.truth:
             logs["truth"].write(_truth(packer, stamp, q2[i], rate[i], current[i], spent[i]))
         if recipe.performance:
@@ -146,6 +152,11 @@ def _control(packer: Packer, stamp: int, cycle: int, q2: float, rate: float, cur
         current_written=(current, 0.0, 0.0),
         saturated=False,
     )
+
+
+def _housekeeping(packer: Packer, stamp: int, bus_power: float) -> bytes:
+    values: dict[str, object] = {field.name: 0 for field in table.HOUSEKEEPING.fields}
+    return packer.pack(table.HOUSEKEEPING, stamp, {**values, "coil_power": bus_power})
 
 
 def _truth(packer: Packer, stamp: int, q2: float, rate: float, current: float, spent: float) -> bytes:

@@ -66,6 +66,24 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     assert drawn.max() == CURRENT
 
 
+def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tmp_path: Path) -> None:
+    """0.1 A in a tenth of the time: 34 mW at 3.4 V, 50 mW measured at the bus, 23 mW of R I^2."""
+    scene, ax = Scene(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots()
+    panels.power(ax, scene)
+    drawn = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in ax.get_lines()}
+    assert drawn["$V |I|$ at the coils"].max() == pytest.approx(0.34)
+    assert drawn["average, 34.0 mW"][-1] == pytest.approx(0.034)
+    assert drawn["average at the bus, 50.0 mW"][-1] == pytest.approx(0.050)
+    assert drawn["average $R I^2$, 23.0 mW"][-1] == pytest.approx(0.023)
+    assert drawn["thesis, 100 mW"][0] == 0.10
+
+
+def test_two_runs_are_compared_by_their_supply_power(tmp_path: Path) -> None:
+    scene, axes = Scene(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots(3)
+    panels.compared(axes, scene, "A", "black")
+    assert np.asarray(axes[2].get_lines()[0].get_ydata(), float)[-1] == pytest.approx(34.0)
+
+
 def test_one_late_cycle_of_thousands_does_not_flatten_the_distribution() -> None:
     times = 1e-4 * np.random.default_rng(1).gamma(3.0, size=4000)
     times[7] = 3.0

@@ -59,7 +59,7 @@ def flown(folder: Path, limit_deg: float) -> Path:
                 SPIN, stamp, known=0, rate=NAN3, rate_sigma=1.0, field=NAN3, restarts=0, dipole=(0.0,) * 3
             )
         )
-        coils = {"current": (0.0,) * 3, "energy": 0.002 * at, "supply_energy": 0.0}
+        coils = {"current": (0.0,) * 3, "energy": 0.002 * at, "supply_energy": 0.03 * at}
         truth.write(packer.pack(table.TRUTH, stamp, quaternion=true, rate=(0.0, 0.001, 0.0), **coils))
         turn = 2.0 * math.pi * at / 5700.0
         place = [7e6 * math.cos(turn), 0.0, 7e6 * math.sin(turn)]
@@ -89,7 +89,8 @@ def test_each_target_is_judged_by_the_true_attitude_once_settled(folder: Path) -
     for aim in found["targets"]:
         assert math.degrees(aim["axis_rms_rad"]) == pytest.approx(5.0), "x and y; z is the axis that points"
         assert math.degrees(aim["all_axes_rms_rad"]) == pytest.approx(13.0)
-        assert aim["power_w"] == pytest.approx(0.002)
+        assert aim["supply_w"] == pytest.approx(0.03)
+        assert aim["heat_w"] == pytest.approx(0.002)
 
 
 def test_requirements_are_judged_and_what_cannot_be_known_is_unknown(folder: Path, tmp_path: Path) -> None:

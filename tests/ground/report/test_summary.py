@@ -66,21 +66,23 @@ def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
         "overshoot": (20.0, "%"),
         "rise time": (8.0, "s"),
         "settling time": (30.0, "s"),
-        "average supply power": (0.10, "W"),
+        "average supply power at the coils": (0.10, "W"),
+        "average supply power at the bus": (0.10, "W"),
         "largest current": (0.148, "A"),
     }
     assert {row["verdict"] for row in rows.values()} == {"pass"}
     assert rows["overshoot"]["worst"] == pytest.approx(OVERSHOOT, abs=0.05)
 
 
-def test_supply_power_is_v_i_and_heat_r_i_squared_from_the_true_energies(full: Run) -> None:
+def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> None:
     """A tenth of the time at 0.1 A."""
     power = summarise(full)["power"]
     assert power["source"] == "truth"
-    assert power["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
-    assert power["peak_w"] == pytest.approx(RESISTANCE * CURRENT**2, rel=1e-6)
+    assert power["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
+    assert power["heat_j"] == pytest.approx(70.0 * RESISTANCE * CURRENT**2, rel=1e-9)
     assert power["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
     assert power["supply_peak_w"] == pytest.approx(VOLTAGE * CURRENT, rel=1e-6)
+    assert power["supply_j"] == pytest.approx(70.0 * VOLTAGE * CURRENT, rel=1e-9)
     assert power["peak_current_a"] == CURRENT
 
 
@@ -97,7 +99,7 @@ def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) 
     summary = summarise(run)
     assert summary["attitude_source"] == "estimate"
     assert summary["power"]["source"] == "written"
-    assert summary["power"]["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
+    assert summary["power"]["heat_average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
     assert summary["power"]["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
     assert summary["power"]["peak_current_actual_a"] is None
     assert summary["estimate"] is None
@@ -130,7 +132,7 @@ def test_a_run_without_targets_has_no_steps_and_unknown_verdicts(tmp_path: Path)
     assert summary["steps"] == []
     verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
     assert verdicts["rise time"] == verdicts["overshoot"] == "unknown"
-    assert verdicts["average supply power"] == "pass"
+    assert verdicts["average supply power at the coils"] == "pass"
     assert "no target packets: no steps to judge" in summary["notes"]
 
 
@@ -180,19 +182,30 @@ def test_a_step_never_settled_is_a_miss(tmp_path: Path, monkeypatch: pytest.Monk
     assert verdicts["settling time"] == "miss"
 
 
-def test_a_figure_beyond_the_thesis_is_a_miss(tmp_path: Path) -> None:
+def test_without_a_monitor_the_power_at_the_bus_is_unknown(tmp_path: Path) -> None:
+    summary = summarise(short(tmp_path, bus_power=None))
+    assert summary["power"]["bus_average_w"] is None
+    (bus,) = [row for row in summary["thesis"] if row["quantity"] == "average supply power at the bus"]
+    assert (bus["worst"], bus["verdict"]) == (None, "unknown")
+
+
+def test_the_supply_power_is_judged_by_the_thesis_whatever_r_i_squared_is(tmp_path: Path) -> None:
+    """0.11 W at the coils and 0.16 W at the bus against 0.10 W; R I^2 is 0.01 W."""
     log, packer = FlightLog(tmp_path, "truth", clock=ManualClock()), Packer()
     for i in range(100):
         log.write(
             packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0, 0), current=(0.2, 0, 0),
-                        energy=0.01 * 0.025 * i,
-                        supply_energy=0.11 * 0.025 * i)
+                        energy=0.01 * 0.025 * i, supply_energy=0.11 * 0.025 * i)
         )  # fmt: skip
     log.close()
-    make_run(tmp_path, Recipe(duration=2.0, truth=False))
-    rows = {row["quantity"]: row for row in summarise(read_run(tmp_path))["thesis"]}
-    assert rows["average supply power"]["verdict"] == "miss"
-    assert rows["average supply power"]["worst"] == pytest.approx(0.11)
+    make_run(tmp_path, Recipe(duration=2.0, truth=False, bus_power=0.16))
+    summary = summarise(read_run(tmp_path))
+    rows = {row["quantity"]: row for row in summary["thesis"]}
+    for place, average in (("coils", 0.11), ("bus", 0.16)):
+        row = rows[f"average supply power at the {place}"]
+        assert (row["verdict"], row["limit"]) == ("miss", 0.10)
+        assert row["worst"] == pytest.approx(average)
+    assert summary["power"]["heat_average_w"] == pytest.approx(0.01)
 
 
 def test_a_run_without_its_identity_is_still_reported(tmp_path: Path) -> None:
@@ -281,9 +294,16 @@ def test_the_summary_is_strict_json(tmp_path: Path, changes: dict[str, object]) 
 def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     text = format_report(summarise(full))
     assert "3  -0.100 -> +0.000" in text
-    for row in ("steady-state error", "overshoot", "rise time", "settling time", "average supply power"):
+    supply = "average supply power at the coils"
+    for row in ("steady-state error", "overshoot", "rise time", "settling time", supply):
         (line,) = [line for line in text.splitlines() if line.strip().startswith(row)]
         assert line.endswith("pass")
+    assert "  supply power V |I| at the coils   on average 34.0 mW, at most 0.340 W, 23.80 J in all\n" in text
+    assert "  supply power measured at the bus  on average 50.0 mW\n" in text
+    assert (
+        "  consumption stated in the thesis  on average on the order of 100 mW, at most about 0.5 W\n" in text
+    )
+    assert "  R I^2, heat of steady currents    on average 23.000 mW, 16.100 J in all\n" in text
     assert "planner: 3 jobs (done 3)" in text
     assert max(len(line) for line in text.splitlines()) <= 120
 

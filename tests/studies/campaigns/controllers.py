@@ -1,15 +1,16 @@
 """Campaign `controllers`: the 700 s step demonstration under each controller, on the same seeds.
 
-The thesis gives 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch.
-5, Hardware Results). Here all fly the same simulated hardware with the same noise: this loop, also with paths
-that save supply energy, the thesis's, the thesis's on raw readings (its filter made transparent), and PID and
-adaptive control, which are shown the targets themselves. All gains of PID and adaptive are tuned by one
-criterion, `python -m tests.studies.tune_controllers`: the least power with every step settled in 9 s and
-overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone, and a PID by three poles in
-one place, stand beside them.
+The thesis states a power consumption of 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive
+control on its testbed (ch. 5, Hardware Results). Here all fly the same simulated hardware with the same
+noise: this loop, also with paths that save supply energy, the thesis's, the thesis's on raw readings (its
+filter made transparent), and PID and adaptive control, which are shown the targets themselves. All gains of
+PID and adaptive are tuned by one criterion, `python -m tests.studies.tune_controllers`: the least power with
+every step settled in 9 s and overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone,
+and a PID by three poles in one place, stand beside them.
 
-Two powers are given: R I^2 of the mean current, the thesis's cost, and V |I|, which the chopped coils take
-from their supply of 3.4 V.
+Two powers are given (`knightcube.coil_power`): V |I|, which the chopped coils take from their supply of 3.4 V
+and which compares with the thesis's consumption, and R I^2 of the mean current, the cost that the paths
+minimise.
 
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
 command and held, by direct collocation (tests.knightcube.gnc.guidance.oracle). What reaches its targets later
@@ -136,7 +137,7 @@ def run(case: Case) -> Result:
         "overshoot_percent": _worst(rows, "overshoot_percent"),
         "rise_s": _worst(rows[1:], "rise_s"),
         "settling_s": _worst(rows, "settling_s"),
-        "power_w": summary["power"]["average_w"],
+        "heat_w": summary["power"]["heat_average_w"],
         "supply_w": summary["power"]["supply_average_w"],
     }
 
@@ -189,31 +190,30 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     floor = clairvoyant_power(this_loop(), demo_world())
     facts: dict[str, Any] = {"clairvoyant_w": floor, "controllers": {}}
     head = "".join(f"{label:>14}" for _, label in FIGURES)
-    lines = [f"{'':22}{'R I^2, mW':>11}{'V |I|, mW':>11}{'thesis, V |I|':>15}{'over floor':>12}{head}"]
-    lines.append(f"{'clairvoyant optimum':22}{1e3 * floor:11.2f}{'-':>11}{'-':>15}{1.0:12.3f}")
+    lines = [f"{'':22}{'V |I|, mW':>11}{'thesis, mW':>12}{'R I^2, mW':>11}{'over floor':>12}{head}"]
+    lines.append(f"{'clairvoyant optimum':22}{'-':>11}{'-':>12}{1e3 * floor:11.2f}{1.0:12.3f}")
     for name in CONTROLLERS:
         own = [result for result in results if result["controller"] == name]
-        power = float(np.mean([result["power_w"] for result in own]))
+        heat = float(np.mean([result["heat_w"] for result in own]))
         supply = float(np.mean([result["supply_w"] for result in own]))
         worst = {key: float(max(result[key] for result in own)) for key, _ in FIGURES}
         facts["controllers"][name] = {
             "seeds": len(own),
-            "power_w": power,
             "supply_w": supply,
-            "over_floor": power / floor,
+            "thesis_w": THESIS_W.get(name),
+            "heat_w": heat,
+            "over_floor": heat / floor,
             **{key: value if np.isfinite(value) else None for key, value in worst.items()},
         }
         figures = "".join(f"{worst[key]:14.3f}" for key, _ in FIGURES)
-        thesis = f"{1e3 * THESIS_W[name]:15.0f}" if name in THESIS_W else f"{'-':>15}"
-        lines.append(
-            f"{name:22}{1e3 * power:11.2f}{1e3 * supply:11.2f}{thesis}{power / floor:12.3f}{figures}"
-        )
+        thesis = f"{1e3 * THESIS_W[name]:12.0f}" if name in THESIS_W else f"{'-':>12}"
+        lines.append(f"{name:22}{1e3 * supply:11.2f}{thesis}{1e3 * heat:11.2f}{heat / floor:12.3f}{figures}")
     picture = _draw(facts, folder / "controllers.png")
     return Summary("\n".join(lines) + "\n", facts, (picture,))
 
 
 def _draw(facts: dict[str, Any], path: Path) -> Path:
-    """Draw power against settling time, the floor as a line."""
+    """Draw R I^2 against settling time, the floor as a line."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     figure = Figure(figsize=(6.5, 4.0), layout="constrained")
@@ -221,9 +221,9 @@ def _draw(facts: dict[str, Any], path: Path) -> Path:
     axes.axhline(1e3 * facts["clairvoyant_w"], color="0.5", linewidth=1, label="clairvoyant optimum")
     for name, found in facts["controllers"].items():
         if found["settling_s"] is not None:
-            axes.plot(found["settling_s"], 1e3 * found["power_w"], "o", label=name)
+            axes.plot(found["settling_s"], 1e3 * found["heat_w"], "o", label=name)
     axes.set_xlabel("settling time, worst step (s)")
-    axes.set_ylabel("average heat in the coils, $R I^2$ (mW)")
+    axes.set_ylabel("average R I² of the mean current (mW)")
     axes.set_ylim(bottom=0.0)
     axes.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=110)

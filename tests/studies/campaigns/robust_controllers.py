@@ -52,7 +52,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         found: dict[str, Any] = {
             "worlds": len(mine),
             "lost": sum(result["lost"] for result in mine),
-            "power_w": float(np.mean([result["power_w"] for result in mine])),
+            "heat_w": float(np.mean([result["heat_w"] for result in mine])),
         }
         cells = []
         for key, _label in FIGURES:
@@ -61,8 +61,8 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             found[key] = [level if math.isfinite(level) else None for level in levels]
             cells.append(f"{levels[0]:.3f}, {levels[1]:.3f}")
         facts[name] = found
-        power = f"{1e3 * found['power_w']:.2f}"
-        lines.append(_ROW.format(name, found["worlds"], found["lost"], power, *cells))
+        heat = f"{1e3 * found['heat_w']:.2f}"
+        lines.append(_ROW.format(name, found["worlds"], found["lost"], heat, *cells))
     return Summary("\n".join(lines) + "\n", facts)
 
 

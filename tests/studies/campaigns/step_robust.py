@@ -149,7 +149,7 @@ def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
         "world": drawn,
         **figures,
         "lost": not excursion < LOST_DEG,
-        "power_w": summary["power"]["average_w"],
+        "heat_w": summary["power"]["heat_average_w"],
         "events": {name: names.count(name) for name in sorted(set(names))},
     }
 
