@@ -27,7 +27,7 @@ OVERSHOOT_LIMIT_PERCENT = 20.0
 RISE_LIMIT_S = 8.0
 SETTLING_LIMIT_S = 30.0
 AVERAGE_SUPPLY_POWER_LIMIT_W = 0.10
-"""The thesis's average power consumption (ch. 5, Hardware Results): V |I|, not R I^2."""
+"""The thesis's average power consumption (ch. 5, Hardware Results), compared with the supply's V |I|."""
 CURRENT_LIMIT_A = 0.148
 
 

@@ -161,7 +161,16 @@ def _pointing(found: Object | None) -> list[str]:
         ]
         for aim in found["targets"]
     ]
-    head = ["pointing to", "from s", "for s", "axis deg rms", "at most", "all axes", "V |I| mW", "R I^2 mW"]
+    head = [
+        "pointing to",
+        "from s",
+        "for s",
+        "axis deg rms",
+        "at most",
+        "all axes deg rms",
+        "V |I| mW",
+        "R I^2 mW",
+    ]
     return [
         f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
         *table(head, rows),
