@@ -133,7 +133,7 @@ def power(ax: Axes, scene: Scene) -> None:
         label="thesis, 100 mW",
     )
     ax.set_ylim(bottom=0.0)
-    style(ax, "power, W", "Power from the coils' supply")
+    style(ax, "power, W", "Coil power")
     legend(ax)
 
 

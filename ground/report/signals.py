@@ -9,7 +9,7 @@ import numpy as np
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.coil_power import steady_heat, supply_power
+from knightcube.gnc.coil_power import steady_heat, supply_power
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Attitude:
 
 @dataclass(frozen=True)
 class CoilPower:
-    """The power of all coils together over the intervals of a run (`knightcube.coil_power`).
+    """The power of all coils together over the intervals of a run (`knightcube.gnc.coil_power`).
 
     Attributes:
         time: (n,) s, the beginning of each interval; the last one ends at `end`.

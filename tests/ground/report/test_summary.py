@@ -86,14 +86,6 @@ def test_supply_power_and_heat_are_means_from_the_true_energies(full: Run) -> No
     assert power["peak_current_a"] == CURRENT
 
 
-def test_the_thesis_s_power_is_compared_with_the_supply_power(full: Run) -> None:
-    summary = summarise(full)
-    rows = {row["quantity"]: row for row in summary["thesis"]}
-    assert rows["average supply power"]["worst"] == summary["power"]["supply_average_w"]
-    (line,) = [line for line in format_report(summary).splitlines() if "on the order of 100 mW" in line]
-    assert line.split()[:3] == ["supply,", "V", "|I|"]
-
-
 def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) -> None:
     run = short(tmp_path, truth=False, duration=300.0, planned=300.0)
     summary = summarise(run)

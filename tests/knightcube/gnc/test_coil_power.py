@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.coil_power import steady_heat, supply_power
+from knightcube.gnc.coil_power import steady_heat, supply_power
 from tests.hal.coils.rig import Rig
 
 VOLTAGE, BUS_VOLTAGE, RESISTANCE = 3.4, 5.0, 23.0
