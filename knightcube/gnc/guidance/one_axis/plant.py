@@ -23,6 +23,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
+from knightcube.gnc.coil_power import steady_heat, supply_power
 
 Q2_LIMIT = 0.68
 """No path leads beyond: cos(theta) is 0.075 there; at 0.707 no current turns the body at all."""
@@ -160,7 +161,7 @@ _ROUNDED = 0.1
 
 
 class PathCost(StrEnum):
-    """The power whose integral is least along a path."""
+    """The power whose integral a path minimises: R I^2 (Sease 5.1), or V |I| from the supply."""
 
     HEAT = "heat"
     SUPPLY = "supply"
@@ -168,8 +169,8 @@ class PathCost(StrEnum):
     def power(self, plant: SingleAxisPlant, current: FloatArray) -> FloatArray:
         """Return the power in W for mean currents (m,) in A."""
         if self is PathCost.HEAT:
-            return np.asarray(plant.resistance * current * current)
-        return np.asarray(plant.resistance * plant.current_limit * np.abs(current))
+            return steady_heat(current, plant.resistance)
+        return supply_power(current, plant.resistance * plant.current_limit)
 
     def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the power as it is minimised, W, and its derivative, W/A, for mean currents (m,) in A."""
