@@ -1,4 +1,42 @@
-"""A library of attitude determination, vision and magnetic control: pure functions and small classes.
+"""KnightCube: attitude determination, vision and magnetic control of small satellites, as a library.
 
-Nothing here knows a clock, a configuration, a device or a socket.
+    from knightcube import StarTracker
+
+    solution = StarTracker(fov_deg=11.4).solve(image)
+
+The names exported here are the public interface. The modules below `knightcube` may be imported too, but may
+change with any release. Nothing in this package needs a clock, a configuration file, a device or a socket.
+
+A name is imported at its first use, so `import knightcube` takes no time. A new name needs one line in each
+of the two lists below: the first is for type checkers and editors, the second for the interpreter.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from knightcube.vision.star_tracker import MatchedStars as MatchedStars
+    from knightcube.vision.star_tracker import StarSolution as StarSolution
+    from knightcube.vision.star_tracker import StarTracker as StarTracker
+
+_MODULE_OF = {
+    "MatchedStars": "knightcube.vision.star_tracker",
+    "StarSolution": "knightcube.vision.star_tracker",
+    "StarTracker": "knightcube.vision.star_tracker",
+}
+__all__ = list(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name, imported now. Raises AttributeError for another name."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the names of the module, those not yet imported included."""
+    return sorted({*globals(), *_MODULE_OF})

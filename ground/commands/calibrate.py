@@ -18,12 +18,12 @@ from ground.calibration.lens_fit import MatchedFrame
 from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
 from ground.calibration.terms import FixedTerms, LeftOut
 from ground.commands.options import check_size, positive, write_new
-from ground.commands.solve import lens_of_field
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.star_tracker import camera_of_field
 from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     frames = _read(options.images)
     shape = frames[0][1].shape
     sky = default_index()
-    pictures, selected = _calibrated(frames, *lens_of_field(options.fov, None, shape), sky)
+    pictures, selected = _calibrated(frames, *camera_of_field(options.fov, None, shape), sky)
     if selected is None:
         for picture in pictures:
             sys.stderr.write(f"{picture.path}: {picture.reason}\n")

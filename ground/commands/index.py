@@ -12,8 +12,8 @@ from pathlib import Path
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from ground.commands.options import add_field
-from ground.commands.solve import field_of_view
 from knightcube.errors import UsageError
+from knightcube.vision.star_tracker import field_of_view
 from knightcube.vision.startracker.index.build import DEFAULT, IndexSettings, build
 from knightcube.vision.startracker.index.sky_index import save
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.docs.blocks import ROOT
@@ -55,6 +56,18 @@ def test_a_device_is_read_through_its_driver_and_fails_with_a_reason() -> None:
     printed = run([str(EXAMPLES / "device.py")], ROOT).stdout.splitlines()
     assert printed[:2] == ["+21.5000 degree C", "-25.0625 degree C"]
     assert "tmp102 at 0x48: no acknowledge" in printed[2]
+
+
+def test_the_star_tracker_solves_the_image_of_its_example(tmp_path: Path) -> None:
+    """Alnilam, HIP 26311, V 1.69, stands near the middle of the field that the script draws."""
+    script = str(EXAMPLES / "star_tracker.py")
+    printed = run([script], ROOT).stdout.splitlines()
+    assert printed[0] == "right ascension  84.050 deg"
+    assert printed[1] == "declination      -1.200 deg"
+    assert "HIP 26311        V 1.69 at pixel 511" in printed[6]
+    dark = tmp_path / "dark.npy"
+    np.save(dark, np.random.default_rng(2).poisson(100.0, (64, 64)))
+    assert "not solved: " in run([script, str(dark)], ROOT, status=1).stderr
 
 
 @pytest.mark.slow

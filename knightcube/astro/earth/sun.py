@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -21,6 +22,15 @@ J2000 = 2_451_545.0
 """The Julian date of 2000 January 1.5 TT."""
 DAY = 86_400.0
 """s."""
+
+
+def julian_date(utc: datetime) -> float:
+    """Return the Julian date of an instant, days; an instant without a time zone is UTC.
+
+    The result is a Julian date UTC. It differs from TT by about 69 s.
+    """
+    instant = utc.replace(tzinfo=UTC) if utc.tzinfo is None else utc
+    return J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
 
 
 def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:

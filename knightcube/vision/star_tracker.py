@@ -1,0 +1,316 @@
+"""The star tracker as one class: an image of the sky in, an attitude or the reason for none out.
+
+    solution = StarTracker(fov_deg=11.4).solve(image)
+
+It combines the steps of `knightcube.vision.startracker` with those for streaked stars by the decision tree of
+`knightcube.vision.frame_job`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
+from knightcube.errors import InputError
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
+from knightcube.vision.startracker.sky_map import Pointing, SkyMap
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
+
+UNKNOWN_FOV_DEG = 4.0, 60.0
+"""Range of the fields of view (deg) that is searched when none is given."""
+FOV_TOLERANCE = 0.05
+"""Default uncertainty of a given field of view, as a fraction of it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedStars:
+    """The catalogue stars that were identified in an image, the brightest in the image first.
+
+    Attributes:
+        hip: Hipparcos numbers (m,); of stars that the image cannot resolve, that of the brightest.
+        magnitude: Johnson V magnitudes (m,); the joint magnitude of unresolved stars.
+        directions: unit vectors (m, 3), ICRS, at the epoch of the image.
+        points: measured positions (m, 2), px, x and y; of a streaked star the position at mid-exposure.
+        residuals: measured minus predicted positions (m, 2), px.
+    """
+
+    hip: IntArray
+    magnitude: FloatArray
+    directions: FloatArray
+    points: FloatArray
+    residuals: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.hip)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StarSolution:
+    """The attitude of a camera from one image of the sky, or the reason why there is none.
+
+    A solution is true (`if solution:`) when the image was solved. Otherwise angles, quaternion and covariance
+    are NaN, `stars` is empty, and `reason` says why.
+
+    Attributes:
+        status: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
+        reason: why the image was not solved, in one sentence; empty when it was.
+        right_ascension: of the boresight, ICRS, rad, 0 to 2 pi.
+        declination: of the boresight, ICRS, rad.
+        roll: position angle of the upward direction of the image (-y), from north through east, rad, 0 to
+            2 pi.
+        quaternion: attitude (4,) at mid-exposure, scalar last. It rotates ICRS into the camera frame:
+            boresight +z, x to the right along the rows of pixels, y down.
+        covariance: of the attitude error (3, 3), rad^2, as a small rotation about the axes of the camera.
+        stars: the identified stars.
+        field_of_view: angle across the columns, edge to edge, without distortion, rad, fitted to the stars
+            unless the camera is calibrated.
+        field_of_view_sigma: its standard deviation, rad; 0 for a calibrated camera.
+        log10_false_alarm: log10 of an upper bound of the probability that randomly placed points would have
+            been solved.
+        mirrored: whether the image shows the sky as a mirror does; the attitude is then that of the image
+            with left and right exchanged about the optical axis.
+        rate: angular velocity (3,) of the camera with respect to inertial space, camera axes, rad/s, if the
+            stars are streaks and the exposure was given; else None.
+        rate_covariance: its covariance (3, 3), rad^2/s^2; else None.
+        rate_sign_known: whether the sign of `rate` is known: a single image shows it only together with a
+            predicted rate.
+        sky_map: conversion between pixels and ICRS directions; None unless solved.
+        frame: all results of the star tracker, which include the points that are not catalogue stars.
+        index: the sky index at the epoch of the image; `frame.star` counts its stars.
+    """
+
+    status: str
+    reason: str
+    right_ascension: float
+    declination: float
+    roll: float
+    quaternion: FloatArray
+    covariance: FloatArray
+    stars: MatchedStars
+    field_of_view: float
+    field_of_view_sigma: float
+    log10_false_alarm: float
+    mirrored: bool
+    rate: FloatArray | None
+    rate_covariance: FloatArray | None
+    rate_sign_known: bool
+    sky_map: SkyMap | None
+    frame: FrameSolution
+    index: SkyIndex
+
+    def __bool__(self) -> bool:
+        """Return whether the image was solved."""
+        return self.frame.fix is not None
+
+    @property
+    def right_ascension_deg(self) -> float:
+        """The right ascension of the boresight, deg, 0 to 360."""
+        return math.degrees(self.right_ascension)
+
+    @property
+    def declination_deg(self) -> float:
+        """The declination of the boresight, deg."""
+        return math.degrees(self.declination)
+
+    @property
+    def roll_deg(self) -> float:
+        """The position angle of the image's upward direction, from north through east, deg, 0 to 360."""
+        return math.degrees(self.roll)
+
+    @property
+    def field_of_view_deg(self) -> float:
+        """The angle across the columns, edge to edge, deg."""
+        return math.degrees(self.field_of_view)
+
+
+class StarTracker:
+    """Determines the attitude of a camera from single images of the sky, with or without a prior.
+
+    It identifies the stars against the Hipparcos catalogue to V 8.5 and fits the attitude to their positions
+    in the image. Streaked stars give the angular velocity too. An instance can be used for any number of
+    images. The sky index is made at the first use, in some seconds, and kept in the cache folder of the user.
+
+    Args:
+        fov_deg: field of view across the columns, edge to edge, deg, 1 to 120. None: any from 4 to 60 deg.
+        fov_error_deg: largest error of the field of view, deg. None: 5 % of `fov_deg`; a `camera` is exact.
+        camera: a calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
+        settings: tolerances and methods of detection, identification and attitude. None: the defaults.
+        index: a sky index, or the file of one. None: the default index.
+
+    Raises:
+        InputError: if a field of view is out of range or is given together with a camera, or if the index
+            cannot be read.
+
+    Source: the overall method follows Michalski, chapter 3; see `knightcube.vision.startracker`.
+    """
+
+    def __init__(
+        self,
+        fov_deg: float | None = None,
+        fov_error_deg: float | None = None,
+        *,
+        camera: CameraModel | None = None,
+        settings: SolveSettings | None = None,
+        index: SkyIndex | Path | str | None = None,
+    ) -> None:
+        if fov_deg is not None and camera is not None:
+            raise InputError("fov_deg", "give a field of view or a camera, not both")
+        _check_field_of_view(fov_deg, fov_error_deg)
+        self._fov_deg, self._fov_error_deg, self._camera = fov_deg, fov_error_deg, camera
+        self._settings = SolveSettings() if settings is None else settings
+        if index is None:
+            self._index = default_index()
+        else:
+            self._index = index if isinstance(index, SkyIndex) else load_once(Path(index))
+
+    def solve(
+        self,
+        image: Image,
+        *,
+        exposure: float | None = None,
+        utc: datetime | None = None,
+        attitude: FloatArray | None = None,
+        attitude_sigma: float = 1e-3,
+        rate: FloatArray | None = None,
+        rate_sigma: float = 0.0,
+    ) -> StarSolution:
+        """Return the attitude at mid-exposure of an image, or the reason why it has none.
+
+        Args:
+            image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger. A
+                larger value is brighter. Colour images must be converted to grey values first.
+            exposure: exposure time, s; needed only for the rate of streaked stars.
+            utc: date of the image, UTC if it has no time zone. It is used for proper motion and for the
+                aberration by the velocity of the Earth, 20.5" at most. None: the epoch of the index and no
+                aberration.
+            attitude: predicted attitude (4,), ICRS to camera. Stars are searched near their predicted
+                positions first, which is faster, and in the whole sky if that fails.
+            attitude_sigma: standard deviation of the prediction about each axis, rad.
+            rate: predicted angular velocity (3,), camera axes, rad/s. It decides the sign of a measured rate.
+            rate_sigma: standard deviation of each component, rad/s.
+
+        Raises:
+            ValueError: if the image is not two-dimensional, smaller than 16 x 16 pixels, or not finite.
+            InputError: if the image does not have the size of the camera.
+        """
+        image = np.asarray(image)
+        if image.ndim != 2:
+            raise ValueError(f"an image of shape {image.shape}: give (rows, columns)")
+        camera, scale = self._camera_for(image.shape)
+        sky, settings = self._index, self._settings
+        if utc is not None:
+            date = julian_date(utc)
+            sky = sky.at(2000.0 + (date - J2000) / 365.25)
+            settings = replace(settings, velocity=earth_velocity(date))
+        frame = solve_frame(
+            image,
+            camera,
+            scale,
+            1.0 if exposure is None else exposure,
+            sky,
+            settings,
+            None if attitude is None else AttitudePrior(np.asarray(attitude, dtype=float), attitude_sigma),
+            None if rate is None else RatePrior(np.asarray(rate, dtype=float), rate_sigma),
+        )
+        return _solution(frame, sky, settings.velocity, exposure is not None)
+
+    def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
+        """Return the camera for an image of `shape`, and the range of factors of its tangents."""
+        camera = self._camera
+        if camera is None:
+            return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
+        if shape != (camera.rows, camera.columns):
+            raise InputError(
+                "image",
+                f"{shape[1]} x {shape[0]} pixels, but the camera has {camera.columns} x {camera.rows}",
+            )
+        if self._fov_error_deg is None:
+            return camera, (1.0, 1.0)
+        return camera, camera_of_field(math.degrees(field_of_view(camera)), self._fov_error_deg, shape)[1]
+
+
+def field_of_view(camera: CameraModel) -> float:
+    """Return the angle across the columns of a camera, edge to edge, without its distortion, rad."""
+    return 2.0 * math.atan(0.5 * camera.columns / camera.focal_length)
+
+
+def camera_of_field(
+    fov_deg: float | None, error_deg: float | None, shape: tuple[int, ...]
+) -> tuple[Pinhole, tuple[float, float]]:
+    """Return a pinhole camera for a field of view, and the range of factors by which its tangents may be off.
+
+    Args:
+        fov_deg: field of view across the columns, deg; None: any of `UNKNOWN_FOV_DEG`.
+        error_deg: largest error of `fov_deg`, deg; None: 5 % of it.
+        shape: rows and columns of the image.
+
+    Raises InputError if the field of view is not between 1 and 120 deg.
+    """
+    _check_field_of_view(fov_deg, error_deg)
+    lowest, highest = UNKNOWN_FOV_DEG
+    if fov_deg is not None:
+        error = FOV_TOLERANCE * fov_deg if error_deg is None else error_deg
+        lowest, highest = max(fov_deg - error, 0.5), min(fov_deg + error, 125.0)
+    tangents = [math.tan(0.5 * math.radians(angle)) for angle in (lowest, highest)]
+    middle = math.sqrt(tangents[0] * tangents[1])
+    camera = Pinhole(shape[1], shape[0], 0.5 * shape[1] / middle)
+    return camera, (tangents[0] / middle, tangents[1] / middle)
+
+
+def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:
+    """Raise InputError for a field of view outside of 1 to 120 deg, or a negative error."""
+    if fov_deg is not None and not 1.0 <= fov_deg <= 120.0:
+        raise InputError("field of view", f"{fov_deg:g}: give 1 to 120 degrees across the columns")
+    if error_deg is not None and not 0.0 <= error_deg < 120.0:
+        raise InputError("error of the field of view", f"{error_deg:g}: give 0 or more degrees")
+
+
+def _solution(
+    frame: FrameSolution, sky: SkyIndex, velocity: FloatArray | None, exposure_known: bool
+) -> StarSolution:
+    """Return the public solution of a frame."""
+    fix, matched, motion = frame.fix, frame.matched, frame.motion
+    pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
+    if fix is None:
+        matched = matched[:0]
+    fov = math.nan if fix is None else field_of_view(frame.camera)
+    star = frame.star[matched]
+    measured = motion if exposure_known else None
+    return StarSolution(
+        status=frame.status.value,
+        reason=frame.reason,
+        right_ascension=pointing.right_ascension,
+        declination=pointing.declination,
+        roll=pointing.roll,
+        quaternion=np.full(4, np.nan) if fix is None else fix.quaternion,
+        covariance=np.full((3, 3), np.nan) if fix is None else fix.covariance,
+        stars=MatchedStars(
+            sky.stars.hip[star].astype(np.int64),
+            np.asarray(sky.stars.magnitude[star], dtype=np.float64),
+            sky.stars.direction[star],
+            frame.points[matched],
+            frame.points[matched] - frame.expected[matched],
+        ),
+        field_of_view=fov,
+        field_of_view_sigma=math.sin(fov) * frame.scale_sigma,
+        log10_false_alarm=frame.log10_false_alarm,
+        mirrored=frame.mirrored,
+        rate=None if measured is None else measured.rate,
+        rate_covariance=None if measured is None else measured.covariance,
+        rate_sign_known=motion is not None and motion.status is StreakStatus.RATE,
+        sky_map=frame.sky_map(velocity),
+        frame=frame,
+        index=sky,
+    )

@@ -1,0 +1,138 @@
+"""The public star tracker, against frames of known attitude."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
+from knightcube.errors import InputError
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
+from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
+
+ARCSECOND = math.radians(1.0 / 3600.0)
+
+
+@pytest.fixture(scope="module")
+def resting() -> SkyFrame:
+    return sky_frame(np.random.default_rng(31), 0.0, 0.2)
+
+
+def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) -> None:
+    solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
+    assert solution
+    assert (solution.status, solution.reason) == ("solved", "")
+    error = to_rotation_vector(multiply(solution.quaternion, conjugate(resting.attitude)))
+    assert error @ np.linalg.solve(solution.covariance, error) < 16.3  # chi-square of 3, 0.1 %
+    assert np.linalg.norm(error[:2]) < 15.0 * ARCSECOND
+    assert solution.field_of_view_deg == pytest.approx(12.0, abs=0.01)
+    assert not solution.mirrored
+    assert solution.rate is None
+
+
+def test_right_ascension_declination_and_roll_are_those_of_the_quaternion(resting: SkyFrame) -> None:
+    """The boresight is the third row of the attitude matrix; north is up where the roll is zero."""
+    solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
+    x, y, z, w = solution.quaternion
+    boresight = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
+    ra, dec = solution.right_ascension, solution.declination
+    expected = [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    assert boresight == pytest.approx(expected, abs=1e-12)
+    assert solution.right_ascension_deg == pytest.approx(math.degrees(ra))
+    assert solution.declination_deg == pytest.approx(math.degrees(dec))
+    assert solution.roll_deg == pytest.approx(math.degrees(solution.roll))
+
+
+def test_the_matched_stars_lie_where_the_solution_predicts_them(resting: SkyFrame) -> None:
+    solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
+    stars = solution.stars
+    assert len(stars) > 10
+    assert len(set(stars.hip.tolist())) == len(stars)
+    assert solution.sky_map is not None
+    predicted = solution.sky_map.pixels(stars.directions)
+    np.testing.assert_allclose(stars.points - predicted, stars.residuals, atol=1e-6)
+    nearest = np.linalg.norm(stars.points[:, None] - resting.stars, axis=2).min(axis=1)
+    assert np.median(nearest) < 0.2
+
+
+def test_an_image_without_stars_gives_the_reason() -> None:
+    noise = np.random.default_rng(5).normal(100.0, 5.0, (256, 256)).astype(np.uint16)
+    solution = StarTracker(fov_deg=12.0).solve(noise)
+    assert not solution
+    assert solution.status in {"no-stars", "too-few-stars"}
+    assert solution.reason
+    assert math.isnan(solution.right_ascension)
+    assert np.isnan(solution.quaternion).all()
+    assert np.isnan(solution.covariance).all()
+    assert len(solution.stars) == 0
+    assert solution.sky_map is None
+
+
+def test_streaks_give_the_rate_and_a_prediction_its_sign() -> None:
+    frame = sky_frame(np.random.default_rng(32), 40.0, 0.2)
+    tracker = StarTracker(fov_deg=12.0)
+    alone = tracker.solve(frame.pixels, exposure=frame.exposure)
+    assert alone.rate is not None
+    assert not alone.rate_sign_known
+    assert np.linalg.norm(alone.rate) == pytest.approx(np.linalg.norm(frame.rate), rel=0.02)
+    known = tracker.solve(frame.pixels, exposure=frame.exposure, rate=0.8 * frame.rate)
+    assert known.rate is not None
+    assert known.rate_sign_known
+    assert known.rate @ frame.rate > 0.0
+    assert tracker.solve(frame.pixels).rate is None
+
+
+def test_a_predicted_attitude_is_used_and_a_wrong_one_does_no_harm(resting: SkyFrame) -> None:
+    tracker = StarTracker(camera=resting.camera.pinhole)
+    near = tracker.solve(resting.pixels, attitude=resting.attitude, attitude_sigma=1e-3)
+    assert near
+    assert near.frame.tracked
+    wrong = tracker.solve(resting.pixels, attitude=np.array([0.0, 0.0, 0.0, 1.0]), attitude_sigma=1e-3)
+    assert wrong
+    assert not wrong.frame.tracked
+    assert angle_between(near.quaternion, wrong.quaternion) < 5.0 * ARCSECOND
+    assert near.field_of_view_sigma == 0.0
+
+
+def test_the_date_corrects_aberration_by_at_most_its_constant(resting: SkyFrame) -> None:
+    """The frame was drawn without aberration, so a date moves the answer, by 20.5" at most."""
+    tracker = StarTracker(camera=resting.camera.pinhole)
+    plain = tracker.solve(resting.pixels)
+    naive, aware = datetime(2026, 7, 2, 12), datetime(2026, 7, 2, 12, tzinfo=UTC)
+    dated = tracker.solve(resting.pixels, utc=aware).quaternion
+    np.testing.assert_array_equal(tracker.solve(resting.pixels, utc=naive).quaternion, dated)
+    assert 2.0 * ARCSECOND < angle_between(dated, plain.quaternion) < 21.0 * ARCSECOND
+
+
+def test_wrong_arguments_are_refused_with_the_value(tmp_path: Path) -> None:
+    lens = Pinhole.from_field_of_view(64, 48, 0.2)
+    with pytest.raises(InputError, match=r"field of view: 0\.5: give 1 to 120 degrees"):
+        StarTracker(fov_deg=0.5)
+    with pytest.raises(InputError, match="-1: give 0 or more degrees"):
+        StarTracker(fov_deg=10.0, fov_error_deg=-1.0)
+    with pytest.raises(InputError, match="not both"):
+        StarTracker(fov_deg=10.0, camera=lens)
+    with pytest.raises(InputError, match=r"none\.index"):
+        StarTracker(index=tmp_path / "none.index")
+    with pytest.raises(InputError, match="48 x 64 pixels, but the camera has 64 x 48"):
+        StarTracker(camera=lens, index=sky()).solve(np.zeros((64, 48)))
+    with pytest.raises(ValueError, match=r"shape \(4, 4, 3\)"):
+        StarTracker().solve(np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="16 or more"):
+        StarTracker().solve(np.zeros((8, 8)))
+
+
+def test_a_field_of_view_gives_a_camera_and_the_range_of_its_scale() -> None:
+    camera, scale = camera_of_field(10.0, 1.0, (300, 400))
+    tangents = [factor * 200.0 / camera.focal_length for factor in scale]
+    assert [math.degrees(2.0 * math.atan(tangent)) for tangent in tangents] == pytest.approx([9.0, 11.0])
+    assert camera_of_field(None, None, (300, 400))[1][1] > 3.0
+    exact, (lowest, highest) = camera_of_field(10.0, 0.0, (300, 400))
+    assert math.degrees(field_of_view(exact)) == pytest.approx(10.0)
+    assert lowest == pytest.approx(1.0)
+    assert highest == pytest.approx(1.0)
