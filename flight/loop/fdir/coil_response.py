@@ -71,7 +71,7 @@ class ResponseSettings:
     damping: float = 5.0e-3
     errors: BodyErrors = field(default_factory=BodyErrors)
     sure: float = 0.25
-    persistence: int = 4
+    persistence: int = 3
     lowest_sound: float = 0.6
     highest_feeble: float = 0.4
     highest_reversed: float = -0.5
