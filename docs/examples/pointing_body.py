@@ -2,7 +2,7 @@
 
 The configuration names this body as `body: pointing_body:POINTING`. The law is the cross product law of
 magnetic control: from the wanted torque T, the dipole is m = (B x T) / |B|^2, so that m x B is the part of T
-across the field B. Filter, feed, brake and coil watch are those of the testbed, whose plant this body has.
+across the field B. Estimation and brake are those of the testbed, whose plant this body has.
 
 Run with `python docs/examples/pointing_body.py`: it flies the demonstration's first step.
 """
@@ -22,17 +22,15 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.testbed.body import (
-    UnitFeed,
-    attitude_filter,
+    ThreadEstimation,
     brake_of,
-    coil_watch,
     dipole_per_ampere,
     surrounding_field,
 )
-from flight.bodies.testbed.thread import angular_acceleration_psd_of, plant_of
+from flight.bodies.testbed.thread import plant_of
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
-from flight.loop.body import COMMANDED, KEPT, Body, BodyKind, CoilCommand, ControlOutput, Target
+from flight.loop.body import COMMANDED, KEPT, Body, BodyControl, BodyKind, CoilCommand, ControlOutput, Target
 from flight.loop.executive.executive import Cycle
 from flight.loop.executive.jobs import JobResult
 from flight.loop.services import Services
@@ -261,31 +259,24 @@ class View:
 
 
 # --8<-- [start:make]
+class PointingControl(BodyControl):
+    """Implements `BodyControl`: the parts above, and the testbed's detumbling."""
+
+    def __init__(self, config: TestbedConfig) -> None:
+        direct = Direct()
+        self.modes = frozenset(Mode) - ORBITAL
+        self.dipole_per_ampere = dipole_per_ampere(config)
+        self.free_axis = np.array([0.0, 1.0, 0.0])
+        self.paths = self.planner = direct
+        self.targets = Attitudes(config, direct)
+        self.tracker = CrossProductTracker(config, surrounding_field(config))
+        self.brake = brake_of(config, plant_of(config))
+
+
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the body of a configuration, with what an earlier boot learned."""
     config = as_testbed(config)
-    plant = plant_of(config)
-    filter_, problems = attitude_filter(config, plant, learned)
-    tracker = CrossProductTracker(config, surrounding_field(config))
-    direct = Direct()
-    density = angular_acceleration_psd_of(config, plant) * np.eye(3)
-    return Body(
-        modes=frozenset(Mode) - ORBITAL,
-        filter=filter_,
-        learned_problems=problems,
-        paths=direct,
-        planner=direct,
-        targets=Attitudes(config, direct),
-        tracker=tracker,
-        feed=UnitFeed(filter_, config.inertial_unit),
-        brake=brake_of(config, plant),
-        coil_watch=coil_watch(config, plant),
-        view=View(services),
-        field=tracker.field,
-        free_axis=np.array([0.0, 1.0, 0.0]),
-        dipole_per_ampere=dipole_per_ampere(config),
-        angular_acceleration_psd=lambda _: density,
-    )
+    return Body(ThreadEstimation(config, learned), PointingControl(config), View(services))
 
 
 def plan(job: Any) -> Any:

@@ -16,14 +16,14 @@ from flight.loop.body import PLANNER, Body, BodyKind, Planner
 from flight.loop.executive.jobs import JobRunner, Worker
 from flight.loop.fdir.facts import EventLog, Facts, Streams, streams_of
 from flight.loop.fdir.supervision import WorkerWatch
-from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
+from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.services import Devices, Services
 from flight.loop.state.content import Learned
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks import imaging as imaging_task
 from flight.loop.tasks import wide_imaging as wide_task
 from flight.loop.tasks.commanding import Adopters, Commanding, Obeying, Parameters
-from flight.loop.tasks.control_cycle import ControlCycle, CycleTasks
+from flight.loop.tasks.control_cycle import LoopTasks
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.health import HealthInputs, HealthWatch, Housekeeping, PerformanceObserver, Watched
 from flight.loop.tasks.imaging import Imaging, ObjectTracking
@@ -95,12 +95,12 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),
-        angular_acceleration_psd=body.angular_acceleration_psd,
-        velocity=body.velocity,
+        angular_acceleration_psd=body.estimation.angular_acceleration_psd,
+        velocity=body.estimation.velocity,
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
-        knowledge=body.knowledge,
-        seeks=body.seeks,
-        calm=body.calm,
+        knowledge=body.estimation.knowledge,
+        seeks=body.control.follows_objects,
+        calm=body.control.exposure_start,
         kept=kept,
     )
 
@@ -236,7 +236,7 @@ def _tasks(
     stop: Callable[[str], None],
 ) -> LoopTasks:
     devices, timeline = opened.devices, config.commands.timeline
-    navigation = Navigation(devices.unit, body, navigation_settings(config), services)
+    navigation = Navigation(devices.unit, body.estimation, navigation_settings(config), services)
     drive = _drive(config, devices, body, services)
     steering = Steering(body, drive, services)
     imaging = _imaging(config, opened, navigation, body, services)
@@ -244,14 +244,13 @@ def _tasks(
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
     observer = PerformanceObserver(devices.coils, services)
-    control = ControlCycle(
-        CycleTasks(navigation, modes, steering, drive, imaging, wide), body, observer, services
-    )
-    watches = worker_watches(config.executive, body.planner, imaging, wide)
+    watches = worker_watches(config.executive, body.control.planner, imaging, wide)
     health = HealthWatch(
         HealthInputs(modes, drive, devices.power, watches), config.health, opened.feed, services
     )
-    watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
+    watched = Watched(
+        navigation, body.control.planner, imaging, devices.coils, devices.power, opened.log_error
+    )
     commanded = bool(opened.channels or timeline)
     parameters = Parameters(config, Adopters((modes.adopt, drive.adopt), health.adopt), keeper, services)
     obeying = Obeying(modes, drive, parameters)
@@ -259,32 +258,47 @@ def _tasks(
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
     return LoopTasks(
-        navigation, imaging, positioning, sun, wide, modes, control, observer, health, house, commanding
+        navigation,
+        imaging,
+        positioning,
+        sun,
+        wide,
+        modes,
+        steering,
+        drive,
+        observer,
+        health,
+        house,
+        commanding,
     )
 
 
 def _drive(config: Config, devices: Devices, body: Body, services: Services) -> CoilDrive:
     limits = np.full(3, config.coils.current_limit)
-    settings = CoilDriveSettings(body.dipole_per_ampere, limits, body.free_axis)
-    return CoilDrive(devices.coils, devices.power, body.coil_watch, settings, services)
+    settings = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
+    return CoilDrive(devices.coils, devices.power, body.estimation.coil_watch, settings, services)
 
 
 def _positioning(config: Config, devices: Devices, body: Body, services: Services) -> Positioning | None:
     if config.gps is None or devices.gps is None:
         return None
-    return Positioning(devices.gps, body.fix, round(config.gps.max_age * SECOND_NS), services)
+    return Positioning(
+        devices.gps, body.estimation.accept_fix, round(config.gps.max_age * SECOND_NS), services
+    )
 
 
 def _sun(config: Config, devices: Devices, body: Body, services: Services) -> SunSensing | None:
     if config.solar_strings is None or devices.strings is None:
         return None
-    return SunSensing(devices.strings, body.sun, round(config.solar_strings.max_age * SECOND_NS), services)
+    return SunSensing(
+        devices.strings, body.estimation.accept_sun, round(config.solar_strings.max_age * SECOND_NS), services
+    )
 
 
 def _wide(config: Config, devices: Devices, body: Body, services: Services) -> WideImaging | None:
-    if not config.wide_cameras or not devices.wide or body.wide is None:
+    if not config.wide_cameras or not devices.wide or body.estimation.wide is None:
         return None
-    return WideImaging(devices.wide, body.wide, wide_settings(config.wide_cameras), services)
+    return WideImaging(devices.wide, body.estimation.wide, wide_settings(config.wide_cameras), services)
 
 
 def _imaging(

@@ -317,62 +317,106 @@ class WideSight(Protocol):
         """Accept Sun and nadir of a time; return whether each of them was used."""
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
-    """A body ready to fly.
+class BodyEstimation(Protocol):
+    """The estimate of a body, and the measurements that it uses.
+
+    A body inherits from this class and implements the methods without a default. The defaults are those of a
+    body without an orbit.
+
+    Attributes:
+        filter: estimates attitude, rate and the body's parameters.
+        feed: passes the readings of the inertial unit to the filter.
+        coil_watch: compares commanded currents with the supply current and the motion.
+        learned_problems: why parameters that an earlier boot learned were rejected.
+        wide: makes jobs of the wide cameras' frames and accepts the results; None: they are not used.
+    """
+
+    filter: Filter
+    feed: Feed
+    coil_watch: CoilWatch
+    learned_problems: list[str]
+    wide: WideSight | None = None
+
+    def field(self, estimate: Estimate) -> FloatArray:
+        """Return the magnetic field (3,) T in body axes at an estimate, for the reallocation of currents."""
+
+    def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the body's white angular acceleration, body axes."""
+
+    def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
+        """Return the parameters from which the next boot is to start."""
+        return learned_of(estimate)
+
+    def knowledge(self) -> Knowledge:
+        """Return how well the attitude is known now, if there is an estimate."""
+        return Knowledge.FINE
+
+    def orbit(self, time_ns: int) -> OrbitState | None:
+        """Return the orbit's state at a time; None while it is not known."""
+        return None
+
+    def velocity(self, time_ns: int) -> FloatArray | None:
+        """Return the velocity (3,) m/s about the Sun, reference axes, for the aberration of starlight.
+
+        None if the configured velocity holds.
+        """
+        return None
+
+    def accept_fix(self, reading: GpsReading) -> bool:
+        """Accept a valid GPS reading; return whether the body uses it."""
+        return False
+
+    def accept_sun(self, reading: StringReading) -> str | None:
+        """Accept a reading of the solar cells; return why it shows no Sun, empty if it does.
+
+        None if the reading was not judged.
+        """
+        return None
+
+
+class BodyControl(Protocol):
+    """Guidance and control of a body.
+
+    A body inherits from this class. The defaults are those of a body that follows no objects.
 
     Attributes:
         modes: the modes that this body has.
-        filter: estimates attitude, rate and the body's parameters.
-        learned_problems: why parameters that an earlier boot learned were rejected.
-        learned: returns what the next boot is to start from, at an estimate.
-        field: returns the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
+        dipole_per_ampere: n A of each coil, m^2.
         free_axis: (3,) the only axis about which the body can turn; None for a free body.
-        coil_watch: compares commanded currents with supply and motion.
-        feed: gives the filter the readings of the inertial unit.
-        brake: brakes a tumble by magnetometer and gyro.
-        angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
-            acceleration at a time, body axes.
-        knowledge: returns how well the attitude is known now, where there is an estimate.
-        velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
-            aberrated; None where the configured one holds.
-        fix: accepts a valid GPS reading; returns whether the body uses it.
-        sighted: accepts the confirmed tracks of objects after each frame that was searched, at a time.
-        place: returns the orbit's state at a time, None while it is not known.
-        seeks: returns whether an object is looked for or followed, so that no frame is left out.
-        wide: makes jobs of the wide cameras' frames and accepts what was found; None: it does not use them.
-        calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
-        seeker: turns the body to the Sun without an attitude, in SAFE; None where nothing does.
-        sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
-            where it is not judged.
+        brake: stops a tumble by magnetometer and gyro.
+        sun_acquisition: turns the body to the Sun without an attitude, in SAFE; None if the body cannot.
     """
 
     modes: frozenset[Mode]
-    filter: Filter
-    learned_problems: list[str]
-    paths: Paths
-    planner: Planner
-    targets: Targets
-    tracker: Tracker
-    feed: Feed
-    brake: Brake
-    coil_watch: CoilWatch
-    view: BodyView
-    field: Callable[[Estimate], FloatArray]
-    free_axis: FloatArray | None
     dipole_per_ampere: float
-    angular_acceleration_psd: Callable[[int], FloatArray]
-    knowledge: Callable[[], Knowledge] = lambda: Knowledge.FINE
-    velocity: Callable[[int], FloatArray | None] = lambda _: None
-    fix: Callable[[GpsReading], bool] = lambda _: False
-    sun: Callable[[StringReading], str | None] = lambda _: None
-    wide: WideSight | None = None
-    sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
-    place: Callable[[int], OrbitState | None] = lambda _: None
-    seeks: Callable[[], bool] = lambda: False
-    learned: Callable[[Estimate], Mapping[str, Learned]] = learned_of
-    calm: Callable[[int, int], int] = lambda begin_ns, _: begin_ns
-    seeker: Brake | None = None
+    free_axis: FloatArray | None
+    targets: Targets
+    planner: Planner
+    paths: Paths
+    tracker: Tracker
+    brake: Brake
+    sun_acquisition: Brake | None = None
+
+    def follows_objects(self) -> bool:
+        """Return whether an object is searched for or followed, so that no frame is skipped."""
+        return False
+
+    def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
+        """Accept the confirmed tracks of objects after each frame that was searched."""
+        return
+
+    def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
+        """Return the first time from `from_ns` on at which an exposure meets no step of the coils."""
+        return from_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A body ready to fly."""
+
+    estimation: BodyEstimation
+    control: BodyControl
+    view: BodyView
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,60 +14,18 @@ from dataclasses import dataclass, field
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.body import Body, ControlOutput, SteeringState
-from flight.loop.executive.executive import Cycle, Executive, RateGroup, Task
+from flight.loop.executive.executive import Cycle, Executive, RateGroup
 from flight.loop.fdir.resources import ResourceReader
 from flight.loop.flight_status import Ending, Progress, RunLabel, ending, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
-from flight.loop.tasks.commanding import Commanding
-from flight.loop.tasks.control_cycle import ControlCycle
-from flight.loop.tasks.health import CONTROL, HealthWatch, Housekeeping, PerformanceObserver
-from flight.loop.tasks.imaging import Imaging
-from flight.loop.tasks.mode_control import ModeControl
-from flight.loop.tasks.navigation import Navigation, Positioning, SunSensing
-from flight.loop.tasks.wide_imaging import WideImaging
+from flight.loop.tasks.control_cycle import ControlCycle, LoopTasks
+from flight.loop.tasks.health import CONTROL
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
 COMMAND_PERIOD_NS = SECOND_NS // 10
-
-
-@dataclass(frozen=True, slots=True)
-class Periods:
-    """Periods from the configuration, ns; None for what is not done."""
-
-    control_ns: int
-    replan_ns: int | None
-    camera_ns: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class GroupTasks:
-    """The task of each rate group; None where there is nothing to do."""
-
-    control: Task
-    replan: Task
-    camera: Task | None
-    commands: Task | None
-    health: Task
-    housekeeping: Task
-
-
-def rate_groups(periods: Periods, tasks: GroupTasks) -> list[RateGroup]:
-    """Return the rate groups, control first."""
-    groups = [
-        RateGroup(CONTROL, periods.control_ns, tasks.control),
-    ]
-    if periods.replan_ns is not None:
-        groups.append(RateGroup("planning", periods.replan_ns, tasks.replan))
-    if tasks.camera is not None and periods.camera_ns is not None:
-        groups.append(RateGroup("camera", periods.camera_ns, tasks.camera))
-    if tasks.commands is not None:
-        groups.append(RateGroup("commands", COMMAND_PERIOD_NS, tasks.commands))
-    groups.append(RateGroup("health", HEALTH_PERIOD_NS, tasks.health))
-    groups.append(RateGroup("housekeeping", SECOND_NS, tasks.housekeeping))
-    return groups
 
 
 def nothing() -> None:
@@ -87,26 +45,6 @@ class Supervisors:
     beat: Callable[[], None] = nothing
     keeper: StateKeeper | None = None
     board: ResourceReader | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LoopTasks:
-    """The tasks of the loop; without a device or channels the tasks of these are None.
-
-    The order is that of the data flow.
-    """
-
-    navigation: Navigation
-    imaging: Imaging | None
-    positioning: Positioning | None
-    sun: SunSensing | None
-    wide: WideImaging | None
-    modes: ModeControl
-    control: ControlCycle
-    observer: PerformanceObserver
-    health: HealthWatch
-    housekeeping: Housekeeping
-    commanding: Commanding | None
 
 
 @dataclass(slots=True)
@@ -131,7 +69,10 @@ class FlightLoop:
         self._services = services
         self._supervisors = supervisors
         self._requests = _Requests()
-        self._requests.notes += [(events.LEARNED_REFUSED, problem) for problem in body.learned_problems]
+        self._requests.notes += [
+            (events.LEARNED_REFUSED, problem) for problem in body.estimation.learned_problems
+        ]
+        self._control = ControlCycle(tasks, body, services)
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
@@ -166,7 +107,7 @@ class FlightLoop:
         try:
             self._executive.run(epoch_ns, epoch_ns + round(self._config.duration * SECOND_NS))
         finally:
-            self._tasks.control.coils_off()
+            self._tasks.drive.off()
             self._tasks.health.close()
             now_ns = services.clock.now_ns()
             self._requests.ended_ns = max(now_ns - epoch_ns, 0)
@@ -208,27 +149,24 @@ class FlightLoop:
             tasks.health.read_resources(supervisors.board, round(config.health.look_period * SECOND_NS))
 
     def _rate_groups(self) -> list[RateGroup]:
+        """Return the rate groups in order of importance, control first."""
         config, tasks = self._config, self._tasks
         camera, replan_period = config.camera, config.replan_period()
-        periods = Periods(
-            round(SECOND_NS / config.executive.control_rate_hz),
-            round(replan_period * SECOND_NS) if replan_period is not None else None,
-            round(camera.period * SECOND_NS) if camera is not None else None,
-        )
-        return rate_groups(
-            periods,
-            GroupTasks(
-                control=self._run_control,
-                replan=self._body.planner.replan,
-                camera=tasks.imaging.trigger if tasks.imaging is not None else None,
-                commands=tasks.commanding.run if tasks.commanding is not None else None,
-                health=tasks.health.run,
-                housekeeping=self._keep_house,
-            ),
-        )
+        control_ns = round(SECOND_NS / config.executive.control_rate_hz)
+        groups = [RateGroup(CONTROL, control_ns, self._run_control)]
+        if replan_period is not None:
+            planner = self._body.control.planner
+            groups.append(RateGroup("planning", round(replan_period * SECOND_NS), planner.replan))
+        if camera is not None and tasks.imaging is not None:
+            groups.append(RateGroup("camera", round(camera.period * SECOND_NS), tasks.imaging.trigger))
+        if tasks.commanding is not None:
+            groups.append(RateGroup("commands", COMMAND_PERIOD_NS, tasks.commanding.run))
+        groups.append(RateGroup("health", HEALTH_PERIOD_NS, tasks.health.run))
+        groups.append(RateGroup("housekeeping", SECOND_NS, self._keep_house))
+        return groups
 
     def _run_control(self, cycle: Cycle) -> None:
-        self._output = self._tasks.control.run(cycle)
+        self._output = self._control.run(cycle)
         self._supervisors.beat()
 
     def _keep_house(self, cycle: Cycle) -> None:
@@ -264,7 +202,8 @@ class FlightLoop:
         for kind, text in keeper.notices():
             self._services.events.report(kind, now_ns, text)
         estimate = self._tasks.navigation.estimate(now_ns)
-        keeper.note(self._tasks.modes.mode.label, self._body.learned(estimate) if estimate else None)
+        learned = self._body.estimation.learned(estimate) if estimate else None
+        keeper.note(self._tasks.modes.mode.label, learned)
 
     def _record_performance(self, now_ns: int) -> None:
         for group in self._groups:

@@ -30,7 +30,7 @@ def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-dem
     wishes: list[FloatArray] = []
 
     def listen(rigged: Rigged) -> None:
-        drive = rigged.loop._tasks.control._tasks.drive
+        drive = rigged.loop._tasks.drive
         send, zero = drive.send, drive.zero
 
         def sent(currents: FloatArray, field: object) -> None:

@@ -204,8 +204,8 @@ def test_what_led_to_safe_and_is_latched_bars_the_way_out_until_it_is_cleared(tm
         def fail(*_: object) -> None:
             raise ZeroDivisionError
 
-        rigged.at(1.0, lambda: setattr(rigged.loop._tasks.control._tasks.steering, "run", fail))
-        rigged.at(4.0, lambda: delattr(rigged.loop._tasks.control._tasks.steering, "run"))
+        rigged.at(1.0, lambda: setattr(rigged.loop._tasks.steering, "run", fail))
+        rigged.at(4.0, lambda: delattr(rigged.loop._tasks.steering, "run"))
 
     run = fly(
         commanded(

@@ -6,7 +6,7 @@ It detumbles by magnetometer and gyro, acquires its attitude with its coils at r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from flight.bodies.orbit.guidance import (
 )
 from flight.bodies.orbit.view import OrbitView
 from flight.link.modes import Mode
-from flight.loop.body import Body, BodyKind
+from flight.loop.body import Body, BodyControl, BodyEstimation, BodyKind
 from flight.loop.fdir.coil_response import ResponseSettings
 from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
@@ -36,10 +36,10 @@ from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.orbit_devices import SolarStrings as StringsSection
 from flight.schema.sections import Config
-from hal.interfaces.readings import StringReading
+from hal.interfaces.readings import GpsReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
@@ -48,66 +48,117 @@ from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, Fi
 from knightcube.gnc.control.three_axes.pointing_job import SlewRequest
 from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
-from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_settings import FreeFilterSettings
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.tracking.tracker import Track
 from knightcube.vision.sun.strings import SolarStrings
 
 _BELOW = 0.8
 """Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""
 
 
-def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
-    """Return the satellite of a configuration, with what an earlier boot learned."""
-    config = as_orbit(config)
-    surroundings = Surroundings(_elements(config), services.clock)
-    limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
-    filter_, problems = _filter(config, surroundings, learned, _utc(services))
-    brake = FieldBrake(_detumbler(config, filter_, surroundings), dipole_per_ampere)
-    seeker = _seeker(config, services)
-    paths = PointingPaths(limit, fastest_rate(config))
-    sun = _sun(config, filter_, surroundings)
-    disturbed, objects = _disturbed(filter_), ObjectAim(_sensor(config), limit, services.events)
+class OrbitEstimation(BodyEstimation):
+    """The estimate of the satellite, and its orbit."""
 
-    return Body(
-        modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
-        filter=filter_,
-        learned_problems=problems,
-        learned=lambda _: learned_of(filter_.slow, _utc(services)),
-        paths=paths,
-        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
-        targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
-        tracker=_tracker(config, filter_, surroundings),
-        feed=OrbitFeed(filter_),
-        brake=brake,
-        coil_watch=_coil_watch(config),
-        view=OrbitView(brake, filter_, surroundings, services),
-        field=lambda estimate: _field(estimate, surroundings),
-        free_axis=None,
-        dipole_per_ampere=dipole_per_ampere,
-        angular_acceleration_psd=filter_.acceleration_psd,
-        knowledge=lambda: filter_.knowledge,
-        velocity=surroundings.velocity,
-        fix=surroundings.fix,
-        sun=_read_by(sun, seeker),
-        seeker=seeker,
-        wide=wide_feed_of(config.wide_cameras, filter_, surroundings, sun) if config.wide_cameras else None,
-        sighted=objects.accept,
-        place=surroundings.state,
-        seeks=lambda: objects.seeks,
-        calm=_pauses(config).calm,
-    )
+    def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
+        """Start from the states that an earlier boot learned."""
+        self.environment = Surroundings(_elements(config), services.clock)
+        self._services = services
+        self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
+        self.filter = self.orbit_filter
+        self.feed = OrbitFeed(self.orbit_filter)
+        self.coil_watch = _coil_watch(config)
+        self._sun = _sun(config, self.orbit_filter, self.environment)
+        self.sun_acquisition = _seeker(config, services)
+        if config.wide_cameras:
+            self.wide = wide_feed_of(config.wide_cameras, self.orbit_filter, self.environment, self._sun)
+
+    def field(self, estimate: Estimate) -> FloatArray:
+        """Return the expected field (3,) T in body axes; zero while the orbit is not known."""
+        around = self.environment.at(estimate.time_ns)
+        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
+
+    def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then."""
+        return self.orbit_filter.acceleration_psd(time_ns)
+
+    def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
+        """Return the slow states, with the time to which they refer."""
+        return learned_of(self.orbit_filter.slow, _utc(self._services))
+
+    def knowledge(self) -> Knowledge:
+        """Return how well the attitude is known."""
+        return self.orbit_filter.knowledge
+
+    def orbit(self, time_ns: int) -> OrbitState | None:
+        """Return position and velocity, ICRS; None while no orbit is known."""
+        return self.environment.state(time_ns)
+
+    def velocity(self, time_ns: int) -> FloatArray | None:
+        """Return the velocity (3,) m/s about the Sun, ICRS; None while no orbit is known."""
+        return self.environment.velocity(time_ns)
+
+    def accept_fix(self, reading: GpsReading) -> bool:
+        """Accept an epoch of the receiver; return whether it is used."""
+        return self.environment.fix(reading)
+
+    def accept_sun(self, reading: StringReading) -> str | None:
+        """Pass a reading of the solar cells to the estimate, and to the Sun acquisition of SAFE."""
+        if self._sun is None or self.sun_acquisition is None:
+            return None
+        self.sun_acquisition.see(reading)
+        return self._sun.accept(reading)
+
+
+class OrbitControl(BodyControl):
+    """Guidance and control of the satellite."""
+
+    def __init__(self, config: OrbitConfig, estimation: OrbitEstimation, services: Services) -> None:
+        environment, filter_ = estimation.environment, estimation.orbit_filter
+        limit = _limit(config)
+        self._objects = ObjectAim(_sensor(config), limit, services.events)
+        self._pauses = _pauses(config)
+        paths = PointingPaths(limit, fastest_rate(config))
+        disturbed = _disturbed(filter_)
+        self.modes = frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
+        self.dipole_per_ampere = config.craft.dipole_per_ampere
+        self.free_axis = None
+        self.paths = paths
+        self.planner = PointingPlanner(
+            _planned(config), paths, environment, disturbed, self._objects, services
+        )
+        self.targets = PointingTargets(_timed(config), paths, config.looks_for_objects())
+        self.tracker = _tracker(config, filter_, environment)
+        detumbler = _detumbler(config, filter_, environment)
+        self.brake = self.field_brake = FieldBrake(detumbler, self.dipole_per_ampere)
+        self.sun_acquisition = estimation.sun_acquisition
+
+    def follows_objects(self) -> bool:
+        """Return whether an object is searched for or followed."""
+        return self._objects.seeks
+
+    def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
+        """Choose the track to follow."""
+        self._objects.accept(tracks, now_ns)
+
+    def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
+        """Return the first time from `from_ns` on at which an exposure meets no step of the coils."""
+        return self._pauses.calm(from_ns, exposure_ns)
+
+
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+    """Return the satellite of a configuration, with the states that an earlier boot learned."""
+    config = as_orbit(config)
+    estimation = OrbitEstimation(config, services, learned)
+    control = OrbitControl(config, estimation, services)
+    view = OrbitView(control.field_brake, estimation.orbit_filter, estimation.environment, services)
+    return Body(estimation, control, view)
 
 
 ORBIT = BodyKind(pointing_job.run, make)
-
-
-def _field(estimate: Estimate, surroundings: Surroundings) -> FloatArray:
-    """Return the expected field (3,) T in body axes at an estimate; zero where it is not known."""
-    around = surroundings.at(estimate.time_ns)
-    return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
 
 def _disturbed(filter_: OrbitFilter) -> Callable[[], tuple[FloatArray, FloatArray]]:
@@ -225,18 +276,6 @@ def _sun(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) 
     if section is None:
         return None
     return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, surroundings)
-
-
-def _read_by(sun: CoarseSunFeed | None, seeker: StringSeeker | None) -> Callable[[StringReading], str | None]:
-    """Return what hands the strings' readings to the estimate and to what turns to the Sun in SAFE."""
-    if sun is None or seeker is None:
-        return lambda _: None
-
-    def accept(reading: StringReading) -> str | None:
-        seeker.see(reading)
-        return sun.accept(reading)
-
-    return accept
 
 
 def _seeker(config: OrbitConfig, services: Services) -> StringSeeker | None:

@@ -17,7 +17,17 @@ from flight.bodies.testbed.thread import ThreadReader, angular_acceleration_psd_
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
 from flight.link.telemetry.definitions import CONTROL, TARGET
-from flight.loop.body import KEPT, Agreement, Body, BodyKind, ControlOutput, Target, Tracker
+from flight.loop.body import (
+    KEPT,
+    Agreement,
+    Body,
+    BodyControl,
+    BodyEstimation,
+    BodyKind,
+    ControlOutput,
+    Target,
+    Tracker,
+)
 from flight.loop.fdir.coil_response import ResponseSettings
 from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
@@ -140,44 +150,71 @@ class ThreadView:
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 
 
+class ThreadEstimation(BodyEstimation):
+    """The estimate of the testbed."""
+
+    def __init__(
+        self,
+        config: TestbedConfig,
+        learned: Mapping[str, Learned],
+        reader: ThreadReader | None = None,
+        cage: CageField | None = None,
+    ) -> None:
+        """Start from the parameters that an earlier boot learned."""
+        plant = plant_of(config)
+        self._reader = reader or thread_reader(plant)
+        self._cage = cage
+        self._field = surrounding_field(config)
+        self._density = angular_acceleration_psd_of(config, plant) * np.eye(3)
+        filter_, self.learned_problems = attitude_filter(config, plant, learned, cage)
+        self.filter = filter_
+        self.feed = UnitFeed(filter_, config.inertial_unit)
+        self.coil_watch = coil_watch(config, plant)
+
+    def field(self, estimate: Estimate) -> FloatArray:
+        """Return the field (3,) T in body axes."""
+        angle = self._reader.read(estimate).angle
+        field = self._field if self._cage is None else self._cage.at(estimate.time_ns)
+        return np.asarray(attitude_matrix(about_axis_y(angle)) @ field)
+
+    def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the angular acceleration due to current noise."""
+        return self._density
+
+
+class ThreadControl(BodyControl):
+    """Guidance and control of the testbed."""
+
+    def __init__(
+        self, config: TestbedConfig, reader: ThreadReader, cage: CageField | None, services: Services
+    ) -> None:
+        plant, settings = plant_of(config), planning_settings(config)
+        rules = AcceptanceRules(late_after=config.guidance.late_after)
+        guidance = PathGuidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
+        steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
+        self.modes = frozenset(Mode) - ORBITAL
+        self.dipole_per_ampere = dipole_per_ampere(config)
+        self.free_axis = _THREAD_AXIS
+        self.paths = guidance
+        self.planner = self.planning = Planning(plant, settings, guidance, reader, services)
+        self.targets = ThreadTargets(steps, reader, guidance, self.planning)
+        self.tracker = _tracker(config, plant, reader, cage)
+        self.brake = brake_of(config, plant)
+
+
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
     config = as_testbed(config)
-    plant = plant_of(config)
     cage = None if config.cage is None else CageField(config.cage, config.plant.field, services.clock)
-    filter_, problems = attitude_filter(config, plant, learned, cage)
-    reader = ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
-    settings = planning_settings(config)
-    rules = AcceptanceRules(late_after=config.guidance.late_after)
-    guidance = PathGuidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
-    planning = Planning(plant, settings, guidance, reader, services)
-    steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
-    dipole = dipole_per_ampere(config)
-    fixed = surrounding_field(config)
+    reader = thread_reader(plant_of(config))
+    control = ThreadControl(config, reader, cage, services)
+    estimation = ThreadEstimation(config, learned, reader, cage)
+    return Body(estimation, control, ThreadView(reader, control.planning, services))
 
-    def field(estimate: Estimate) -> FloatArray:
-        angle = reader.read(estimate).angle
-        reference_field = fixed if cage is None else cage.at(estimate.time_ns)
-        return np.asarray(attitude_matrix(about_axis_y(angle)) @ reference_field)
 
-    density = angular_acceleration_psd_of(config, plant) * np.eye(3)
-    return Body(
-        modes=frozenset(Mode) - ORBITAL,
-        filter=filter_,
-        learned_problems=problems,
-        paths=guidance,
-        planner=planning,
-        targets=ThreadTargets(steps, reader, guidance, planning),
-        tracker=_tracker(config, plant, reader, cage),
-        feed=UnitFeed(filter_, config.inertial_unit),
-        brake=brake_of(config, plant),
-        coil_watch=coil_watch(config, plant),
-        view=ThreadView(reader, planning, services),
-        field=field,
-        free_axis=_THREAD_AXIS,
-        dipole_per_ampere=dipole,
-        angular_acceleration_psd=lambda _: density,
-    )
+def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
+    """Return the reader of the turn about the thread, with the thread of `plant`."""
+    return ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
 
 
 def _tracker(

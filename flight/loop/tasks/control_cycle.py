@@ -12,18 +12,18 @@ from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE
 from flight.loop.body import PLANNER, Body, ControlOutput, Steered, Target
 from flight.loop.executive.executive import Cycle
-from flight.loop.executive.jobs import JobResult
-from flight.loop.fdir.coil_watch import CoilKnowledge
+from flight.loop.fdir.coil_watch import CoilKnowledge, CurrentValidity
 from flight.loop.services import Services
 from flight.loop.tasks import imaging as imaging_task
 from flight.loop.tasks import wide_imaging as wide_task
-from flight.loop.tasks.health import PerformanceObserver
+from flight.loop.tasks.commanding import Commanding
+from flight.loop.tasks.health import HealthWatch, Housekeeping, PerformanceObserver
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl
-from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.navigation import Navigation, Positioning, SunSensing
 from flight.loop.tasks.steering import CoilDrive, Steering
 from flight.loop.tasks.wide_imaging import WideImaging
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.readings import CoilState, ImuReading
 from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate
 
 ATTITUDE_EVERY = 4
@@ -33,130 +33,149 @@ _NAN4 = np.full(4, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class CycleTasks:
-    """The tasks that a cycle runs, in the order of the data."""
+class LoopTasks:
+    """The tasks of the loop, in the order of the data flow.
+
+    A task is None if the configuration has no device or command channel for it.
+    """
 
     navigation: Navigation
+    imaging: Imaging | None
+    positioning: Positioning | None
+    sun: SunSensing | None
+    wide: WideImaging | None
     modes: ModeControl
     steering: Steering
     drive: CoilDrive
-    imaging: Imaging | None
-    wide: WideImaging | None
+    observer: PerformanceObserver
+    health: HealthWatch
+    housekeeping: Housekeeping
+    commanding: Commanding | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """The inputs of one cycle: coil command on the wire, its validity, and readings of the inertial unit."""
+
+    coils: CoilState
+    validity: CurrentValidity
+    readings: Sequence[ImuReading]
 
 
 class ControlCycle:
-    """The task of the control rate group."""
+    """The task of the control rate group: sample, check, estimate, decide, steer, publish."""
 
-    def __init__(
-        self, tasks: CycleTasks, body: Body, observer: PerformanceObserver, services: Services
-    ) -> None:
+    def __init__(self, tasks: LoopTasks, body: Body, services: Services) -> None:
         self._tasks = tasks
         self._body = body
-        self._observer = observer
         self._jobs = services.jobs
         self._recorder = services.recorder
         self._streams = services.streams
         self._knowledge = CoilKnowledge()
         self._ever_started = False
-        self._blind = True
+        self._had_estimate = False
         self._measured = False
         self._target: Target | None = None
 
     def run(self, cycle: Cycle) -> ControlOutput:
         """Run one cycle."""
-        tasks, body, now_ns = self._tasks, self._body, cycle.start_ns
-        # The last command may have reached the wire late: the coils' thread sends it.
-        in_force = tasks.drive.state()
-        known = self._knowledge.look(in_force, now_ns, suspected=tasks.drive.suspects)
-        tasks.navigation.commanded(in_force, known)
-        readings = tasks.navigation.update(now_ns)
-        if not in_force.error:
-            self._streams.note("coils", now_ns)
-        tasks.drive.look(in_force, readings, now_ns, known=known.since_last_look)
-        if tasks.imaging is not None:
-            tasks.imaging.serve(now_ns)
-        estimate = tasks.navigation.estimate(now_ns)
-        overdue = self._overdue(estimate, now_ns)
-        mode = tasks.modes.step(estimate, _newest_rate(readings), overdue, not in_force.error, now_ns)
-        self._aim(now_ns)
-        measured = self._replan_if_regained(estimate, now_ns)
-        self._ever_started = self._ever_started or estimate is not None
-        if self._collect(now_ns):
-            estimate = tasks.navigation.estimate(now_ns)
-        trusted = estimate if measured else None
-        steered = self._act(mode, trusted, readings, now_ns)
-        output = ControlOutput(cycle, mode, estimate, self._target, steered, tasks.drive.state())
-        if mode in STEERING and self._target is not None:
-            body.planner.serve(trusted, self._target, now_ns)
-        body.view.record_cycle(output)
-        if cycle.slot % ATTITUDE_EVERY == 0:
-            self._record(output)
+        now_ns = cycle.start_ns
+        samples = self._sample(now_ns)
+        self._check(samples, now_ns)
+        estimate = self._tasks.navigation.estimate(now_ns)
+        mode = self._decide(estimate, samples, now_ns)
+        if self._accept_results(now_ns):
+            estimate = self._tasks.navigation.estimate(now_ns)
+        measured = estimate if self._measured else None
+        steered = self._steer(mode, measured, samples.readings, now_ns)
+        output = ControlOutput(cycle, mode, estimate, self._target, steered, self._tasks.drive.state())
+        self._publish(output, measured)
         return output
 
-    def coils_off(self) -> None:
-        """Switch all coils off: the flight is over."""
-        self._tasks.drive.off()
+    def _sample(self, now_ns: int) -> _Samples:
+        """Return the coil command on the wire and the readings, and apply both to the estimate."""
+        tasks = self._tasks
+        # The last command may have reached the wire late: the coils' thread sends it.
+        coils = tasks.drive.state()
+        validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.suspects)
+        tasks.navigation.commanded(coils, validity)
+        readings = tasks.navigation.update(now_ns)
+        if not coils.error:
+            self._streams.note("coils", now_ns)
+        return _Samples(coils, validity, readings)
 
-    def _overdue(self, estimate: Estimate | None, now_ns: int) -> float | None:
-        if estimate is None or self._target is None:
-            return None
-        return self._body.targets.error_when_due(estimate, self._target, now_ns)
+    def _check(self, samples: _Samples, now_ns: int) -> None:
+        """Check the coils against supply current and motion, and the camera."""
+        tasks = self._tasks
+        known = samples.validity.since_last_look
+        tasks.drive.look(samples.coils, samples.readings, now_ns, known=known)
+        if tasks.imaging is not None:
+            tasks.imaging.serve(now_ns)
 
-    def _replan_if_regained(self, estimate: Estimate | None, now_ns: int) -> bool:
-        """Return whether the estimate is measured; request a path when measured again."""
-        planner, measured = self._body.planner, self._tasks.navigation.is_measured(now_ns)
-        if estimate is not None and self._blind:
+    def _decide(self, estimate: Estimate | None, samples: _Samples, now_ns: int) -> Mode:
+        """Return the mode to act in; set the target, and request a path if there is an estimate again."""
+        overdue = None
+        if estimate is not None and self._target is not None:
+            overdue = self._body.control.targets.error_when_due(estimate, self._target, now_ns)
+        rate = _newest_rate(samples.readings)
+        mode = self._tasks.modes.step(estimate, rate, overdue, not samples.coils.error, now_ns)
+        self._aim(now_ns)
+        planner, measured = self._body.control.planner, self._tasks.navigation.is_measured(now_ns)
+        if estimate is not None and not self._had_estimate:
             planner.request(now_ns)
         elif measured and not self._measured:
             planner.resume(now_ns)
-        self._blind = estimate is None
+        self._had_estimate = estimate is not None
+        self._ever_started = self._ever_started or self._had_estimate
         self._measured = measured
-        return measured
-
-    def _act(
-        self, mode: Mode, estimate: Estimate | None, readings: Sequence[ImuReading], now_ns: int
-    ) -> Steered:
-        """Use the coils as the mode requires; `estimate` is None unless measured."""
-        steering = self._tasks.steering
-        if mode in STEERING:
-            return steering.run(estimate, now_ns, self._ever_started)
-        if self._tasks.modes.brakes:
-            return steering.brake(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
-        if self._tasks.modes.seeks:
-            return steering.seek(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
-        return steering.rest(now_ns)
+        return mode
 
     def _aim(self, now_ns: int) -> None:
         """Set the target in force; announce a new target and request a path at once."""
-        modes = self._tasks.modes
-        mission_ns = now_ns - self._recorder.epoch_ns
-        target = modes.target(mission_ns)
+        target = self._tasks.modes.target(now_ns - self._recorder.epoch_ns)
         if target is self._target:
             return
         self._target = target
-        if target is None:
-            return
-        self._body.view.announce(target, now_ns)
-        self._body.planner.aim(target, now_ns)
+        if target is not None:
+            self._body.view.announce(target, now_ns)
+            self._body.control.planner.aim(target, now_ns)
 
-    def _collect(self, now_ns: int) -> bool:
+    def _accept_results(self, now_ns: int) -> bool:
         """Accept the workers' results; return whether a frame was among them."""
-        framed = False
+        tasks, framed = self._tasks, False
         for result in self._jobs.collect():
-            framed |= self._accept(result, now_ns)
+            tasks.observer.job(result, now_ns)
+            if result.worker == PLANNER:
+                self._body.control.planner.finish(result, now_ns)
+            elif result.worker == imaging_task.WORKER and tasks.imaging is not None:
+                tasks.imaging.finish(result, now_ns)
+                framed = True
+            elif result.worker == wide_task.WORKER and tasks.wide is not None:
+                tasks.wide.finish(result, now_ns)
+                framed = True
         return framed
 
-    def _accept(self, result: JobResult, now_ns: int) -> bool:
-        self._observer.job(result, now_ns)
-        if result.worker == PLANNER:
-            self._body.planner.finish(result, now_ns)
-        elif result.worker == imaging_task.WORKER and self._tasks.imaging is not None:
-            self._tasks.imaging.finish(result, now_ns)
-            return True
-        elif result.worker == wide_task.WORKER and self._tasks.wide is not None:
-            self._tasks.wide.finish(result, now_ns)
-            return True
-        return False
+    def _steer(
+        self, mode: Mode, estimate: Estimate | None, readings: Sequence[ImuReading], now_ns: int
+    ) -> Steered:
+        """Use the coils as the mode requires; `estimate` is None unless measured."""
+        steering, modes = self._tasks.steering, self._tasks.modes
+        if mode in STEERING:
+            return steering.run(estimate, now_ns, self._ever_started)
+        if modes.detumbles:
+            return steering.detumble(readings, self._tasks.navigation.is_current(now_ns), now_ns)
+        if modes.acquires_sun:
+            return steering.acquire_sun(readings, self._tasks.navigation.is_current(now_ns), now_ns)
+        return steering.rest(now_ns)
+
+    def _publish(self, output: ControlOutput, measured: Estimate | None) -> None:
+        """Submit the requested plan, and record the cycle; `measured` is the measured estimate or None."""
+        cycle = output.cycle
+        if output.mode in STEERING and output.target is not None:
+            self._body.control.planner.serve(measured, output.target, cycle.start_ns)
+        self._body.view.record_cycle(output)
+        if cycle.slot % ATTITUDE_EVERY == 0:
+            self._record(output)
 
     def _record(self, output: ControlOutput) -> None:
         """Record the attitude packet, the same for every body."""

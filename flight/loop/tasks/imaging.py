@@ -83,7 +83,7 @@ class ObjectTracking:
     def ingest(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
         """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
         self._record_sightings(sequence, middle_ns, sighted, now_ns)
-        orbit = self._body.place(middle_ns)
+        orbit = self._body.estimation.orbit(middle_ns)
         frame = FrameSightings(
             middle_ns,
             sighted.directions,
@@ -103,7 +103,7 @@ class ObjectTracking:
             self._events.report(events.OBJECT_LOST, now_ns, text)
         for track in self._tracker.objects:
             self._record_track(track, now_ns)
-        self._body.sighted(self._tracker.objects, now_ns)
+        self._body.control.accept_tracks(self._tracker.objects, now_ns)
 
     def _record_sightings(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
         x, y = np.reshape(sighted.points, (-1, 2)).T
@@ -121,7 +121,7 @@ class ObjectTracking:
     def _record_track(self, track: Track, now_ns: int) -> None:
         line = track.line
         across = np.eye(3) - np.outer(line.direction, line.direction)
-        orbit = self._body.place(line.time_ns)
+        orbit = self._body.estimation.orbit(line.time_ns)
         self._recorder.record(
             TRACK,
             now_ns,

@@ -62,14 +62,14 @@ class AttitudeWatch:
 
     Attributes:
         follows: the mode that follows the acquisition; None where the body rests.
-        brakes: whether a body in SAFE is being braked.
-        seeks: whether a body in SAFE turns to the Sun.
+        detumbles: whether a body in SAFE is detumbled.
+        acquires_sun: whether a body in SAFE turns to the Sun.
     """
 
     def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
         """`low_rate` rad/s for `low_for` s ends the braking."""
         self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
-        self.brakes = self.seeks = False
+        self.detumbles = self.acquires_sun = False
         self._fast, self._low = settings.tumble_rate, low_rate
         self._known = HoldTimer(settings.known_for)
         self._lost = HoldTimer(settings.lost_for)
@@ -85,7 +85,7 @@ class AttitudeWatch:
 
     def reset(self) -> None:
         """Begin again: another mode is entered."""
-        self.brakes = self.seeks = False
+        self.detumbles = self.acquires_sun = False
         for timer in (self._known, self._lost, self._spins, self._slow):
             timer.reset()
 
@@ -101,24 +101,24 @@ class AttitudeWatch:
         self,
         rate: float,
         barred: bool,
-        brake: Callable[[int], None],
-        seek: Callable[[int], None],
+        detumble: Callable[[int], None],
+        acquire_sun: Callable[[int], None],
         now_ns: int,
     ) -> None:
-        """Brake a body in SAFE that turns fast until it is slow, else have it seek the Sun.
+        """Detumble a body in SAFE that turns fast until it is slow; otherwise turn it to the Sun.
 
-        Neither while `barred` by a latched fault. `brake` and `seek` are called when either begins.
+        Neither while `barred` by a latched fault. `detumble` and `acquire_sun` are called when either begins.
         """
-        if self.brakes:
-            self.brakes = not (barred or self._slow.update(rate < self._low, now_ns))
+        if self.detumbles:
+            self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
         elif self._spins.update(rate > self._fast and not barred, now_ns):
             self._slow.reset()
-            self.brakes = True
-            brake(now_ns)
-        seeks = not (barred or self.brakes)
-        if seeks and not self.seeks:
-            seek(now_ns)
-        self.seeks = seeks
+            self.detumbles = True
+            detumble(now_ns)
+        acquires_sun = not (barred or self.detumbles)
+        if acquires_sun and not self.acquires_sun:
+            acquire_sun(now_ns)
+        self.acquires_sun = acquires_sun
 
 
 class PointingWatch:
@@ -209,24 +209,24 @@ class ModeControl:
         self._settings = settings.modes
         self._stop = settings.stop
         self._machine = ModeMachine()
-        self._targets = body.targets
-        self._paths = body.paths
+        self._targets = body.control.targets
+        self._paths = body.control.paths
         self._view = body.view
         self._steering = steering
         self._facts = services.facts
         self._recorder = services.recorder
         self._events = services.events
         self._low_rate = settings.low_rate
-        self._modes = body.modes
+        self._modes = body.control.modes
         self._initial = Mode.named(settings.modes.initial)
-        if self._initial not in body.modes:
+        if self._initial not in body.control.modes:
             raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {_starts(body)}")
         self._crashed, self._too_many_crashes = 0, False
         self._commands = 0
         self._seen_ns = 0
         self._slow = HoldTimer(settings.low_for)
         self._arrived = HoldTimer(settings.modes.arrived_for)
-        self._pointing = PointingWatch(settings.modes, body.targets, services.facts)
+        self._pointing = PointingWatch(settings.modes, body.control.targets, services.facts)
         self._attitude = AttitudeWatch(settings.modes, settings.low_rate, settings.low_for)
         self.restart = ""
         self.wanted: Target | None = None
@@ -250,14 +250,14 @@ class ModeControl:
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 
     @property
-    def brakes(self) -> bool:
+    def detumbles(self) -> bool:
         """Whether the body is to be braked: in DETUMBLE, and in SAFE while it spins."""
-        return self.mode is Mode.DETUMBLE or self._attitude.brakes
+        return self.mode is Mode.DETUMBLE or self._attitude.detumbles
 
     @property
-    def seeks(self) -> bool:
+    def acquires_sun(self) -> bool:
         """Whether the body is to turn to the Sun without an attitude: in SAFE, once it is slow."""
-        return self._attitude.seeks
+        return self._attitude.acquires_sun
 
     def target(self, mission_time_ns: int) -> Target | None:
         """Return the target in force at a mission time; None in a mode without one."""
@@ -306,7 +306,9 @@ class ModeControl:
             self._pointing.watch_rate(rate, now_ns)
         elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
             barred, steering = bool(_barred(self._facts)), self._steering
-            self._attitude.watch_safe(rate, barred, steering.begin_braking, steering.begin_seeking, now_ns)
+            self._attitude.watch_safe(
+                rate, barred, steering.begin_detumbling, steering.begin_sun_acquisition, now_ns
+            )
         if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
             self._fire(trigger, "", now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
@@ -406,7 +408,7 @@ class ModeControl:
         if change.before not in STEERING | {Mode.BOOT}:
             self._paths.release()  # an old path does not start where the body is now
         if change.after is Mode.DETUMBLE:
-            self._steering.begin_braking(now_ns)
+            self._steering.begin_detumbling(now_ns)
         if change.after is Mode.SUN:
             self.wanted = self._targets.commanded(SUN, 0)
         elif change.after is Mode.POINT:
@@ -443,4 +445,4 @@ def _barred(known: Facts) -> str:
 
 def _starts(body: Body) -> str:
     """Return the modes in which this body can start, as text."""
-    return ", ".join(sorted(mode.label for mode in STARTS.keys() & body.modes))
+    return ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))

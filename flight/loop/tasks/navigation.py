@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
-from flight.loop.body import Body
+from flight.loop.body import BodyEstimation
 from flight.loop.fdir import facts
 from flight.loop.fdir.coil_watch import CurrentValidity
 from flight.loop.services import Services
@@ -47,11 +47,11 @@ class Navigation:
     """Owns the filter, and monitors the inertial unit's line."""
 
     def __init__(
-        self, unit: InertialUnit, body: Body, settings: NavigationSettings, services: Services
+        self, unit: InertialUnit, estimation: BodyEstimation, settings: NavigationSettings, services: Services
     ) -> None:
         self._unit = unit
-        self._filter = body.filter
-        self._feed = body.feed
+        self._filter = estimation.filter
+        self._feed = estimation.feed
         self._settings = settings
         self._recorder = services.recorder
         self._events = services.events
@@ -104,7 +104,7 @@ class Navigation:
         self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return readings
 
-    def is_heard(self, now_ns: int) -> bool:
+    def is_current(self, now_ns: int) -> bool:
         """Return whether the coils may be driven by readings alone until the next cycle."""
         return self._is_fresh(self._heard_ns, now_ns)
 

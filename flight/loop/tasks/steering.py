@@ -186,62 +186,60 @@ class Steering:
 
         `ever_started`: there was an estimate before, so that None is a loss of control.
         """
-        body = self._body
-        reference = body.paths.sample(now_ns)
+        control = self._body.control
+        reference = control.paths.sample(now_ns)
         text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
         self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
         if estimate is None or reference is None:
             self._release()
         else:
-            following = body.paths.is_following(now_ns)
+            following = control.paths.is_following(now_ns)
             state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
-            wanted: CoilCommand = body.tracker.command(estimate, reference)
+            wanted: CoilCommand = control.tracker.command(estimate, reference)
             dipole, saturated = wanted.dipole, wanted.saturated
-            self._drive.send(wanted.currents, lambda: body.field(estimate))
-            adrift = not following and body.paths.is_adrift(now_ns)
+            self._drive.send(wanted.currents, lambda: self._body.estimation.field(estimate))
+            adrift = not following and control.paths.is_adrift(now_ns)
         self._facts.update(
             facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
         )
         return self._steered(state, now_ns, reference, dipole, saturated)
 
-    def begin_braking(self, now_ns: int) -> None:
+    def begin_detumbling(self, now_ns: int) -> None:
         """Begin the measuring and acting windows of detumbling."""
-        self._body.brake.begin(now_ns)
+        self._body.control.brake.begin(now_ns)
 
-    def begin_seeking(self, now_ns: int) -> None:
-        """Begin the windows of turning to the Sun, where the body can."""
-        if self._body.seeker is not None:
-            self._body.seeker.begin(now_ns)
+    def begin_sun_acquisition(self, now_ns: int) -> None:
+        """Begin the windows of turning to the Sun, if the body can."""
+        if (acquisition := self._body.control.sun_acquisition) is not None:
+            acquisition.begin(now_ns)
 
-    def brake(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
-        """Detumble in this cycle; `heard`: its newest reading is fresh enough."""
-        return self._drive_by(self._body.brake, SteeringState.BRAKING, readings, heard, now_ns)
+    def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
+        """Detumble in this cycle; `current`: the newest reading is fresh enough."""
+        return self._drive_by(self._body.control.brake, readings, current, now_ns)
 
-    def seek(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
-        """Turn to the Sun in this cycle, without an attitude; rest where nothing does that."""
-        if self._body.seeker is None:
-            return self.rest(now_ns)
-        return self._drive_by(self._body.seeker, SteeringState.BRAKING, readings, heard, now_ns)
+    def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
+        """Turn to the Sun in this cycle, without an attitude; rest if the body cannot."""
+        acquisition = self._body.control.sun_acquisition
+        return (
+            self.rest(now_ns)
+            if acquisition is None
+            else self._drive_by(acquisition, readings, current, now_ns)
+        )
 
-    def _drive_by(
-        self, brake: Brake, acting: SteeringState, readings: Sequence[ImuReading], heard: bool, now_ns: int
-    ) -> Steered:
-        """Command what needs no estimate."""
+    def _drive_by(self, brake: Brake, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
+        """Command the coils by a law that needs no estimate."""
         for reading in readings:
             brake.sample(reading.time_ns, reading.field, reading.rate)
-        text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
-        self._facts.update(facts.CONTROL_LOST, not heard, now_ns, text)
-        state, dipole = SteeringState.OFF, _NO_DIPOLE
-        if heard:
-            self._body.tracker.reset()
-            state, wanted = acting, brake.command(now_ns)
-            dipole = wanted.dipole
-            self._drive.send(wanted.currents, lambda: brake.field(now_ns))
-            brake.sent(self._drive.command)
-        else:
-            self._release()
-        return self._steered(state, now_ns, None, dipole)
+        text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
+        self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
+        if not current:
+            return self.rest(now_ns)
+        self._body.control.tracker.reset()
+        wanted = brake.command(now_ns)
+        self._drive.send(wanted.currents, lambda: brake.field(now_ns))
+        brake.sent(self._drive.command)
+        return self._steered(SteeringState.BRAKING, now_ns, None, wanted.dipole)
 
     def rest(self, now_ns: int) -> Steered:
         """Keep the coils at zero in this cycle."""
@@ -258,7 +256,7 @@ class Steering:
 
     def _release(self) -> None:
         self._drive.zero()
-        self._body.tracker.reset()
+        self._body.control.tracker.reset()
 
     def _steered(
         self,

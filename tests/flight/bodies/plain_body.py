@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -42,8 +41,9 @@ class PlainTracker:
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     testbed = TESTBED.make(config, services, learned)
     field = np.array([0.0, 0.0, -as_testbed(config).plant.field])
-    tracker = PlainTracker(field, config.coils.current_limit, testbed.dipole_per_ampere)
-    return replace(testbed, tracker=tracker)
+    tracker = PlainTracker(field, config.coils.current_limit, testbed.control.dipole_per_ampere)
+    testbed.control.tracker = tracker
+    return testbed
 
 
 PLAIN = BodyKind(TESTBED.plan, make)

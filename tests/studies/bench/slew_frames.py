@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.bodies.orbit.body import ORBIT
+from flight.bodies.orbit.body import ORBIT, OrbitControl, OrbitEstimation
 from flight.link.telemetry.packets import to_text
 from flight.loop.body import Body, BodyKind
 from flight.loop.services import Services
@@ -38,9 +38,20 @@ BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
 """s and s and rad, of the slew."""
 
 
+class _Unscheduled(OrbitControl):
+    """The satellite's control with exposures that are not scheduled by the coils' pauses."""
+
+    def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
+        """Return the requested time."""
+        return from_ns
+
+
 def _as_they_come(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the satellite with exposures whenever the camera's turn comes."""
-    return replace(ORBIT.make(config, services, learned), calm=lambda begin_ns, _: begin_ns)
+    body = ORBIT.make(config, services, learned)
+    estimation = body.estimation
+    assert isinstance(estimation, OrbitEstimation)
+    return replace(body, control=_Unscheduled(as_orbit(config), estimation, services))
 
 
 AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)

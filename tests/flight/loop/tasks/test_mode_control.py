@@ -43,20 +43,20 @@ def watched() -> Watched:
 def test_a_slow_body_in_safe_seeks_the_sun_at_once(watched: Watched) -> None:
     watched.safe(0.5 * FAST, 1)
     assert watched.began == ["seek"]
-    assert watched.watch.seeks
-    assert not watched.watch.brakes
+    assert watched.watch.acquires_sun
+    assert not watched.watch.detumbles
 
 
 def test_a_spin_in_safe_is_braked_until_it_has_been_slow_and_then_the_sun_is_sought(watched: Watched) -> None:
     watched.safe(1.5 * FAST, 5)
     assert watched.began == ["seek", "brake"]
-    assert watched.watch.brakes
-    assert not watched.watch.seeks
+    assert watched.watch.detumbles
+    assert not watched.watch.acquires_sun
     watched.safe(0.5 * LOW, 1)
-    assert watched.watch.brakes, "not slow for long enough"
+    assert watched.watch.detumbles, "not slow for long enough"
     watched.safe(0.5 * LOW, 5)
     assert watched.began == ["seek", "brake", "seek"]
-    assert watched.watch.seeks
+    assert watched.watch.acquires_sun
 
 
 def test_one_fast_sample_brakes_nothing(watched: Watched) -> None:
@@ -70,9 +70,9 @@ def test_a_latched_fault_bars_both_also_what_has_begun(watched: Watched) -> None
     watched.safe(1.5 * FAST, 5, barred=True)
     assert not watched.began
     watched.safe(1.5 * FAST, 5)
-    begun = watched.watch.brakes
+    begun = watched.watch.detumbles
     watched.safe(1.5 * FAST, 1, barred=True)
-    assert (begun, watched.watch.brakes, watched.watch.seeks) == (True, False, False)
+    assert (begun, watched.watch.detumbles, watched.watch.acquires_sun) == (True, False, False)
 
 
 def test_an_attitude_that_is_lost_for_long_enough_ends_pointing(watched: Watched) -> None:
