@@ -59,10 +59,14 @@ class House:
         found = self.sizes
         median = found.median_file
         return [
-            Bar("median file", median, "60 to 150", 60 <= median <= 150),
-            at_most("largest file", found.files[0].lines, 400),
-            at_most("classes over 200, no reason given", len(found.long_classes), 0),
-            at_most("functions over 40 lines", len(found.long_functions), 10),
+            Bar("median file", median, "60 to 300", 60 <= median <= 300),
+            at_most("largest file", found.files[0].lines, sizes.LONG_FILE),
+            at_most(f"classes over {sizes.LONG_CLASS}, no reason given", len(found.long_classes), 0),
+            at_most(
+                f"functions over {sizes.LONG_FUNCTION} lines",
+                len(found.long_functions),
+                sizes.MOST_LONG_FUNCTIONS,
+            ),
         ]
 
 
