@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.testbed.body import (
-    ThreadEstimation,
+    TestbedEstimation,
     brake_of,
     dipole_per_ampere,
     surrounding_field,
@@ -51,7 +51,7 @@ DUE_NS = 60_000_000_000
 # --8<-- [start:law]
 @dataclass(frozen=True, slots=True)
 class FixedAttitude:
-    """An `AttitudeLaw`: an attitude that stands still."""
+    """An `TargetLaw`: an attitude that stands still."""
 
     wanted: tuple[float, ...]
 
@@ -276,7 +276,7 @@ class PointingControl(BodyControl):
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the body of a configuration, with what an earlier boot learned."""
     config = as_testbed(config)
-    return Body(ThreadEstimation(config, learned), PointingControl(config), View(services))
+    return Body(TestbedEstimation(config, learned), PointingControl(config), View(services))
 
 
 def plan(job: Any) -> Any:

@@ -42,7 +42,7 @@ _NAME = re.compile(r"(\d{6,})-([0-9a-f]{64})\.yaml")
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class KeptConfig:
     """A configuration that flew."""
 
     number: int
@@ -50,14 +50,14 @@ class Kept:
     text: str
 
 
-def kept_configs(folder: Path) -> list[Kept]:
+def kept_configs(folder: Path) -> list[KeptConfig]:
     """Return the whole configurations kept in a state folder, the newest first. Raises OSError."""
     found = []
     for number, path, digest in _named(folder):
         with suppress(OSError, UnicodeDecodeError):
             data = LinuxFiles().read(path)
             if data is not None and hashlib.sha256(data).hexdigest() == digest:
-                found.append(Kept(number, path, data.decode("utf-8")))
+                found.append(KeptConfig(number, path, data.decode("utf-8")))
     return sorted(found, key=lambda kept: kept.number, reverse=True)
 
 
@@ -90,7 +90,7 @@ class FlownConfig:
             self._drop_others(kept)
             self._kept = True
 
-    def _drop_others(self, kept: list[Kept]) -> None:
+    def _drop_others(self, kept: list[KeptConfig]) -> None:
         """Remove damaged copies, and all but the newest of each text; the newest `KEPT` texts stay."""
         texts: dict[str, Path] = {}
         for one in kept:

@@ -22,11 +22,17 @@ from flight.loop.state.content import Learned
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks import imaging as imaging_task
 from flight.loop.tasks import wide_imaging as wide_task
-from flight.loop.tasks.commanding import Adopters, Commanding, Obeying, Parameters
+from flight.loop.tasks.commanding import CommandedTasks, Commanding, ParameterTable, ParameterUsers
 from flight.loop.tasks.control_cycle import LoopTasks
 from flight.loop.tasks.frame_measurements import ImagingSettings
-from flight.loop.tasks.health import HealthInputs, HealthWatch, Housekeeping, PerformanceObserver, Watched
-from flight.loop.tasks.imaging import Imaging, ObjectTracking
+from flight.loop.tasks.health import (
+    HealthInputs,
+    HealthWatch,
+    Housekeeping,
+    HousekeepingInputs,
+    PerformanceObserver,
+)
+from flight.loop.tasks.imaging import Imaging, ObjectTracks
 from flight.loop.tasks.mode_control import ModeControl, ModeSettings
 from flight.loop.tasks.navigation import Navigation, NavigationSettings, Positioning, SunSensing
 from flight.loop.tasks.steering import CoilDrive, CoilDriveSettings, Steering
@@ -248,12 +254,14 @@ def _tasks(
     health = HealthWatch(
         HealthInputs(modes, drive, devices.power, watches), config.health, opened.feed, services
     )
-    watched = Watched(
+    watched = HousekeepingInputs(
         navigation, body.control.planner, imaging, devices.coils, devices.power, opened.log_error
     )
     commanded = bool(opened.channels or timeline)
-    parameters = Parameters(config, Adopters((modes.adopt, drive.adopt), health.adopt), keeper, services)
-    obeying = Obeying(modes, drive, parameters)
+    parameters = ParameterTable(
+        config, ParameterUsers((modes.adopt, drive.adopt), health.adopt), keeper, services
+    )
+    obeying = CommandedTasks(modes, drive, parameters)
     commanding = Commanding(obeying, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
@@ -309,5 +317,5 @@ def _imaging(
         return None
     settings = imaging_settings(camera, body, opened.frames)
     section = camera.objects
-    objects = None if section is None else ObjectTracking(track_settings(section), body, services)
+    objects = None if section is None else ObjectTracks(track_settings(section), body, services)
     return Imaging(source, settings, navigation, body.view, services, objects)

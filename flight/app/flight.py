@@ -15,12 +15,12 @@ from flight.app.devices import check_settings, linux_rig
 from flight.app.opening import open_flight
 from flight.app.request import RunRequest, RunResult
 from flight.app.run_folder import begin_folder
-from flight.app.service import EndingSignals, Patience, Release, patiently
+from flight.app.service import EndingSignals, FlownRelease, StartRetry, retried_start
 from flight.app.simulated import injected_faults, simulated_rig
 from flight.link import events
 from flight.link.telemetry.log import FlightLog
 from flight.loop.flight_loop import FlightLoop
-from flight.loop.flight_status import Progress, RunLabel
+from flight.loop.flight_status import FlightProgress, RunLabel
 from flight.loop.state.keeper import service_folder
 from flight.schema import reader as configuration
 from flight.schema.document import read_text
@@ -64,7 +64,7 @@ class _Opened:
     log: FlightLog
 
 
-def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
+def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None = None) -> RunResult:
     """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device.
 
     On a board the start is tried until it succeeds; then StoppedError, where a signal ends the attempts.
@@ -74,7 +74,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
         loop, rig, config, text = opened.loop, opened.rig, opened.config, opened.text
         if progress is not None:
             loop.watch(progress)
-        release = Release(os.environ)
+        release = FlownRelease(os.environ)
         if release.note:
             loop.note(events.RELEASE_LEFT, release.note)
         if rig.realtime:
@@ -97,10 +97,10 @@ def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Op
     judge = partial(_judge, request)
     if not _is_patient(request):
         return _open(judge(), stack)
-    patience = Patience(lambda: signals.received)
-    stack.callback(patience.close)
-    opened = patiently(judge, _open, stack, patience)
-    if summary := patience.summary():
+    retry = StartRetry(lambda: signals.received)
+    stack.callback(retry.close)
+    opened = retried_start(judge, _open, stack, retry)
+    if summary := retry.summary():
         opened.loop.note(events.START_WAITED, summary)
     return opened
 

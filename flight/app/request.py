@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight.loop.flight_status import Ending
+from flight.loop.flight_status import FlightEnding
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,6 @@ class RunResult:
     reason: str
     interrupted: bool
     log_error: str
-    ending: Ending
+    ending: FlightEnding
     restart: str = ""
     faults: tuple[str, ...] = ()

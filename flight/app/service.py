@@ -50,7 +50,7 @@ class StoppedError(FlightError):
     """A signal came before the flight, or the link, could begin."""
 
 
-class Patience:
+class StartRetry:
     """Waits between the attempts of a start: reports, feeds the watchdog, notices signals."""
 
     def __init__(self, interrupted: Callable[[], bool], clock: Clock | None = None) -> None:
@@ -89,8 +89,8 @@ class Patience:
         self._overseer.close()
 
 
-def patiently(
-    judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, patience: Patience
+def retried_start(
+    judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
     """Return the result of the first attempt that succeeds; `stack` closes what that one opened.
 
@@ -110,7 +110,7 @@ def patiently(
                     return result
             except (FlightError, DeviceError, OSError) as error:
                 problem = str(error)
-        patience.wait(problem, pause)
+        retry.wait(problem, pause)
     raise AssertionError("the pauses do not end")
 
 
@@ -180,7 +180,7 @@ PROVEN_NS = 60 * SECOND_NS
 _KEPT = 4
 
 
-class Release:
+class FlownRelease:
     """The release of this flight; without a name there is nothing to prove."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:

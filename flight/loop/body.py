@@ -46,7 +46,7 @@ class Reference(Protocol):
         """(3,) rad/s, body axes."""
 
 
-class AttitudeLaw(Protocol):
+class TargetLaw(Protocol):
     """The attitude to be reached over time, in a body's own form."""
 
     @property
@@ -62,7 +62,7 @@ class Target:
     """An attitude law with its number in packets: that of a step, COMMANDED and up, or KEPT."""
 
     index: int
-    law: AttitudeLaw
+    law: TargetLaw
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ PLANNER = "planner"
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class ReadingAgreement:
     """How a reading of the inertial unit agrees with the estimate.
 
     Attributes:
@@ -176,7 +176,7 @@ class Filter(Protocol):
 class Feed(Protocol):
     """Gives the filter the quantities of a reading that have a meaning for this body."""
 
-    def accept(self, reading: ImuReading) -> Agreement:
+    def accept(self, reading: ImuReading) -> ReadingAgreement:
         """Start the filter from a reading, or apply it."""
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
@@ -303,7 +303,7 @@ class BodyView(Protocol):
         """Return target and attitude as text, for the progress line."""
 
 
-class WideSight(Protocol):
+class WideCameraUse(Protocol):
     """What a body does with the frames of its wide cameras."""
 
     @property
@@ -335,7 +335,7 @@ class BodyEstimation(Protocol):
     feed: Feed
     coil_watch: CoilWatch
     learned_problems: list[str]
-    wide: WideSight | None = None
+    wide: WideCameraUse | None = None
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the magnetic field (3,) T in body axes at an estimate, for the reallocation of currents."""

@@ -16,7 +16,7 @@ from flight.link.events import EventKind
 from flight.loop.body import Body, ControlOutput, SteeringState
 from flight.loop.executive.executive import Cycle, Executive, RateGroup
 from flight.loop.fdir.resources import ResourceReader
-from flight.loop.flight_status import Ending, Progress, RunLabel, ending, record_run
+from flight.loop.flight_status import FlightEnding, FlightProgress, RunLabel, ending, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks.control_cycle import ControlCycle, LoopTasks
@@ -53,7 +53,7 @@ class _Requests:
 
     stop_reason: str = ""
     ended_ns: int = 0
-    progress: Callable[[Progress], None] | None = None
+    progress: Callable[[FlightProgress], None] | None = None
     notes: list[tuple[EventKind, str]] = field(default_factory=list)
 
 
@@ -96,7 +96,7 @@ class FlightLoop:
         """Keep an event from before the flight, to be reported at its start."""
         self._requests.notes.append((kind, text))
 
-    def watch(self, progress: Callable[[Progress], None]) -> None:
+    def watch(self, progress: Callable[[FlightProgress], None]) -> None:
         """Call `progress` once a second of mission time."""
         self._requests.progress = progress
 
@@ -118,7 +118,7 @@ class FlightLoop:
             self._record_performance(now_ns)
         return reason
 
-    def ending(self) -> Ending:
+    def ending(self) -> FlightEnding:
         """Return how the flight stands; once `run` has returned, how it ended."""
         tasks, requests, services = self._tasks, self._requests, self._services
         cycles, coils, mode = self._groups[0].completed, tasks.housekeeping.coils(), tasks.modes.mode.label
@@ -181,10 +181,10 @@ class FlightLoop:
         if self._requests.progress is not None:
             self._requests.progress(self._progress(state, now_ns))
 
-    def _progress(self, state: SteeringState, now_ns: int) -> Progress:
+    def _progress(self, state: SteeringState, now_ns: int) -> FlightProgress:
         output, services = self._output, self._services
         x, y, z = output.steered.currents.tolist() if output is not None else (0.0, 0.0, 0.0)
-        return Progress(
+        return FlightProgress(
             (now_ns - services.recorder.epoch_ns) * 1e-9,
             self._config.duration,
             self._body.view.progress(output),

@@ -49,7 +49,7 @@ def record_run(
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class FlightProgress:
     """Times in s, currents (3,) in A; `attitude` is the body's text of target and attitude."""
 
     mission_time: float
@@ -65,7 +65,7 @@ _BROKEN = {"x": COIL_X_BROKEN, "y": COIL_Y_BROKEN, "z": COIL_Z_BROKEN}
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class FlightEnding:
     """How a flight stood when its loop ended.
 
     Attributes:
@@ -98,13 +98,13 @@ def ending(
     facts: Facts,
     counts: Mapping[EventKind, int],
     coils: CoilState,
-) -> Ending:
+) -> FlightEnding:
     """Return the ending of a loop; `counts` are those of its events."""
 
     def of(severity: Severity) -> dict[str, int]:
         return {kind.name: count for kind, count in counts.items() if kind.severity is severity}
 
-    return Ending(
+    return FlightEnding(
         mission_time,
         cycles,
         mode,

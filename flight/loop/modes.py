@@ -1,7 +1,7 @@
 """The state machine of the satellite's modes: triggers, transition table and machine.
 
-The table holds the result of every trigger in every mode. `Answer.STAY` is for a trigger without effect in
-that mode, `Answer.REFUSE` for a command that is refused.
+The table holds the result of every trigger in every mode. `TriggerAnswer.STAY` is for a trigger without
+effect in that mode, `TriggerAnswer.REFUSE` for a command that is refused.
 """
 
 from __future__ import annotations
@@ -65,19 +65,19 @@ SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
 """The triggers that must lead to SAFE from every mode."""
 
 
-class Answer(Enum):
+class TriggerAnswer(Enum):
     """The result of a trigger that changes no mode."""
 
     STAY = "stays"
     REFUSE = "is refused"
 
 
-Row = Mapping[Trigger, Mode | Answer]
+Row = Mapping[Trigger, Mode | TriggerAnswer]
 Table = Mapping[Mode, Row]
 
 _COMMANDED: Row = {trigger: mode for mode, trigger in COMMANDS.items()}
-_STARTED: Row = dict.fromkeys(STARTS.values(), Answer.STAY)
-_ACQUIRED: Row = dict.fromkeys((*KNOWN.values(), Trigger.LOST), Answer.STAY)
+_STARTED: Row = dict.fromkeys(STARTS.values(), TriggerAnswer.STAY)
+_ACQUIRED: Row = dict.fromkeys((*KNOWN.values(), Trigger.LOST), TriggerAnswer.STAY)
 _POINTING: Row = {  # a new target is approached from the present attitude
     **_STARTED,
     **_COMMANDED,
@@ -85,24 +85,24 @@ _POINTING: Row = {  # a new target is approached from the present attitude
     Trigger.LOST: Mode.ACQUIRE,
     Trigger.REACT_SAFE: Mode.SAFE,
     Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-    Trigger.REACT_HOLD: Answer.STAY,
-    Trigger.DETUMBLED: Answer.STAY,
-    Trigger.SLOWED: Answer.STAY,
-    Trigger.ARRIVED: Answer.STAY,
+    Trigger.REACT_HOLD: TriggerAnswer.STAY,
+    Trigger.DETUMBLED: TriggerAnswer.STAY,
+    Trigger.SLOWED: TriggerAnswer.STAY,
+    Trigger.ARRIVED: TriggerAnswer.STAY,
 }
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
         **{trigger: mode for mode, trigger in STARTS.items()},
-        **dict.fromkeys(COMMANDS.values(), Answer.REFUSE),
+        **dict.fromkeys(COMMANDS.values(), TriggerAnswer.REFUSE),
         **_ACQUIRED,
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Answer.STAY,
-        Trigger.REACT_HOLD: Answer.STAY,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.SAFE: {  # left by command only; the way to pointing leads through the acquisition
         **_STARTED,
@@ -110,27 +110,27 @@ TRANSITIONS: Table = {
         **_ACQUIRED,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
-        Trigger.COMMAND_SAFE: Answer.STAY,
-        Trigger.REACT_SAFE: Answer.STAY,
-        Trigger.REACT_DETUMBLE: Answer.STAY,
-        Trigger.REACT_HOLD: Answer.STAY,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.COMMAND_SAFE: TriggerAnswer.STAY,
+        Trigger.REACT_SAFE: TriggerAnswer.STAY,
+        Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.DETUMBLE: {  # commanded to point it does so once its rate is low and its attitude known
         **_STARTED,
         **_COMMANDED,
         **_ACQUIRED,
-        Trigger.COMMAND_SUN: Answer.STAY,
-        Trigger.COMMAND_POINT: Answer.STAY,
-        Trigger.COMMAND_DETUMBLE: Answer.STAY,
+        Trigger.COMMAND_SUN: TriggerAnswer.STAY,
+        Trigger.COMMAND_POINT: TriggerAnswer.STAY,
+        Trigger.COMMAND_DETUMBLE: TriggerAnswer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Answer.STAY,
-        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
         Trigger.DETUMBLED: Mode.HOLD,
         Trigger.SLOWED: Mode.ACQUIRE,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.HOLD: {  # commanded again it keeps the attitude of that moment
         **_STARTED,
@@ -138,10 +138,10 @@ TRANSITIONS: Table = {
         **_ACQUIRED,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: Answer.STAY,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.SLEW: {  # commanded again it goes to the new target
         **_STARTED,
@@ -150,37 +150,37 @@ TRANSITIONS: Table = {
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Mode.HOLD,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
         Trigger.ARRIVED: Mode.HOLD,
     },
     Mode.TESTBED_DEMO: {  # without a plan it holds the attitude, and continues with the next plan
         **_STARTED,
         **_COMMANDED,
         **_ACQUIRED,
-        Trigger.COMMAND_DEMO: Answer.STAY,
+        Trigger.COMMAND_DEMO: TriggerAnswer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: Answer.STAY,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.ACQUIRE: {
         **_STARTED,
         **_COMMANDED,
         **_ACQUIRED,
         **{trigger: mode for mode, trigger in KNOWN.items()},
-        Trigger.COMMAND_SUN: Answer.STAY,
-        Trigger.COMMAND_POINT: Answer.STAY,
+        Trigger.COMMAND_SUN: TriggerAnswer.STAY,
+        Trigger.COMMAND_POINT: TriggerAnswer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: Answer.STAY,
-        Trigger.DETUMBLED: Answer.STAY,
-        Trigger.SLOWED: Answer.STAY,
-        Trigger.ARRIVED: Answer.STAY,
+        Trigger.REACT_HOLD: TriggerAnswer.STAY,
+        Trigger.DETUMBLED: TriggerAnswer.STAY,
+        Trigger.SLOWED: TriggerAnswer.STAY,
+        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
-    Mode.SUN: {**_POINTING, Trigger.COMMAND_SUN: Answer.STAY},
+    Mode.SUN: {**_POINTING, Trigger.COMMAND_SUN: TriggerAnswer.STAY},
     Mode.POINT: _POINTING,
 }
 
@@ -195,7 +195,9 @@ def check(table: Table) -> None:
             if trigger not in row:
                 raise FlightError(f"mode table: {mode.label} has no answer to {trigger.value!r}")
         for trigger in SAFING:
-            if row[trigger] is not Mode.SAFE and not (mode is Mode.SAFE and row[trigger] is Answer.STAY):
+            if row[trigger] is not Mode.SAFE and not (
+                mode is Mode.SAFE and row[trigger] is TriggerAnswer.STAY
+            ):
                 raise FlightError(f"mode table: {trigger.value!r} does not lead from {mode.label} to safe")
         if not any(isinstance(to, Mode) and to is not mode for to in row.values()):
             raise FlightError(f"mode table: {mode.label} is a dead end")
@@ -218,7 +220,7 @@ def _reachable(table: Table, start: Mode) -> set[Mode]:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ModeChange:
     """A transition from one mode to another, or to the same mode again."""
 
     before: Mode
@@ -236,15 +238,15 @@ class ModeMachine:
         self.mode = Mode.BOOT
         self.since_ns = time_ns
 
-    def answer(self, trigger: Trigger) -> Mode | Answer:
+    def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
         """Return what `trigger` would do now."""
         return self._table[self.mode][trigger]
 
-    def fire(self, trigger: Trigger, now_ns: int) -> Change | None:
+    def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:
         """Follow the table; return the change, None when the mode stays or the trigger is refused."""
         after = self.answer(trigger)
-        if isinstance(after, Answer):
+        if isinstance(after, TriggerAnswer):
             return None
-        change = Change(self.mode, after, trigger)
+        change = ModeChange(self.mode, after, trigger)
         self.mode, self.since_ns = after, now_ns
         return change

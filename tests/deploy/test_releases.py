@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.app.service import NAME, NOTE, TRIALS, Release
+from flight.app.service import NAME, NOTE, TRIALS, FlownRelease
 from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import script
 
@@ -47,13 +47,13 @@ def test_a_new_release_that_is_never_proven_gives_way_to_the_old_one_which_repor
     label, complaint = board.fly()
     assert label == "old"
     assert "ended 3 times before it was proven; 0.1.0+1 flies" in complaint
-    Release({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).prove()
+    FlownRelease({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).prove()
     assert _flown(board, 5) == ["new"] * 5, "proven: power cuts no longer count"
 
 
 def test_a_release_that_ends_by_itself_has_its_starts_forgiven(board: FakeBoard) -> None:
     assert _flown(board, 2) == ["new", "new"]
-    Release({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).end()
+    FlownRelease({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).end()
     assert _flown(board, 3) == ["new", "new", "new"]
     assert _flown(board, 1) == ["old"]
 
@@ -139,7 +139,7 @@ def test_a_release_that_fails_its_self_test_changes_nothing(board: FakeBoard) ->
 
 
 def test_a_flight_without_a_release_has_nothing_to_prove(tmp_path: Path) -> None:
-    release = Release({"STATE_DIRECTORY": str(tmp_path), NOTE: ""})
+    release = FlownRelease({"STATE_DIRECTORY": str(tmp_path), NOTE: ""})
     with ExitStack() as stack:
         release.serve(None, stack)  # type: ignore[arg-type] # no ticker is asked for
     release.prove()

@@ -22,7 +22,7 @@ FLOWN_S = 10.0
 
 
 @dataclass(slots=True)
-class Verdict:
+class CheckResult:
     """What was found; `problems` would keep the flight from going well, none where it is ready."""
 
     config: Config
@@ -58,7 +58,7 @@ def check(options: argparse.Namespace) -> int:
     chosen = accepted_config(options.config, os.environ)
     path = chosen.path
     config = configuration.parse(chosen.text, str(path))
-    verdict = Verdict(config, path, [chosen.problem] if chosen.problem else [])
+    verdict = CheckResult(config, path, [chosen.problem] if chosen.problem else [])
     with placing(chosen.text, str(path)):
         body_kind(config)
         check_settings(config)
@@ -71,7 +71,7 @@ def check(options: argparse.Namespace) -> int:
     return 1 if verdict.problems else 0
 
 
-def _fly(verdict: Verdict) -> None:
+def _fly(verdict: CheckResult) -> None:
     """Fly the beginning in lock-step, into a folder that is forgotten."""
     from flight.app.flight import fly  # noqa: PLC0415
 
@@ -96,7 +96,7 @@ def flight_problems(result: RunResult) -> list[str]:
     return problems
 
 
-def _facts(verdict: Verdict) -> dict[str, Any]:
+def _facts(verdict: CheckResult) -> dict[str, Any]:
     config, result = verdict.config, verdict.result
     flown = None if result is None else summary_facts(result, verdict.elapsed)
     return {
@@ -111,7 +111,7 @@ def _facts(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _text(verdict: Verdict) -> str:
+def _text(verdict: CheckResult) -> str:
     config, result = verdict.config, verdict.result
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),

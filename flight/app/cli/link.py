@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
-from flight.app.service import Patience, StoppedError, patiently
+from flight.app.service import StartRetry, StoppedError, retried_start
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine
 from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
@@ -36,7 +36,7 @@ _NICE = 10
 
 
 @dataclass(frozen=True, slots=True)
-class _Judged:
+class _JudgedLink:
     """A configuration that was found right: its link, its command socket, and why another file was read."""
 
     link: Link
@@ -45,7 +45,7 @@ class _Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class _Opened:
+class _OpenedLink:
     """A link that is ready to run, and the names of its lines."""
 
     station: Station
@@ -95,29 +95,29 @@ def link(options: argparse.Namespace) -> int:
 def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
     """Start the link as soon as nothing prevents it, and run it until `ended` returns true."""
     with ExitStack() as stack:
-        patience = Patience(ended)
-        stack.callback(patience.close)
-        opened = patiently(partial(_judge, config, log), partial(_open, log), stack, patience)
+        retry = StartRetry(ended)
+        stack.callback(retry.close)
+        opened = retried_start(partial(_judge, config, log), partial(_open, log), stack, retry)
         overseer = ServiceManager(os.environ, os.getpid())
         stack.callback(overseer.close)
         stack.callback(overseer.stopping)
         status = f"link open on {opened.names}"
-        _say("; ".join(filter(None, (status, patience.summary()))))
+        _say("; ".join(filter(None, (status, retry.summary()))))
         overseer.ready(status)
         opened.station.run(ended, lambda text: _say(f"link: {text}"), overseer.feed_watchdog)
 
 
-def _judge(config_path: Path, log: Path) -> _Judged:
+def _judge(config_path: Path, log: Path) -> _JudgedLink:
     """Read the configuration, and judge it. Raises UnreadConfigError; ConfigError for a wrong one."""
     # A service keeps the last configuration that flew beside its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
         raise ConfigError(str(chosen.path), "no `link` section: there is nothing to connect")
-    return _Judged(config.link, Path(config.commands.socket), chosen.problem)
+    return _JudgedLink(config.link, Path(config.commands.socket), chosen.problem)
 
 
-def _open(log: Path, judged: _Judged, stack: ExitStack) -> _Opened:
+def _open(log: Path, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
     """Open keys and lines. Raises UsageError, FlightError, DeviceError, OSError for what may pass."""
     if judged.problem:
         _say(judged.problem)
@@ -133,7 +133,7 @@ def _open(log: Path, judged: _Judged, stack: ExitStack) -> _Opened:
     control: ControlLine[Sent] = ControlLine(judged.socket, Path(folder))
     settings = StationSettings(section.spacecraft, section.frame_bytes, section.rate)
     station = Station(settings, vault, lines, control, LogFollower(log), clock)
-    return _Opened(station, ", ".join(line.name for line in lines))
+    return _OpenedLink(station, ", ".join(line.name for line in lines))
 
 
 def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Line]:

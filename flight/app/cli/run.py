@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from flight.app.cli import PROGRAM
 from flight.app.request import RunRequest, RunResult
-from flight.loop.flight_status import Ending, Progress
+from flight.loop.flight_status import FlightEnding, FlightProgress
 from flight.schema.carried import config_path, names
 from knightcube.errors import FlightError
 
@@ -62,7 +62,7 @@ def counts_text(counts: Mapping[str, int], noun: str) -> str:
     return f"{noun} " + ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
 
 
-def _coils(ending: Ending) -> str:
+def _coils(ending: FlightEnding) -> str:
     state = "at zero" if ending.coils_at_zero else f"NOT confirmed at zero: {ending.coil_error}"
     left_out = ", ".join(ending.coils_left_out)
     return f"{state}; left out: {left_out}" if left_out else state
@@ -160,13 +160,13 @@ def run(options: argparse.Namespace) -> int:
     return 1 if result.log_error or result.restart else 0
 
 
-def progress_on(stream: TextIO) -> Callable[[Progress], None]:
+def progress_on(stream: TextIO) -> Callable[[FlightProgress], None]:
     """Return a function that shows progress: on a terminal in one line, elsewhere in a line every 10 s."""
     terminal = stream.isatty()
     period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
     last = time.perf_counter()
 
-    def show(progress: Progress) -> None:
+    def show(progress: FlightProgress) -> None:
         nonlocal last
         now = time.perf_counter()
         if now - last < period:

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, wide_feed_of
-from flight.bodies.orbit.control import FieldBrake, PointingTracker, StringSeeker, expected_field
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.control import FieldBrake, PointingTracker, SunAcquisitionBrake, expected_field
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, learned_of, start_from
 from flight.bodies.orbit.filter_steps import OrbitFilterSettings
 from flight.bodies.orbit.guidance import (
@@ -60,12 +60,12 @@ _BELOW = 0.8
 """Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""
 
 
-class OrbitEstimation(BodyEstimation):
+class SatelliteEstimation(BodyEstimation):
     """The estimate of the satellite, and its orbit."""
 
     def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
         """Start from the states that an earlier boot learned."""
-        self.environment = Surroundings(_elements(config), services.clock)
+        self.environment = OrbitEnvironment(_elements(config), services.clock)
         self._services = services
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
@@ -113,10 +113,10 @@ class OrbitEstimation(BodyEstimation):
         return self._sun.accept(reading)
 
 
-class OrbitControl(BodyControl):
+class SatelliteControl(BodyControl):
     """Guidance and control of the satellite."""
 
-    def __init__(self, config: OrbitConfig, estimation: OrbitEstimation, services: Services) -> None:
+    def __init__(self, config: OrbitConfig, estimation: SatelliteEstimation, services: Services) -> None:
         environment, filter_ = estimation.environment, estimation.orbit_filter
         limit = _limit(config)
         self._objects = ObjectAim(_sensor(config), limit, services.events)
@@ -152,8 +152,8 @@ class OrbitControl(BodyControl):
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the satellite of a configuration, with the states that an earlier boot learned."""
     config = as_orbit(config)
-    estimation = OrbitEstimation(config, services, learned)
-    control = OrbitControl(config, estimation, services)
+    estimation = SatelliteEstimation(config, services, learned)
+    control = SatelliteControl(config, estimation, services)
     view = OrbitView(control.field_brake, estimation.orbit_filter, estimation.environment, services)
     return Body(estimation, control, view)
 
@@ -177,10 +177,10 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
 
 
-def _tracker(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> PointingTracker:
+def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> PointingTracker:
     craft, pauses = config.craft, _pauses(config)
     inertia = np.array(craft.inertia)
-    return PointingTracker(filter_, surroundings, pauses, _limit(config), craft.dipole_per_ampere, inertia)
+    return PointingTracker(filter_, environment, pauses, _limit(config), craft.dipole_per_ampere, inertia)
 
 
 def _planned(config: OrbitConfig) -> PlannedCraft:
@@ -246,7 +246,7 @@ def _utc(services: Services) -> float:
 
 
 def _filter(
-    config: OrbitConfig, surroundings: Surroundings, learned: Mapping[str, Learned], utc: float
+    config: OrbitConfig, environment: OrbitEnvironment, learned: Mapping[str, Learned], utc: float
 ) -> tuple[OrbitFilter, list[str]]:
     """Return the filter, and why parts of what was learned were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
@@ -263,7 +263,7 @@ def _filter(
         slow=slow,
         free=filter_settings(config),
     )
-    return OrbitFilter(settings, surroundings.at), problems
+    return OrbitFilter(settings, environment.at), problems
 
 
 def _strings(section: StringsSection) -> SolarStrings:
@@ -271,14 +271,14 @@ def _strings(section: StringsSection) -> SolarStrings:
     return SolarStrings(normals, np.array([string.peak for string in section.strings]))
 
 
-def _sun(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> CoarseSunFeed | None:
+def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> CoarseSunFeed | None:
     section = config.solar_strings
     if section is None:
         return None
-    return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, surroundings)
+    return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, environment)
 
 
-def _seeker(config: OrbitConfig, services: Services) -> StringSeeker | None:
+def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionBrake | None:
     """Return what turns the pointing axis to the Sun in SAFE; None without strings."""
     section, craft = config.solar_strings, config.craft
     if section is None:
@@ -286,7 +286,7 @@ def _seeker(config: OrbitConfig, services: Services) -> StringSeeker | None:
     axis = np.array(config.pointing.axis)
     seeking = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
     seeker = SunAcquisition(_pauses(config), seeking)
-    return StringSeeker(seeker, _strings(section), craft.dipole_per_ampere, services.events)
+    return SunAcquisitionBrake(seeker, _strings(section), craft.dipole_per_ampere, services.events)
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:
@@ -299,7 +299,7 @@ def _elements(config: OrbitConfig) -> TwoLineElements | None:
         raise ConfigError("elements", f"are no two-line elements: {error}") from error
 
 
-def _detumbler(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> FieldDetumbler:
+def _detumbler(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> FieldDetumbler:
     section, craft = config.detumble, config.craft
     settle_ns, measure_ns, act_ns = (
         round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
@@ -318,7 +318,7 @@ def _detumbler(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surround
         spin_up=section.spin_up,
         slow=section.low_rate,
     )
-    expected = expected_field(filter_, surroundings, braking.instants)
+    expected = expected_field(filter_, environment, braking.instants)
     return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)
 
 

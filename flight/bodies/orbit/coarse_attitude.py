@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.schema.camera_model import camera_model
 from flight.schema.orbit_devices import WideCamera
@@ -68,7 +68,7 @@ class CoarseSunFeed:
     """Gives the filter the attitude by field and strings."""
 
     def __init__(
-        self, strings: SolarStrings, period_ns: int, filter_: OrbitFilter, surroundings: Surroundings
+        self, strings: SolarStrings, period_ns: int, filter_: OrbitFilter, environment: OrbitEnvironment
     ) -> None:
         """`period_ns`: of a round of readings, which are not of one instant."""
         self.strings = strings
@@ -76,7 +76,7 @@ class CoarseSunFeed:
         self._turns = FieldAndStrings(strings)
         self._period_ns = period_ns
         self._filter = filter_
-        self._surroundings = surroundings
+        self._environment = environment
         self._judged_ns = -PERIOD_NS
         self._against = 0
         self._last: list[float] = []
@@ -86,7 +86,7 @@ class CoarseSunFeed:
         """Take a reading; return what it shows to be wrong, empty for nothing, None where not judged."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
-        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None or around.sunlit < SUNLIT:
             return None
         currents = reading.currents.tolist()
@@ -95,12 +95,12 @@ class CoarseSunFeed:
             return "the strings give the same currents in every reading"
         if time_ns - self._judged_ns < PERIOD_NS:
             return None
-        heard = self._filter.heard_field()
-        turned = None if heard is None else self._filter.turned(heard[0].time_ns, time_ns)
-        if heard is None or turned is None:
+        measured_field = self._filter.newest_field()
+        turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
+        if measured_field is None or turned is None:
             return None
         self._carry_on(time_ns)
-        (field, gyro), sky = heard, _sky(around, sun)
+        (field, gyro), sky = measured_field, _sky(around, sun)
         seen = attitude_matrix(turned) @ field.field
         sigma = float(np.sqrt(field.covariance[0, 0]))
         excess = float(np.linalg.norm(seen) - np.linalg.norm(sky.field))
@@ -165,14 +165,14 @@ FIELD_SIGMA = 0.03
 
 
 class WideFeed:
-    """Implements `flight.loop.body.WideSight`."""
+    """Implements `flight.loop.body.WideCameraUse`."""
 
     def __init__(
         self,
         cameras: Sequence[MountedCamera],
         lens_error: float,
         filter_: OrbitFilter,
-        surroundings: Surroundings,
+        environment: OrbitEnvironment,
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
@@ -183,7 +183,7 @@ class WideFeed:
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
         self._filter = filter_
-        self._surroundings = surroundings
+        self._environment = environment
         self._sun = sun
         self._response = response
         self._against = 0
@@ -193,7 +193,7 @@ class WideFeed:
         """Whether the cameras are to be read often: in the shadow only while the attitude is lost."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
-        around = self._surroundings.at(self._filter.measured_ns)
+        around = self._environment.at(self._filter.measured_ns)
         dark = around is not None and around.sunlit <= 0.0
         return not dark or self._filter.knowledge is Knowledge.LOST
 
@@ -206,7 +206,7 @@ class WideFeed:
 
     def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
         """Start the filter from Sun, nadir and field, or feed it; return whether Sun and nadir were used."""
-        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return False, False
         down = -around.position / np.linalg.norm(around.position)
@@ -264,19 +264,21 @@ class WideFeed:
 
     def _field_sight(self, time_ns: int) -> Sight | None:
         """Return the direction of the magnetic field at a time, None without a recent one."""
-        heard = self._filter.heard_field()
-        turned = None if heard is None else self._filter.turned(heard[0].time_ns, time_ns)
-        around = self._surroundings.at(time_ns)
-        if heard is None or turned is None or around is None:
+        measured_field = self._filter.newest_field()
+        turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
+        around = self._environment.at(time_ns)
+        if measured_field is None or turned is None or around is None:
             return None
         try:
-            return field_sight(attitude_matrix(turned) @ heard[0].field, around.field, heard[0].covariance)
+            return field_sight(
+                attitude_matrix(turned) @ measured_field[0].field, around.field, measured_field[0].covariance
+            )
         except AttitudeError:
             return None
 
     def _known(self, time_ns: int) -> HorizonKnowledge:
         """Return what is known of place, Sun, field and attitude at a time, in body axes."""
-        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return HorizonKnowledge()
         field = self._field_sight(time_ns)
@@ -299,7 +301,7 @@ class WideFeed:
 def wide_feed_of(
     sections: Sequence[WideCamera],
     filter_: OrbitFilter,
-    surroundings: Surroundings,
+    environment: OrbitEnvironment,
     sun: CoarseSunFeed | None,
 ) -> WideFeed:
     """Return the feed of configured cameras."""
@@ -308,7 +310,7 @@ def wide_feed_of(
     first, response = sections[0], None
     if first.response == "logarithmic":
         response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
-    return WideFeed(cameras, error, filter_, surroundings, sun, response)
+    return WideFeed(cameras, error, filter_, environment, sun, response)
 
 
 def _is_of_strings(sun: Sighted | None) -> bool:

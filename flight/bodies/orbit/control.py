@@ -16,8 +16,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flight.bodies.orbit.environment import Surroundings
-from flight.bodies.orbit.filter import FieldDoubt, OrbitFilter
+from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.filter import OrbitFilter, StuckFieldCheck
 from flight.bodies.orbit.guidance import PathPoint
 from flight.link import events
 from flight.loop.body import CoilCommand
@@ -41,7 +41,7 @@ class FieldBrake:
         """Take n A of each coil, m^2."""
         self.detumbler = detumbler
         self._dipole_per_ampere = dipole_per_ampere
-        self._doubt = FieldDoubt()
+        self._field_check = StuckFieldCheck()
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
@@ -49,13 +49,13 @@ class FieldBrake:
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
-        if self._doubt.sees(field):
+        if self._field_check.accept(field):
             self.detumbler.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now: zero where the magnetometer is stuck."""
         dipole = self.detumbler.dipole(now_ns)
-        if self._doubt.stuck:
+        if self._field_check.stuck:
             dipole = np.zeros(3)
             self.detumbler.acts(dipole)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
@@ -70,7 +70,7 @@ class FieldBrake:
 
 
 def expected_field(
-    filter_: OrbitFilter, surroundings: Surroundings, instants: FloatArray
+    filter_: OrbitFilter, environment: OrbitEnvironment, instants: FloatArray
 ) -> Callable[[int], FloatArray | None]:
     """Return what gives the field (n, 3) T at `instants` (n,) s after a time, in the body axes of then.
 
@@ -79,8 +79,8 @@ def expected_field(
     field = FieldAhead()
 
     def expected(now_ns: int) -> FloatArray | None:
-        state = surroundings.state(now_ns)
-        if state is None or surroundings.at(now_ns) is None or not filter_.started:
+        state = environment.state(now_ns)
+        if state is None or environment.at(now_ns) is None or not filter_.started:
             return None
         ahead = field.along(state, instants)
         return np.asarray(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T)
@@ -88,7 +88,7 @@ def expected_field(
     return expected
 
 
-class StringSeeker:
+class SunAcquisitionBrake:
     """Commands the seeker's dipole and says whether it has a Sun; implements `flight.loop.body.Brake`."""
 
     def __init__(
@@ -97,7 +97,7 @@ class StringSeeker:
         """Take n A of each coil, m^2."""
         self._seeker, self._strings = seeker, strings
         self._dipole_per_ampere = dipole_per_ampere
-        self._doubt = FieldDoubt()
+        self._field_check = StuckFieldCheck()
         self._events = log
         self._found: bool | None = None
         self._reason = "the strings give no readings"
@@ -115,7 +115,7 @@ class StringSeeker:
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
-        if self._doubt.sees(field):
+        if self._field_check.accept(field):
             self._seeker.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
@@ -128,7 +128,7 @@ class StringSeeker:
             else:
                 self._events.report(events.SUN_MISSED, now_ns, self._reason)
         dipole = self._seeker.dipole(now_ns)
-        if self._doubt.stuck:
+        if self._field_check.stuck:
             dipole = np.zeros(3)
             self._seeker.acts(dipole)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
@@ -151,7 +151,7 @@ class PointingTracker:
     def __init__(
         self,
         filter_: OrbitFilter,
-        surroundings: Surroundings,
+        environment: OrbitEnvironment,
         pauses: WindowSchedule,
         limit: float,
         dipole_per_ampere: float,
@@ -159,7 +159,7 @@ class PointingTracker:
     ) -> None:
         """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil; `inertia` (3,) kg m^2 of the body axes."""
         self._inertia = inertia
-        self._filter, self._surroundings = filter_, surroundings
+        self._filter, self._environment = filter_, environment
         self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
         self._held = CoilCommand(_NOTHING, _NOTHING)
         self._window: tuple[int, object] | None = None
@@ -179,7 +179,7 @@ class PointingTracker:
         self._window = None
 
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
-        around = self._surroundings.at(reference.time_ns)
+        around = self._environment.at(reference.time_ns)
         if around is None:
             return CoilCommand(_NOTHING, _NOTHING)
         residual = self._filter.residual_dipole

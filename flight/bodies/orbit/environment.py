@@ -1,6 +1,6 @@
 """What surrounds the satellite by belief: its place, the field, the Sun and the shadow at any time.
 
-The place is that of the newest GPS fix, carried on; without one, of two-line elements. The surroundings are
+The place is that of the newest GPS fix, carried on; without one, of two-line elements. The environment are
 predicted for some 20 s at once (2 ms) and interpolated between. Long predictions, of a revolution, belong
 into a worker: 0.3 ms for each 10 s.
 """
@@ -36,7 +36,7 @@ _UNIX_EPOCH = 2_440_587.5
 _SHORTEST = 1.0
 
 
-class Surroundings:
+class OrbitEnvironment:
     """Owns the knowledge of the orbit. `refused` counts the fixes that contradict what is known."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
@@ -45,7 +45,7 @@ class Surroundings:
         self._clock = clock
         self._fix: GpsFix | None = None
         self._utc_offset_ns: int | None = None
-        self._heard_offset_ns: int | None = None  # of the newest fix, used or not
+        self._newest_offset_ns: int | None = None  # of the newest fix, used or not
         self._near: Ephemeris | None = None
         self._refused_in_a_row = 0
         self.refused = 0
@@ -145,8 +145,8 @@ class Surroundings:
 
     def _is_out_of_time(self, offset_ns: int) -> bool:
         """Return whether the receiver's time stands or jumps; a lasting jump is believed after a while."""
-        heard, self._heard_offset_ns = self._heard_offset_ns, offset_ns
-        if heard is not None and abs(offset_ns - heard) > TIME_GATE_NS:
+        last_offset_ns, self._newest_offset_ns = self._newest_offset_ns, offset_ns
+        if last_offset_ns is not None and abs(offset_ns - last_offset_ns) > TIME_GATE_NS:
             return True
         known = self._utc_offset_ns
         jumped = known is not None and abs(offset_ns - known) > TIME_GATE_NS

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.bodies.orbit.filter_steps import DipoleHistory, OpenStep, OrbitFilterSettings, StepReplay
-from flight.loop.body import Agreement
+from flight.loop.body import ReadingAgreement
 from flight.loop.state.content import Learned
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -45,7 +45,7 @@ STUCK, CONTRADICTED = 20, 4
 """Readings in a row with the same field, whose noise never repeats; fields that contradict the estimate."""
 
 
-class FieldDoubt:
+class StuckFieldCheck:
     """Counts readings with the same field."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class FieldDoubt:
         """Whether the field has been the same for `STUCK` readings."""
         return self._same >= STUCK
 
-    def sees(self, field: FloatArray) -> bool:
+    def accept(self, field: FloatArray) -> bool:
         """Take the field (3,) of a reading; return whether it may be used: it is not stuck."""
         values = field.tolist()
         self._same, self._last = (self._same + 1 if values == self._last else 0), values
@@ -99,7 +99,7 @@ class _Beginning:
     residual: FloatArray
 
 
-class CarriedOn:
+class EstimatePropagation:
     """Carries estimates of a filter on; 0.03 ms each."""
 
     def __init__(self, free: FreeFilter) -> None:
@@ -186,10 +186,10 @@ class OrbitFilter:
         self._around = around
         self._replay = StepReplay(settings)
         self._free, self._steps = self._replay.free, self._replay.steps
-        self._carried = CarriedOn(self._free)
+        self._propagated = EstimatePropagation(self._free)
         self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
-        self._doubt = FieldDoubt()
+        self._field_check = StuckFieldCheck()
         self._refused_attitudes = 0
         self._placed_ns = 0  # time of the last attitude that was used
         self.restarts = 0
@@ -214,10 +214,10 @@ class OrbitFilter:
         """Whether it takes measurements: also while the attitude is not yet, or no longer, of use."""
         return self._free.started
 
-    def heard_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate (`StepReplay.heard_field`)."""
+    def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
+        """Return the newest field and the gyro's rate (`StepReplay.newest_field`)."""
         self._close()
-        return self._replay.heard_field()
+        return self._replay.newest_field()
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
         """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
@@ -242,7 +242,7 @@ class OrbitFilter:
     @property
     def field_doubt(self) -> str:
         """Why the magnetometer is not believed; empty while it is."""
-        return self._doubt.text(self._replay.refused_fields)
+        return self._field_check.text(self._replay.refused_fields)
 
     @property
     def torque_sizes(self) -> FloatArray:
@@ -281,7 +281,7 @@ class OrbitFilter:
             return False
         if reading.time_ns <= self._open.end_ns:
             return False
-        usable = self._doubt.sees(reading.field)
+        usable = self._field_check.accept(reading.field)
         rest_ns = self._dipoles.at_rest_since()
         settled = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
         self._open.add(reading, self._dipoles.total(reading.time_ns), settled and usable)
@@ -333,7 +333,7 @@ class OrbitFilter:
         newest = self._steps[-1]
         dipole = self._dipoles.mean(newest.end_ns, time_ns)
         seconds = (time_ns - newest.end_ns) / SECOND_NS
-        return self._carried.now(time_ns, seconds, dipole, newest.around, self.measured_ns)
+        return self._propagated.now(time_ns, seconds, dipole, newest.around, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
         """Return the estimate at a past time, None beyond the history."""
@@ -346,7 +346,7 @@ class OrbitFilter:
         if step.before is None:
             return None
         seconds = (time_ns - step.begin_ns) / SECOND_NS
-        return self._carried.then(step.before, time_ns, seconds, step.dipole, step.around)
+        return self._propagated.then(step.before, time_ns, seconds, step.dipole, step.around)
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
@@ -408,9 +408,9 @@ class OrbitFeed:
     def __init__(self, filter_: OrbitFilter) -> None:
         self._filter = filter_
 
-    def accept(self, reading: ImuReading) -> Agreement:
+    def accept(self, reading: ImuReading) -> ReadingAgreement:
         """Gather rate and field for the filter's next step."""
-        return Agreement(self._filter.accept(reading))
+        return ReadingAgreement(self._filter.accept(reading))
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Start the filter from an attitude of the stars; return whether it did."""

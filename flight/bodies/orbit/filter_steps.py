@@ -85,7 +85,7 @@ class DipoleHistory:
 
 
 @dataclass(slots=True, eq=False)
-class Step:
+class FilterStep:
     """What was commanded and measured between two times.
 
     Attributes:
@@ -145,10 +145,10 @@ class OpenStep:
         """Return whether it has lasted long enough, or the coils have begun or ceased to act."""
         return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
 
-    def close(self, dipole: FloatArray, doubt: float, around: Around) -> Step:
+    def close(self, dipole: FloatArray, doubt: float, around: Around) -> FilterStep:
         """Return the step from its beginning to the newest reading."""
         samples, fields = len(self._rates), len(self._fields)
-        return Step(
+        return FilterStep(
             self.begin_ns,
             self.end_ns,
             dipole,
@@ -211,13 +211,13 @@ class StepReplay:
     def __init__(self, settings: OrbitFilterSettings) -> None:
         self._settings = settings
         self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
-        self.steps: deque[Step] = deque()
+        self.steps: deque[FilterStep] = deque()
         self.refused_gyros = 0
         self.refused_fields = 0
         self.contradicted = 0
         self._refused_ns = 0
 
-    def add(self, step: Step) -> None:
+    def add(self, step: FilterStep) -> None:
         """Add the newest step and forget those beyond the history; take it if there is an estimate."""
         self.steps.append(step)
         while self.steps[0].end_ns < step.end_ns - self._settings.history_ns:
@@ -284,7 +284,7 @@ class StepReplay:
                 return k
         return None
 
-    def heard_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
+    def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
         """Return the newest field and the gyro's rate (3,) rad/s of its step; None without one.
 
         Its covariance is for the start of an estimate: the field's bias enters again with the next.
@@ -336,13 +336,13 @@ class StepReplay:
             self._end(step)
         return used
 
-    def _advance(self, step: Step, from_ns: int, to_ns: int) -> None:
+    def _advance(self, step: FilterStep, from_ns: int, to_ns: int) -> None:
         seconds = (to_ns - from_ns) / SECOND_NS
         parts = math.ceil(seconds / _LONGEST)
         for _ in range(parts):
             self.free.advance(seconds / parts, step.dipole, step.around, step.doubt)
 
-    def _end(self, step: Step) -> None:
+    def _end(self, step: FilterStep) -> None:
         """Apply the gyro's and the magnetometer's means of a step, at its end."""
         free, settings = self.free, self._settings
         since = (step.end_ns - step.gyro_ns) / SECOND_NS
@@ -360,7 +360,7 @@ class StepReplay:
             used = free.field(now, step.around.field, settings.field_noise**2 / step.fields * _EYE)
             self.refused_fields = 0 if used else self.refused_fields + 1
 
-    def _apply(self, measurement: Measurement, step: Step) -> bool:
+    def _apply(self, measurement: Measurement, step: FilterStep) -> bool:
         """Apply a measurement to the estimate of its time; return whether it passed the gate."""
         free = self.free
         if isinstance(measurement, AttitudeMeasurement):

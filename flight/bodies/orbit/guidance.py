@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.link import events
 from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
 from flight.loop.executive.executive import Cycle
@@ -143,7 +143,7 @@ class PointingPaths:
 
 
 @dataclass(frozen=True, slots=True)
-class PointingLawOf:
+class PointingTargetLaw:
     """The attitude of a target over time, by the path that is flown to it; implements `AttitudeLaw`."""
 
     target: PointingTarget
@@ -163,7 +163,7 @@ class PointingLawOf:
 def target_of(target: Target) -> PointingTarget:
     """Return the pointing target of a target of this body."""
     law = target.law
-    assert isinstance(law, PointingLawOf), "only the satellite's own targets reach its planner"
+    assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
     return law.target
 
 
@@ -177,7 +177,7 @@ class PointingTargets:
         self._looks_for_objects = looks_for_objects
         self._paths = paths
         self._times = [round(at * 1e9) for at, _ in timed]
-        self._steps = [Target(k, PointingLawOf(target, paths)) for k, (_, target) in enumerate(timed)]
+        self._steps = [Target(k, PointingTargetLaw(target, paths)) for k, (_, target) in enumerate(timed)]
 
     def configured(self, mission_time_ns: int) -> Target:
         """Return the configured target in force at a mission time."""
@@ -189,12 +189,12 @@ class PointingTargets:
             raise UsageError("a satellite points to a goal, not to a q2")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
             raise UsageError("no star camera looks for objects: `camera: {star_tracker: {}, objects: {}}`")
-        return Target(COMMANDED + number, PointingLawOf(wanted, self._paths))
+        return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
         """Return the present attitude as a target."""
         qx, qy, qz, qw = estimate.quaternion.tolist()
-        return Target(KEPT, PointingLawOf(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
+        return Target(KEPT, PointingTargetLaw(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
 
     def can_hold(self, estimate: Estimate) -> bool:
         """Return True: every attitude can be held in the mean over a revolution."""
@@ -368,13 +368,13 @@ class PointingPlanner:
         self,
         craft: PlannedCraft,
         paths: PointingPaths,
-        surroundings: Surroundings,
+        environment: OrbitEnvironment,
         disturbed: Callable[[], tuple[FloatArray, FloatArray]],
         objects: ObjectAim,
         services: Services,
     ) -> None:
         """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
-        self._craft, self._paths, self._surroundings = craft, paths, surroundings
+        self._craft, self._paths, self._environment = craft, paths, environment
         self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
@@ -418,7 +418,7 @@ class PointingPlanner:
         wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
-        orbit, craft = self._surroundings.state(now_ns), self._craft
+        orbit, craft = self._environment.state(now_ns), self._craft
         if orbit is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return

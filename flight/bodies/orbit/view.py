@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.orbit.control import FieldBrake
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.link import events
 from flight.link.modes import Mode
@@ -32,10 +32,10 @@ class OrbitView:
     """Implements `flight.loop.body.BodyView`."""
 
     def __init__(
-        self, brake: FieldBrake, filter_: OrbitFilter, surroundings: Surroundings, services: Services
+        self, brake: FieldBrake, filter_: OrbitFilter, environment: OrbitEnvironment, services: Services
     ) -> None:
         self._filter = filter_
-        self._surroundings = surroundings
+        self._environment = environment
         self._events = services.events
         self._facts = services.facts
         self._knowledge = Knowledge.LOST
@@ -78,9 +78,9 @@ class OrbitView:
             NAVIGATION,
             now_ns,
             knowledge=LEVELS.index(known),
-            placed=int(self._surroundings.known),
+            placed=int(self._environment.known),
             refused=found.refused,
-            fixes_refused=self._surroundings.refused,
+            fixes_refused=self._environment.refused,
             restarts=found.restarts,
             gyro_bias=_NAN3 if estimate is None else estimate.bias.tolist(),
             field_bias=_NAN3 if estimate is None else estimate.field_bias.tolist(),

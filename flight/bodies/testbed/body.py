@@ -19,12 +19,12 @@ from flight.link.modes import ORBITAL, Mode
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.loop.body import (
     KEPT,
-    Agreement,
     Body,
     BodyControl,
     BodyEstimation,
     BodyKind,
     ControlOutput,
+    ReadingAgreement,
     Target,
     Tracker,
 )
@@ -64,7 +64,7 @@ class UnitFeed:
         self._angle_covariance: FloatArray = np.eye(3) * unit.angle_noise**2
         self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2
 
-    def accept(self, reading: ImuReading) -> Agreement:
+    def accept(self, reading: ImuReading) -> ReadingAgreement:
         """Start the filter from a reading, or apply its attitude and its rate."""
         latency = self._filter.latency
         time_ns = reading.time_ns - round(latency * SECOND_NS)
@@ -72,14 +72,14 @@ class UnitFeed:
         rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
         if not self._filter.started:
             self._filter.start(attitude, rate)
-            return Agreement(True)
+            return ReadingAgreement(True)
         # Gated separately: a correct gyro keeps the rate while the attitude is rejected.
         turned = self._filter.measure(attitude)
         moved = self._filter.started and self._filter.measure(rate)
         if turned and moved:
-            return Agreement(True)
+            return ReadingAgreement(True)
         angle = angle_about_axis_y(reading.quaternion)
-        return Agreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
+        return ReadingAgreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Return False: the unit's own attitude starts the filter."""
@@ -150,7 +150,7 @@ class ThreadView:
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 
 
-class ThreadEstimation(BodyEstimation):
+class TestbedEstimation(BodyEstimation):
     """The estimate of the testbed."""
 
     def __init__(
@@ -182,7 +182,7 @@ class ThreadEstimation(BodyEstimation):
         return self._density
 
 
-class ThreadControl(BodyControl):
+class TestbedControl(BodyControl):
     """Guidance and control of the testbed."""
 
     def __init__(
@@ -207,8 +207,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     config = as_testbed(config)
     cage = None if config.cage is None else CageField(config.cage, config.plant.field, services.clock)
     reader = thread_reader(plant_of(config))
-    control = ThreadControl(config, reader, cage, services)
-    estimation = ThreadEstimation(config, learned, reader, cage)
+    control = TestbedControl(config, reader, cage, services)
+    estimation = TestbedEstimation(config, learned, reader, cage)
     return Body(estimation, control, ThreadView(reader, control.planning, services))
 
 

@@ -51,7 +51,7 @@ class JobResult:
     execution_ns: int
 
 
-class Change(Enum):
+class WorkerChange(Enum):
     """What happened to a worker: its process ended, runs again, or died too often and rests."""
 
     DIED = "died"
@@ -64,7 +64,7 @@ class WorkerNews:
     """A change in a worker's life, and its circumstances."""
 
     worker: str
-    change: Change
+    change: WorkerChange
     text: str
 
 

@@ -26,7 +26,7 @@ from collections.abc import Sequence, Set
 from contextlib import suppress
 from typing import Any
 
-from flight.loop.executive.jobs import Change, JobResult, Outcome, Worker, WorkerNews
+from flight.loop.executive.jobs import JobResult, Outcome, Worker, WorkerChange, WorkerNews
 from flight.loop.executive.messages import (
     LONGEST_BYTES,
     SLAB_BYTES,
@@ -66,7 +66,7 @@ class Attempts:
         return self.deaths >= BUDGET
 
 
-Answer = tuple[Outcome, Any, str, int]
+JobAnswer = tuple[Outcome, Any, str, int]
 """Outcome, value, error and execution time in ns of a job."""
 
 MODULE = "flight.loop.executive.worker"
@@ -141,7 +141,7 @@ class WorkerProcess:
         if sent != len(message):
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
 
-    def receive(self) -> Answer | None:
+    def receive(self) -> JobAnswer | None:
         """Return an arrived answer, else None. Raises EOFError at a death, FlightError for damage."""
         try:
             while chunk := self._socket.recv(1 << 16):
@@ -231,7 +231,7 @@ class _Kept:
         if process.ready and not was_ready:
             self.accepts = True
             if self._deaths:
-                news.append(WorkerNews(self.worker.name, Change.READY, "runs again"))
+                news.append(WorkerNews(self.worker.name, WorkerChange.READY, "runs again"))
         if answer is not None and self.submitted_ns >= 0:
             results.append(JobResult(self.worker.name, *answer[:3], self.submitted_ns, now_ns, answer[3]))
             self.submitted_ns = -1
@@ -267,10 +267,10 @@ class _Kept:
         self._deaths += 1
         wait_ns = self._attempts.died(now_ns - self._begun_ns)
         self._due_ns = self._clock.now_ns() + wait_ns
-        news = [WorkerNews(self.worker.name, Change.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
+        news = [WorkerNews(self.worker.name, WorkerChange.DIED, f"{text}; starts in {wait_ns * 1e-9:g} s")]
         if self._attempts.is_spent:
             spent = f"died {self._attempts.deaths} times in a row; rests for {REST_NS * 1e-9:g} s"
-            news.append(WorkerNews(self.worker.name, Change.SPENT, spent))
+            news.append(WorkerNews(self.worker.name, WorkerChange.SPENT, spent))
         return results, news
 
     def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:

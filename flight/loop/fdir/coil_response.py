@@ -169,10 +169,10 @@ class CoilResponse:
             self.reset()
             return False
         if self._settings.settle_ns is not None:
-            heard = self._field_without_coils(time_ns, since_ns * 1e-9, rate, field)
-            if heard is None:
+            quiet_field = self._field_without_coils(time_ns, since_ns * 1e-9, rate, field)
+            if quiet_field is None:
                 return False
-            field = heard
+            field = quiet_field
         self._samples.append((time_ns, since_ns * 1e-9, rate, field, self._command_at(time_ns)))
         return len(self._samples) >= self._settings.bin_samples and self._close_bin()
 

@@ -244,7 +244,7 @@ class StreamState(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class StreamLimits:
     """One row: rate in Hz, age limit in s, and the range of its value, in the value's unit.
 
     `has_silence_alarm`: another fact covers the silence of this stream, so that `poor` does not.
@@ -259,23 +259,23 @@ class Stream:
     has_silence_alarm: bool = True
 
 
-def streams_of(config: Config) -> tuple[Stream, ...]:
+def streams_of(config: Config) -> tuple[StreamLimits, ...]:
     """Return the streams of the devices that a configuration has."""
     unit, coils, field = config.inertial_unit, config.coils, config.field_range()
     control_hz = config.executive.control_rate_hz
     rows = [
-        Stream("imu", float(unit.rate_hz), unit.max_age, IMU_POOR),
-        Stream("field", float(unit.rate_hz), unit.max_age, FIELD_POOR, *field),
-        Stream("coils", control_hz, coils.stale_after, COILS_POOR),
+        StreamLimits("imu", float(unit.rate_hz), unit.max_age, IMU_POOR),
+        StreamLimits("field", float(unit.rate_hz), unit.max_age, FIELD_POOR, *field),
+        StreamLimits("coils", control_hz, coils.stale_after, COILS_POOR),
     ]
     if config.power_monitor is not None:
         most = 1.5 * sum(coils.supply_voltage / resistance for resistance in coils.resistance)
-        rows.append(Stream("power", 1.0, 3.0, POWER_POOR, -0.1 * most, most))
+        rows.append(StreamLimits("power", 1.0, 3.0, POWER_POOR, -0.1 * most, most))
     if config.camera is not None:
         camera = config.camera
-        rows.append(Stream("camera", 1.0 / _seldom(camera), camera.max_age, CAMERA_POOR))
+        rows.append(StreamLimits("camera", 1.0 / _seldom(camera), camera.max_age, CAMERA_POOR))
     if config.gps is not None:
-        rows.append(Stream("gps", 1.0 / config.gps.period, config.gps.max_age, GPS_POOR))
+        rows.append(StreamLimits("gps", 1.0 / config.gps.period, config.gps.max_age, GPS_POOR))
     return tuple(rows)
 
 
@@ -289,7 +289,7 @@ def _seldom(camera: Camera) -> float:
 class StreamWatch:
     """Computes the age, rate and state of one stream from its readings."""
 
-    def __init__(self, stream: Stream, time_ns: int) -> None:
+    def __init__(self, stream: StreamLimits, time_ns: int) -> None:
         self.stream = stream
         self._window_ns = round(max(_SPAN, _PERIODS / stream.rate_hz) * 1e9)
         self._times: deque[int] = deque(maxlen=max(int(2.0 * stream.rate_hz * self._window_ns * _SECOND), 2))
@@ -337,7 +337,7 @@ class StreamWatch:
 class Streams:
     """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
 
-    def __init__(self, rows: tuple[Stream, ...], time_ns: int = 0) -> None:
+    def __init__(self, rows: tuple[StreamLimits, ...], time_ns: int = 0) -> None:
         self._watches = {row.name: StreamWatch(row, time_ns) for row in rows}
 
     def begin(self, time_ns: int) -> None:
@@ -356,7 +356,7 @@ class Streams:
         watch = self._watches.get(name)
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
-    def look(self, now_ns: int) -> list[tuple[Stream, bool | None, str]]:
+    def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
         """Return for each stream whether it is poor, None when unknown or covered elsewhere, and why."""
         return [(watch.stream, *_poor(watch, now_ns)) for watch in self._watches.values()]
 

@@ -24,7 +24,7 @@ from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import Clock, Ticker
 
 _PERIODS = 3
-_LEAST_PATIENCE_NS = 2_000_000_000
+_SHORTEST_LIMIT_NS = 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,20 +33,20 @@ class WorkerWatch:
 
     name: str
     busy_since_ns: Callable[[], int | None]
-    patience_ns: int
+    limit_ns: int
 
 
 class _GroupWatch:
     def __init__(self, group: RateGroup) -> None:
         self.group = group
-        self.patience_ns = max(_PERIODS * group.period_ns, _LEAST_PATIENCE_NS)
+        self.limit_ns = max(_PERIODS * group.period_ns, _SHORTEST_LIMIT_NS)
         self._completed = group.completed
         self.since_ns = 0
 
     def is_stalled(self, now_ns: int) -> bool:
         if self.group.completed != self._completed:
             self._completed, self.since_ns = self.group.completed, now_ns
-        return now_ns - self.since_ns > self.patience_ns
+        return now_ns - self.since_ns > self.limit_ns
 
 
 class GroupsAndWorkers:
@@ -66,7 +66,7 @@ class GroupsAndWorkers:
         names = [watch.group.name for watch in self._groups if watch.is_stalled(now_ns)]
         for worker in self._workers:
             since_ns = worker.busy_since_ns()
-            if since_ns is not None and now_ns - since_ns > worker.patience_ns:
+            if since_ns is not None and now_ns - since_ns > worker.limit_ns:
                 names.append(worker.name)
         return names
 
@@ -78,7 +78,7 @@ def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
         stood_ns = now_ns - ticker.served_ns
         if ticker.error:
             problems.append(f"{ticker.name}: {ticker.error}")
-        elif stood_ns > max(_PERIODS * ticker.period_ns, _LEAST_PATIENCE_NS):
+        elif stood_ns > max(_PERIODS * ticker.period_ns, _SHORTEST_LIMIT_NS):
             problems.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
     return problems
 

@@ -37,11 +37,11 @@ REMEMBERED = 32
 """How many unclean shutdowns are kept, the newest."""
 
 
-class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A part of the state; unknown keys are rejected."""
 
 
-class Learned(Kept, frozen=True):
+class Learned(StatePart, frozen=True):
     """Parameters learned in flight: `values` (n,) and their covariance (n, n), by rows, in SI units."""
 
     values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=16)]
@@ -58,7 +58,7 @@ class Learned(Kept, frozen=True):
         return np.array(self.values), np.array(self.covariance)
 
 
-class UncleanShutdown(Kept, frozen=True):
+class UncleanShutdown(StatePart, frozen=True):
     """An unclean shutdown: boot number, and operating time and UTC label of its last stored state."""
 
     boot: Count
@@ -66,7 +66,7 @@ class UncleanShutdown(Kept, frozen=True):
     utc: Label
 
 
-class KeptTable(Kept, frozen=True, kw_only=True):
+class KeptTable(StatePart, frozen=True, kw_only=True):
     """A table of parameters that was loaded: values by the configuration's keys.
 
     Attributes:
@@ -81,7 +81,7 @@ class KeptTable(Kept, frozen=True, kw_only=True):
     loads: Count = 0
 
 
-class StoredState(Kept, frozen=True, kw_only=True, omit_defaults=True):
+class StoredState(StatePart, frozen=True, kw_only=True, omit_defaults=True):
     """The stored state.
 
     Attributes:

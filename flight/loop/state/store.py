@@ -141,7 +141,7 @@ Report = Callable[[EventKind, str], None]
 """Reports an event: kind and text."""
 
 
-class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The content of one file."""
 
     generation: Annotated[int, Meta(ge=1, le=2**62)]
@@ -149,11 +149,11 @@ class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, slots=True)
-class _Read:
+class _ReadCopy:
     """One file as read; `problem` is empty when the copy is valid, or missing."""
 
     name: str
-    copy: _Copy | None
+    copy: _StateCopy | None
     problem: str
 
 
@@ -205,29 +205,29 @@ class StateStore:
         self._generation += 1
         return len(failures) < len(COPIES)
 
-    def _read(self, name: str) -> _Read:
+    def _read(self, name: str) -> _ReadCopy:
         try:
             data = self._files.read(self._folder / name)
         except OSError as error:
-            return _Read(name, None, f"cannot be read: {error.strerror or error}")
+            return _ReadCopy(name, None, f"cannot be read: {error.strerror or error}")
         if data is None:
-            return _Read(name, None, "")
+            return _ReadCopy(name, None, "")
         try:
-            return _Read(name, decode(data), "")
+            return _ReadCopy(name, decode(data), "")
         except ValueError as error:
-            return _Read(name, None, str(error))
+            return _ReadCopy(name, None, str(error))
 
 
 def encode(generation: int, state: StoredState) -> bytes:
     """Return the bytes of one copy. Raises ValueError for a state that `decode` would reject."""
     check(state)
-    line = msgspec.json.encode(_Copy(generation, state)) + b"\n"
+    line = msgspec.json.encode(_StateCopy(generation, state)) + b"\n"
     data = line + b"%08x\n" % zlib.crc32(line)
     decode(data)
     return data
 
 
-def decode(data: bytes) -> _Copy:
+def decode(data: bytes) -> _StateCopy:
     """Return the content of one copy. Raises ValueError for anything that `encode` does not produce."""
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
@@ -235,7 +235,7 @@ def decode(data: bytes) -> _Copy:
     if crc != b"%08x\n" % zlib.crc32(line + end):
         raise ValueError(f"torn or corrupt, {len(data)} bytes")
     try:
-        copy = msgspec.json.decode(line, type=_Copy)
+        copy = msgspec.json.decode(line, type=_StateCopy)
     except (msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"holds another kind of state: {str(error)!r}") from error
     check(copy.state)

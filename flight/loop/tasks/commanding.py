@@ -50,18 +50,18 @@ PROVEN_NS = 60_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Adopters:
+class ParameterUsers:
     """Who goes on with other bounds of the modes and of health."""
 
     modes: Sequence[Callable[[Modes], None]]
     health: Callable[[Health], None]
 
 
-class Parameters:
+class ParameterTable:
     """Owns the table of parameters that flies."""
 
     def __init__(
-        self, config: Config, adopters: Adopters, keeper: StateKeeper | None, services: Services
+        self, config: Config, adopters: ParameterUsers, keeper: StateKeeper | None, services: Services
     ) -> None:
         """Start with the configuration's values, or with a table that the `keeper` has."""
         self._config = config
@@ -153,12 +153,12 @@ _REMEMBERED = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Obeying:
+class CommandedTasks:
     """The tasks that obey commands."""
 
     modes: ModeControl
     drive: CoilDrive
-    parameters: Parameters
+    parameters: ParameterTable
 
 
 class Commanding:
@@ -166,7 +166,7 @@ class Commanding:
 
     def __init__(
         self,
-        obeying: Obeying,
+        obeying: CommandedTasks,
         timeline: Sequence[CommandStep],
         channels: Sequence[Channel],
         services: Services,
@@ -180,7 +180,7 @@ class Commanding:
         self._recorder = services.recorder
         self._events = services.events
         self._answers = Packer()
-        self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._received: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._count = 0
 
     def begin(self, now_ns: int) -> None:
@@ -217,12 +217,12 @@ class Commanding:
         command: Command | None = None
         problem = ""
         well_formed = True
-        if data in self._seen:
+        if data in self._received:
             problem = "the very same packet has come before"
         else:
             try:
                 command = unpack(data)
-                self._seen.append(data)
+                self._received.append(data)
             except CommandError as error:
                 problem = str(error)
                 well_formed = not isinstance(error, MalformedError)

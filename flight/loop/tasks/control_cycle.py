@@ -97,7 +97,7 @@ class ControlCycle:
         tasks = self._tasks
         # The last command may have reached the wire late: the coils' thread sends it.
         coils = tasks.drive.state()
-        validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.suspects)
+        validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
         tasks.navigation.commanded(coils, validity)
         readings = tasks.navigation.update(now_ns)
         if not coils.error:

@@ -17,7 +17,7 @@ from flight.link import events
 from flight.link.telemetry.definitions import CYCLE_TIMING, HEALTH, HOUSEKEEPING, JOB_TIMING, RATE_GROUP
 from flight.loop.body import Planner, SteeringState
 from flight.loop.executive.executive import Cycle, RateGroup
-from flight.loop.executive.jobs import Change, JobResult
+from flight.loop.executive.jobs import JobResult, WorkerChange
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import FACTS, EventLog
 from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceReader, ResourceSample
@@ -96,7 +96,7 @@ class PerformanceObserver:
 
 
 @dataclass(frozen=True, slots=True)
-class Watched:
+class HousekeepingInputs:
     """The sources of housekeeping; `log_error` returns why the flight log fails, empty while it works."""
 
     navigation: Navigation
@@ -110,7 +110,7 @@ class Watched:
 class Housekeeping:
     """Writes the housekeeping packet."""
 
-    def __init__(self, watched: Watched, services: Services) -> None:
+    def __init__(self, watched: HousekeepingInputs, services: Services) -> None:
         self._watched = watched
         self._recorder = services.recorder
         self._events = services.events
@@ -166,9 +166,9 @@ class Housekeeping:
 RUNS_PER_PACKET = 4
 _FAILING_CYCLES = 60
 _WORKER_EVENTS = {
-    Change.DIED: events.WORKER_DIED,
-    Change.READY: events.WORKER_READY,
-    Change.SPENT: events.WORKER_RESTS,
+    WorkerChange.DIED: events.WORKER_DIED,
+    WorkerChange.READY: events.WORKER_READY,
+    WorkerChange.SPENT: events.WORKER_RESTS,
 }
 
 

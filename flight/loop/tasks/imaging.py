@@ -71,7 +71,7 @@ def _has_noise(row: Image) -> bool:
 _UNKNOWN = [math.nan] * 3
 
 
-class ObjectTracking:
+class ObjectTracks:
     """Owns the tracks of objects."""
 
     def __init__(self, settings: TrackSettings, body: Body, services: Services) -> None:
@@ -168,7 +168,7 @@ class Imaging:
         navigation: Navigation,
         view: BodyView,
         services: Services,
-        objects: ObjectTracking | None = None,
+        objects: ObjectTracks | None = None,
     ) -> None:
         self._camera = camera
         self._settings = settings

@@ -22,7 +22,16 @@ from flight.link.telemetry.definitions import MODE
 from flight.loop.body import Body, Target, Targets
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import Facts
-from flight.loop.modes import COMMANDS, KNOWN, STARTS, TRANSITIONS, Answer, Change, ModeMachine, Trigger
+from flight.loop.modes import (
+    COMMANDS,
+    KNOWN,
+    STARTS,
+    TRANSITIONS,
+    ModeChange,
+    ModeMachine,
+    Trigger,
+    TriggerAnswer,
+)
 from flight.loop.services import Services
 from flight.loop.tasks.steering import Steering
 from flight.schema.errors import ConfigError
@@ -326,9 +335,9 @@ class ModeControl:
         if trigger is None or mode not in self._modes:
             return f"{mode.label} cannot be commanded" + (" of this body" if trigger else "")
         answer = self._machine.answer(trigger)
-        if answer is Answer.REFUSE:
+        if answer is TriggerAnswer.REFUSE:
             return f"not while in {self.mode.label}"
-        if answer is Answer.STAY and mode not in POINTING:
+        if answer is TriggerAnswer.STAY and mode not in POINTING:
             return ""
         if self.mode is Mode.SAFE and (barred := _barred(self._facts)):
             return barred
@@ -400,7 +409,7 @@ class ModeControl:
         if change is not None:
             self._enter(change, reason, now_ns)
 
-    def _enter(self, change: Change, reason: str, now_ns: int) -> None:
+    def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
         """Enter a mode: reset timers, release an old path, zero the coils of a mode without steering."""
         self._facts.enter(change.after)
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):

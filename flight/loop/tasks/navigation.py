@@ -58,18 +58,18 @@ class Navigation:
         self._facts = services.facts
         self._streams = services.streams
         self._since_ns = 0
-        self._heard_ns = 0  # the newest reading, and the newest that agreed with the estimate
+        self._received_ns = 0  # the newest reading, and the newest that agreed with the estimate
         self._agreed_ns = 0
         self._link = unit.link()
-        self._heard_since_ns = 0
+        self._bytes_since_ns = 0
         self.speed = 0.0
         """rad/s, of the newest reading, the gyro's bias included."""
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
         self._since_ns = time_ns
-        self._heard_ns = self._agreed_ns = time_ns
-        self._heard_since_ns = time_ns
+        self._received_ns = self._agreed_ns = time_ns
+        self._bytes_since_ns = time_ns
         self._link = self._unit.link()
 
     def link(self) -> ImuLink:
@@ -96,7 +96,7 @@ class Navigation:
             self._ingest(reading)
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
-            self._heard_ns = reading.time_ns
+            self._received_ns = reading.time_ns
             self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
@@ -106,7 +106,7 @@ class Navigation:
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the coils may be driven by readings alone until the next cycle."""
-        return self._is_fresh(self._heard_ns, now_ns)
+        return self._is_fresh(self._received_ns, now_ns)
 
     def is_measured(self, now_ns: int) -> bool:
         """Return whether the coils may be driven by the estimate until the next cycle.
@@ -175,8 +175,8 @@ class Navigation:
         text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
         self._facts.update(facts.IMU_SILENT, silent, now_ns, text)
         if silent:
-            self._heard_since_ns = now_ns
-        without_ns = now_ns - max(self._heard_ns, self._heard_since_ns)
+            self._bytes_since_ns = now_ns
+        without_ns = now_ns - max(self._received_ns, self._bytes_since_ns)
         unusable = without_ns > limit_ns
         text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
         text = text if unusable else "readings come again"

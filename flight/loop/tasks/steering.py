@@ -85,7 +85,7 @@ class CoilDrive:
         return self._coils.state().error
 
     @property
-    def suspects(self) -> bool:
+    def is_suspect(self) -> bool:
         """Whether a coil may carry another current than its command, no verdict being given yet."""
         return self._watch.doubts_currents
 

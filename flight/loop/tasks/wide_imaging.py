@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from flight.link import events
 from flight.link.telemetry.orbit_definitions import DIRECTIONS
-from flight.loop.body import WideSight
+from flight.loop.body import WideCameraUse
 from flight.loop.executive.jobs import JobResult
 from flight.loop.fdir import facts
 from flight.loop.services import Services
@@ -49,7 +49,7 @@ class WideImaging:
     """Owns the frames of one round of the cameras, and monitors these."""
 
     def __init__(
-        self, cameras: Sequence[FrameSource], sight: WideSight, settings: WideSettings, services: Services
+        self, cameras: Sequence[FrameSource], sight: WideCameraUse, settings: WideSettings, services: Services
     ) -> None:
         self._cameras = cameras
         self._sight = sight

@@ -12,7 +12,7 @@ import pytest
 from flight.app import service as patient_start
 from flight.app.cli import main
 from flight.app.request import RunRequest
-from flight.app.service import Patience, StoppedError, patiently, pauses
+from flight.app.service import StartRetry, StoppedError, pauses, retried_start
 from flight.link.telemetry.packets import to_text
 from flight.loop.state.store import StateStore
 from flight.schema.errors import ConfigError, UnreadConfigError
@@ -64,13 +64,13 @@ def test_what_may_pass_is_waited_for_and_reported(
         UnreadConfigError("flight.yaml", "no such file"),
         UsageError("commands.udp: not up yet"),
     )
-    patience = Patience(lambda: False, clock)
+    retry = StartRetry(lambda: False, clock)
     with ExitStack() as stack:
-        assert patiently(attempts.judge, attempts, stack, patience) == "flies"
+        assert retried_start(attempts.judge, attempts, stack, retry) == "flies"
         assert attempts.open == 1
     assert attempts.open == 0
     assert clock.now_ns() == pytest.approx(3e9)
-    assert patience.summary() == "begun at try 5 after 3.0 s: commands.udp: not up yet"
+    assert retry.summary() == "begun at try 5 after 3.0 s: commands.udp: not up yet"
     assert capsys.readouterr().err.count("flight: cannot begin yet: ") == 4
 
 
@@ -78,13 +78,13 @@ def test_what_may_pass_is_waited_for_and_reported(
 def test_a_configuration_judged_wrong_ends_the_start_and_a_defect_the_process(error: Exception) -> None:
     attempts = Attempts(error)
     with ExitStack() as stack, pytest.raises(type(error)):
-        patiently(attempts.judge, attempts, stack, Patience(lambda: False, ManualClock()))
+        retried_start(attempts.judge, attempts, stack, StartRetry(lambda: False, ManualClock()))
 
 
 def test_a_signal_ends_the_wait() -> None:
     attempts = Attempts(UsageError("not up yet"))
     with ExitStack() as stack, pytest.raises(StoppedError, match="not up yet"):
-        patiently(attempts.judge, attempts, stack, Patience(lambda: True, ManualClock()))
+        retried_start(attempts.judge, attempts, stack, StartRetry(lambda: True, ManualClock()))
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_a_board_that_is_stopped_while_it_waits_ends_well(
     def stop(*_: object) -> Any:
         raise StoppedError("stopped before the flight began")
 
-    monkeypatch.setattr(Patience, "wait", stop)
+    monkeypatch.setattr(StartRetry, "wait", stop)
     assert main(board) == 0
     assert "stopped before the flight began" in capsys.readouterr().err
 

@@ -16,12 +16,12 @@ from flight.loop.modes import (
     SAFING,
     STARTS,
     TRANSITIONS,
-    Answer,
-    Change,
+    ModeChange,
     ModeMachine,
     Row,
     Table,
     Trigger,
+    TriggerAnswer,
     check,
 )
 from flight.loop.tasks.mode_control import SAFING_REACTIONS
@@ -37,7 +37,7 @@ def test_every_reaction_that_leads_out_of_a_mode_belongs_to_a_fact_watched_in_it
 
 
 UNSAFE = [mode for mode in Mode if mode is not Mode.SAFE]
-Broken = dict[Mode, dict[Trigger, Mode | Answer]]
+Broken = dict[Mode, dict[Trigger, Mode | TriggerAnswer]]
 
 
 def copied() -> Broken:
@@ -68,11 +68,11 @@ def test_every_trigger_has_an_answer_in_every_mode_and_the_machine_follows_it(
     machine = in_mode(mode)
     answer = machine.answer(trigger)
     change = machine.fire(trigger, 42)
-    if isinstance(answer, Answer):
+    if isinstance(answer, TriggerAnswer):
         assert change is None
         assert (machine.mode, machine.since_ns) == (mode, 0)
     else:
-        assert change == Change(mode, answer, trigger)
+        assert change == ModeChange(mode, answer, trigger)
         assert (machine.mode, machine.since_ns) == (answer, 42)
 
 
@@ -81,7 +81,7 @@ def test_only_commands_are_ever_refused_and_only_while_booting() -> None:
         (mode, trigger)
         for mode, row in TRANSITIONS.items()
         for trigger in row
-        if row[trigger] is Answer.REFUSE
+        if row[trigger] is TriggerAnswer.REFUSE
     }
     assert refused == {(Mode.BOOT, trigger) for trigger in set(COMMANDS.values()) - {Trigger.COMMAND_SAFE}}
 
@@ -95,7 +95,7 @@ def test_boot_is_for_the_start_only() -> None:
     machine = ModeMachine()
     assert machine.mode is Mode.BOOT
     for mode, trigger in STARTS.items():
-        assert in_mode(Mode.BOOT).fire(trigger, 0) == Change(Mode.BOOT, mode, trigger)
+        assert in_mode(Mode.BOOT).fire(trigger, 0) == ModeChange(Mode.BOOT, mode, trigger)
         for elsewhere in set(Mode) - {Mode.BOOT}:
             assert in_mode(elsewhere).fire(trigger, 0) is None
 
@@ -117,7 +117,7 @@ def test_a_table_without_a_row_is_refused() -> None:
 
 @pytest.mark.parametrize(("mode", "trigger"), list(product(UNSAFE, SAFING)))
 def test_a_table_that_keeps_a_mode_from_safe_is_refused(mode: Mode, trigger: Trigger) -> None:
-    for wrong in (Answer.STAY, Answer.REFUSE, Mode.HOLD):
+    for wrong in (TriggerAnswer.STAY, TriggerAnswer.REFUSE, Mode.HOLD):
         table = copied()
         table[mode][trigger] = wrong
         with pytest.raises(FlightError, match=f"does not lead from {mode.label} to safe"):
@@ -126,14 +126,14 @@ def test_a_table_that_keeps_a_mode_from_safe_is_refused(mode: Mode, trigger: Tri
 
 def test_a_dead_end_is_refused() -> None:
     table = copied()
-    row: Row = {t: (Answer.STAY if isinstance(to, Mode) else to) for t, to in table[Mode.SAFE].items()}
+    row: Row = {t: (TriggerAnswer.STAY if isinstance(to, Mode) else to) for t, to in table[Mode.SAFE].items()}
     with pytest.raises(FlightError, match="safe is a dead end"):
         check({**table, Mode.SAFE: row})
 
 
 def test_a_mode_that_nothing_leads_to_is_refused() -> None:
     def without_slew(row: Row) -> Row:
-        return {t: (Answer.STAY if to is Mode.SLEW else to) for t, to in row.items()}
+        return {t: (TriggerAnswer.STAY if to is Mode.SLEW else to) for t, to in row.items()}
 
     with pytest.raises(FlightError, match="slew cannot be reached"):
         check({mode: without_slew(row) for mode, row in TRANSITIONS.items()})

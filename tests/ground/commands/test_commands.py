@@ -15,7 +15,7 @@ import pytest
 
 from flight.app.cli import main
 from flight.app.cli.run import progress_on
-from flight.loop.flight_status import Progress
+from flight.loop.flight_status import FlightProgress
 from ground.telemetry.reader import read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -210,5 +210,5 @@ def test_progress_without_a_terminal_is_a_line_every_ten_seconds(monkeypatch: py
     show = progress_on(stream)
     for second in range(1, 31):
         now[0] = float(second)
-        show(Progress(float(second), 100.0, "q2", (0.0, 0.0, 0.0), "holding", 0, 1))
+        show(FlightProgress(float(second), 100.0, "q2", (0.0, 0.0, 0.0), "holding", 0, 1))
     assert [int(line.split("/")[0]) for line in stream.getvalue().splitlines()] == [10, 20, 30]

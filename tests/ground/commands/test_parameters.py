@@ -19,7 +19,7 @@ from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.fdir.facts import EventLog, Facts, Streams
 from flight.loop.services import Services
-from flight.loop.tasks.commanding import Adopters, Parameters
+from flight.loop.tasks.commanding import ParameterTable, ParameterUsers
 from flight.schema.sections import Health, Modes
 from tests.scenario.flights import demo_config
 
@@ -40,8 +40,8 @@ class Answering:
         recorder = Recorder(Sink(), Sink())
         events = EventLog(recorder.event)
         services = Services(None, None, recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no clock, no jobs
-        adopters = Adopters((self.modes.append,), self.health.append)
-        self.task = Parameters(demo_config(4.0), adopters, None, services)
+        adopters = ParameterUsers((self.modes.append,), self.health.append)
+        self.task = ParameterTable(demo_config(4.0), adopters, None, services)
         self.task.begin(0)
         self._recorder = recorder
         self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

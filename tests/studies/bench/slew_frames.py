@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.bodies.orbit.body import ORBIT, OrbitControl, OrbitEstimation
+from flight.bodies.orbit.body import ORBIT, SatelliteControl, SatelliteEstimation
 from flight.link.telemetry.packets import to_text
 from flight.loop.body import Body, BodyKind
 from flight.loop.services import Services
@@ -38,7 +38,7 @@ BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
 """s and s and rad, of the slew."""
 
 
-class _Unscheduled(OrbitControl):
+class _Unscheduled(SatelliteControl):
     """The satellite's control with exposures that are not scheduled by the coils' pauses."""
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
@@ -50,7 +50,7 @@ def _as_they_come(config: Config, services: Services, learned: Mapping[str, Lear
     """Return the satellite with exposures whenever the camera's turn comes."""
     body = ORBIT.make(config, services, learned)
     estimation = body.estimation
-    assert isinstance(estimation, OrbitEstimation)
+    assert isinstance(estimation, SatelliteEstimation)
     return replace(body, control=_Unscheduled(as_orbit(config), estimation, services))
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from flight.app.accepted_config import FOLDER as FLOWN
 from flight.app.accepted_config import accepted_config, kept_configs, sum_file
-from flight.app.service import TRIALS, Release
+from flight.app.service import TRIALS, FlownRelease
 from flight.link.process.timetable import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed
@@ -155,7 +155,7 @@ def releases() -> DoorTarget:
             raise Finding("a damaged release flies, a whole one does not")
         if whole and (note or found.name != names[1]):
             raise Finding(f"the release flies that should not: {note}")
-        flown = Release({"KNIGHTCUBE_RELEASE": found.name, "STATE_DIRECTORY": str(place)})
+        flown = FlownRelease({"KNIGHTCUBE_RELEASE": found.name, "STATE_DIRECTORY": str(place)})
         flown.prove()
         if found.name not in chooser.Trials(place).proven:
             raise Finding("a release that has flown is not proven")

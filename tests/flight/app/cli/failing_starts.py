@@ -19,7 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 from flight.app.cli import main
-from flight.app.service import Patience
+from flight.app.service import StartRetry
 from flight.link.process.station import Station
 from tests.flight.app.cli.linked_board import write_linked_config
 
@@ -87,7 +87,7 @@ def run(place: Path) -> None:
     config = write_linked_config(place / "board", udp="127.0.0.1:0", tcp="127.0.0.1:0")
     words = ["link", str(config), "--log", str(place / "board" / "runs")]
     faults, came_up = Faults(), False
-    turn_until, wait = Station.run, Patience.wait
+    turn_until, wait = Station.run, StartRetry.wait
 
     def run_shortly(self: Station, *arguments: Any) -> None:
         nonlocal came_up
@@ -97,13 +97,13 @@ def run(place: Path) -> None:
         signal.raise_signal(signal.SIGTERM)
         turn_until(self, *arguments)
 
-    def count_waits(self: Patience, problem: str, _: float) -> None:
+    def count_waits(self: StartRetry, problem: str, _: float) -> None:
         faults.waits += 1
         wait(self, problem, 0.0)
 
     sys.addaudithook(faults.hook)
     # The start alone is tried, and without the pauses.
-    with patch.object(Station, "run", run_shortly), patch.object(Patience, "wait", count_waits):
+    with patch.object(Station, "run", run_shortly), patch.object(StartRetry, "wait", count_waits):
         for name, error_of in cases(faults, place):
             came_up = False
             faults.start(error_of)

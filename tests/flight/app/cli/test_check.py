@@ -16,12 +16,12 @@ import yaml
 
 from flight.app.cli.check import flight_problems
 from flight.app.request import RunResult
-from flight.loop.flight_status import Ending
+from flight.loop.flight_status import FlightEnding
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import DEMO, ROOT
 
 TESTBED = ROOT / "config" / "testbed.yaml"
-WELL = Ending(10.0, 400, "testbed-demo", coils_at_zero=True, coil_error="")
+WELL = FlightEnding(10.0, 400, "testbed-demo", coils_at_zero=True, coil_error="")
 
 
 def write(folder: Path, source: Path, **changes: object) -> Path:
@@ -74,7 +74,7 @@ def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> Non
     ],
 )
 def test_what_counts_as_a_problem_of_a_flight(
-    ending: Ending, changes: dict[str, object], problem: str | None
+    ending: FlightEnding, changes: dict[str, object], problem: str | None
 ) -> None:
     result = replace(RunResult(Path(), "stopped by SIGINT", False, "", ending), **changes)  # type: ignore[arg-type]
     assert flight_problems(result) == ([] if problem is None else [problem])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.filter_steps import OrbitFilterSettings
 from hal.interfaces.readings import ImuReading, StringReading
@@ -57,7 +57,7 @@ class Lit:
         )
         self.filter = OrbitFilter(settings, self.at)
         strings = SolarStrings(peaks=np.full(6, 0.5))
-        self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(Surroundings, self))
+        self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(OrbitEnvironment, self))
         self.wrong: list[str | None] = []
         self.magnet: FloatArray = np.zeros(3)
         self.begin_ns = 0  # when stars begin the filter

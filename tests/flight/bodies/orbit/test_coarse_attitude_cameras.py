@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 
 from flight.bodies.orbit.coarse_attitude import CONTRADICTED, WideFeed
-from flight.bodies.orbit.environment import Surroundings
+from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.filter_steps import OrbitFilterSettings
 from hal.interfaces.readings import Frame, ImuReading
@@ -52,7 +52,7 @@ class Still:
             history_ns=12 * SECOND_NS,
         )
         self.filter = OrbitFilter(settings, self.at)
-        self.feed = WideFeed([CAMERA], LENS, self.filter, cast(Surroundings, self), None, None)
+        self.feed = WideFeed([CAMERA], LENS, self.filter, cast(OrbitEnvironment, self), None, None)
         self.now_ns = 0
         self.sunlit = 1.0
 

@@ -8,7 +8,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, Surroundings
+from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, OrbitEnvironment
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from hal.interfaces.readings import GpsReading
@@ -44,7 +44,7 @@ def reading(elements: TwoLineElements, time_ns: int, shift: FloatArray | None = 
 
 
 def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -> None:
-    known = Surroundings(elements, SimClock(UTC_NS))
+    known = OrbitEnvironment(elements, SimClock(UTC_NS))
     for seconds in (0.0, 15.0, 31.0, 500.0):
         now_ns = round(seconds * SECOND_NS)
         date = known.julian_date(now_ns)
@@ -59,7 +59,7 @@ def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -
 
 
 def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLineElements) -> None:
-    known = Surroundings(None, SimClock(UTC_NS + 300 * SECOND_NS))
+    known = OrbitEnvironment(None, SimClock(UTC_NS + 300 * SECOND_NS))
     assert known.at(0) is None
     assert known.velocity(0) is None
     assert known.ephemeris(0, 100.0) is None
@@ -71,7 +71,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
 
 
 def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements: TwoLineElements) -> None:
-    known = Surroundings(elements, SimClock(UTC_NS))
+    known = OrbitEnvironment(elements, SimClock(UTC_NS))
     shift = np.array([3e4, 0.0, 0.0])
     answers = [known.fix(reading(elements, k * SECOND_NS, shift)) for k in range(CONTRADICTED + 5)]
     assert not any(answers)
@@ -80,20 +80,20 @@ def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements:
 
 
 def test_without_elements_a_first_fix_that_was_false_is_given_up(elements: TwoLineElements) -> None:
-    known = Surroundings(None, SimClock(UTC_NS))
+    known = OrbitEnvironment(None, SimClock(UTC_NS))
     assert known.fix(reading(elements, 0, np.array([3e4, 0.0, 0.0])))
     answers = [known.fix(reading(elements, k * SECOND_NS)) for k in range(1, CONTRADICTED + 2)]
     assert answers == [False] * CONTRADICTED + [True]
 
 
 def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLineElements) -> None:
-    known = Surroundings(None, SimClock(UTC_NS))
+    known = OrbitEnvironment(None, SimClock(UTC_NS))
     assert not known.fix(replace(reading(elements, 0), valid=False))
     assert known.refused == 0
 
 
 def test_a_long_prediction_has_the_times_of_the_clock(elements: TwoLineElements) -> None:
-    known = Surroundings(elements, SimClock(UTC_NS))
+    known = OrbitEnvironment(elements, SimClock(UTC_NS))
     ahead = known.ephemeris(5 * SECOND_NS, 100.0)
     assert ahead is not None
     assert known.seconds_into(ahead, 45 * SECOND_NS) == pytest.approx(40.0, abs=1e-3)
@@ -103,7 +103,7 @@ def test_a_long_prediction_has_the_times_of_the_clock(elements: TwoLineElements)
 
 
 def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements: TwoLineElements) -> None:
-    known, frozen = Surroundings(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
+    known, frozen = OrbitEnvironment(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
     assert known.fix(frozen)
     for seconds in range(11, 60):
         time_ns = seconds * SECOND_NS + GPS_DELAY_NS
@@ -113,7 +113,7 @@ def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements
 
 
 def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while(elements: TwoLineElements) -> None:
-    known, late_ns = Surroundings(elements, SimClock(UTC_NS)), 2 * SECOND_NS
+    known, late_ns = OrbitEnvironment(elements, SimClock(UTC_NS)), 2 * SECOND_NS
     assert known.fix(reading(elements, 10 * SECOND_NS))
     used = []
     for seconds in range(11, 60):

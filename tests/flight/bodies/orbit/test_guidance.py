@@ -12,9 +12,9 @@ import pytest
 from flight.bodies.orbit.guidance import (
     ObjectAim,
     PlannedCraft,
-    PointingLawOf,
     PointingPaths,
     PointingPlanner,
+    PointingTargetLaw,
 )
 from flight.loop.body import Target
 from hal.interfaces.wires import SECOND_NS
@@ -68,7 +68,7 @@ def submitted(
     if requested:
         planner.request(now_ns)
     estimate = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
-    planner.serve(cast(Any, estimate), Target(0, PointingLawOf(goal, paths)), now_ns)
+    planner.serve(cast(Any, estimate), Target(0, PointingTargetLaw(goal, paths)), now_ns)
     return jobs
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.loop.executive.jobs import Change, JobResult, JobRunner, LockStepRunner, Worker, WorkerNews
+from flight.loop.executive.jobs import JobResult, JobRunner, LockStepRunner, Worker, WorkerChange, WorkerNews
 from flight.loop.executive.worker_processes import BUDGET, STEADY_NS, Attempts, ProcessRunner
 from hal.buses.clock import SystemClock
 from hal.buses.real_time import worker_cores
@@ -127,7 +127,7 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
         os.kill(old, 0)
 
 
-def hear(runner: ProcessRunner, name: str, change: Change) -> WorkerNews:
+def hear(runner: ProcessRunner, name: str, change: WorkerChange) -> WorkerNews:
     """Return the first news of a kind of a worker, as the health task would hear it."""
     deadline = time.monotonic() + 20.0
     while time.monotonic() < deadline:
@@ -142,10 +142,10 @@ def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: 
     assert processes.submit("die", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("die", "died")
-    assert "status 3" in hear(processes, "die", Change.DIED).text
+    assert "status 3" in hear(processes, "die", WorkerChange.DIED).text
     os.kill(started(processes, "double"), signal.SIGKILL)
-    assert "signal 9" in hear(processes, "double", Change.DIED).text
-    hear(processes, "double", Change.READY)
+    assert "signal 9" in hear(processes, "double", WorkerChange.DIED).text
+    hear(processes, "double", WorkerChange.READY)
     assert processes.collect() == [], "no job was lost"
     assert processes.submit("double", 3)
     assert wait(processes)[0].value == 6
@@ -159,8 +159,8 @@ def test_a_worker_that_is_stopped_is_reported_and_replaced_idle_or_starting(whil
             assert runner.submit("double", 1)
             assert wait(runner)[0].value == 2
         os.kill(stopped, signal.SIGSTOP)
-        assert "stopped by a signal" in hear(runner, "double", Change.DIED).text
-        hear(runner, "double", Change.READY)
+        assert "stopped by a signal" in hear(runner, "double", WorkerChange.DIED).text
+        hear(runner, "double", WorkerChange.READY)
         assert started(runner, "double") != stopped
 
 
@@ -172,8 +172,8 @@ def test_a_worker_that_cannot_start_takes_no_jobs_and_costs_the_control_thread_n
         begun = time.thread_time()
         assert runner.submit("nowhere", 1)
         assert wait(runner)[0].outcome == "died"
-        assert "status 1" in hear(runner, "nowhere", Change.DIED).text
-        hear(runner, "nowhere", Change.DIED)
+        assert "status 1" in hear(runner, "nowhere", WorkerChange.DIED).text
+        hear(runner, "nowhere", WorkerChange.DIED)
         assert not runner.submit("nowhere", 2)
         assert time.thread_time() - begun < 0.5, "it polls 200 times a second here, and no more"
 

@@ -20,7 +20,7 @@ from flight.loop.fdir.facts import (
     POWER_POOR,
     EventLog,
     Facts,
-    Stream,
+    StreamLimits,
     Streams,
     StreamState,
     StreamWatch,
@@ -143,11 +143,13 @@ def test_every_safing_event_has_a_trigger() -> None:
     assert {Trigger.REACT_SAFE, Trigger.REACT_HOLD, Trigger.REACT_DETUMBLE} == set(SAFING_REACTIONS.values())
 
 
-ROW = Stream("imu", 40.0, 0.1, IMU_POOR, 0.0, 1.0)
+ROW = StreamLimits("imu", 40.0, 0.1, IMU_POOR, 0.0, 1.0)
 PERIOD = 25_000_000
 
 
-def fed(seconds: float, every: int = 1, value: float = 0.5, row: Stream = ROW) -> tuple[StreamWatch, int]:
+def fed(
+    seconds: float, every: int = 1, value: float = 0.5, row: StreamLimits = ROW
+) -> tuple[StreamWatch, int]:
     """Return a watch that got every n-th sample for some seconds, and the time after them."""
     watch = StreamWatch(row, 0)
     count = round(seconds * 40)
@@ -197,7 +199,7 @@ def test_what_is_not_fitted_takes_no_notes() -> None:
 
 
 def test_silence_that_another_alarm_reports_is_not_reported_twice_and_any_other_is() -> None:
-    quiet = Stream("power", 4.0, 3.0, POWER_POOR, has_silence_alarm=False)
+    quiet = StreamLimits("power", 4.0, 3.0, POWER_POOR, has_silence_alarm=False)
     streams = Streams((ROW, quiet))
     for name in ("imu", "power"):
         streams.note(name, 0, 0.5)
