@@ -39,7 +39,7 @@ from knightcube.vision.startracker.detection.survey import (
 
 
 class Quality(IntFlag):
-    """Faults of a detection. Those of the first line are still stars, their errors widened."""
+    """Flags of a detection; a saturated, blended or clipped detection is still a star."""
 
     POINT = 0
     SATURATED, BLENDED, CLIPPED = 1, 2, 4
@@ -51,19 +51,20 @@ REFUSED = int(Quality.HOT | Quality.EXTENDED | Quality.STREAK | Quality.CLUTTER)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """Sources of one frame, the brightest first.
+    """The sources of one frame, the brightest first.
 
     Attributes:
-        points: (n, 2) px, x and y.
-        sigma: (n,) px, standard deviation along one axis.
-        covariance: (n, 2, 2) px^2.
-        flux: (n,) counts above the background.
-        background: (n,) counts a pixel beneath the source.
-        signal_to_noise: (n,) flux over its standard deviation.
-        width: (n,) px, the sigma of the Gaussian that fits the source best by itself; NaN where not measured.
-        quality: (n,) int64, `Quality` flags.
-        prediction: (n,) number of the prediction a source was found at; -1 for one of a whole frame.
-        psf_sigma: px, of the stars of this frame; NaN where it was neither given nor measured.
+        points: positions (n, 2), x and y, px.
+        sigma: standard deviation along one axis (n,), px.
+        covariance: of the positions (n, 2, 2), px^2.
+        flux: light above the background (n,), counts.
+        background: sky background at the source (n,), counts per pixel.
+        signal_to_noise: flux over its standard deviation (n,).
+        width: sigma of the Gaussian that fits the source alone best (n,), px; NaN if not measured.
+        quality: `Quality` flags (n,), int64.
+        prediction: number of the prediction near which a source was found (n,); -1 in a search of the whole
+            frame.
+        psf_sigma: width of the PSF of the frame, px; NaN if it was neither given nor measured.
     """
 
     points: FloatArray
@@ -79,7 +80,7 @@ class Detections:
 
     @classmethod
     def none(cls, psf_sigma: float = np.nan) -> Detections:
-        """Return no detections."""
+        """Return an empty list of detections."""
         empty, whole = np.zeros(0), np.zeros(0, dtype=np.int64)
         return cls(
             np.zeros((0, 2)),
@@ -96,30 +97,30 @@ class Detections:
 
     @property
     def is_star(self) -> BoolArray:
-        """Which (n,) may be stars: not refused as hot, extended, streak or clutter."""
+        """Which sources (n,) may be stars: not hot, extended, a streak or clutter."""
         return np.asarray((self.quality & REFUSED) == 0)
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
-        """Return those that `chosen` picks, by mask (n,) or by number in the order given."""
+        """Return the sources `chosen` by a mask (n,), or by numbers (k,) in the order given."""
         return select(self, chosen, "psf_sigma")
 
     def in_order(self) -> Detections:
-        """Return them with the brightest first."""
+        """Return the sources sorted by flux, the brightest first."""
         return self.select(np.argsort(-self.flux, kind="stable"))
 
     def scaled(self, unit: float) -> Detections:
-        """Return them with flux and background in units of 1 / `unit`."""
+        """Return the sources with flux and background multiplied by `unit`."""
         return replace(self, flux=self.flux * unit, background=self.background * unit)
 
     def stars(self) -> Detections:
-        """Return those that may be stars."""
+        """Return the sources that may be stars."""
         return self.select(self.is_star)
 
     def __len__(self) -> int:
         return len(self.flux)
 
 
-# Real optics leave bumps on a star's wings: light falls no faster than (1 + (d / a)^2)^-b of the peak's.
+# Wings of a bright star, which have local maxima: the share times (1 + (d / scale)^2)^-power of the peak.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
 _WINGS_END = 60.0
 _CELLS = 4
@@ -131,10 +132,10 @@ class Peaks:
     """Local maxima of the smoothed frame, highest first.
 
     Attributes:
-        place: (p, 2) px, column and row.
-        height: (p,) counts of the smoothed frame.
-        area: (p,) number of the area it stands on.
-        core: (p,) px, radius of the saturated disc about it; 0 for none.
+        place: column and row (p, 2), px.
+        height: height in the smoothed frame (p,), counts.
+        area: number of the area that contains the peak (p,).
+        core: radius of the saturated disc around the peak (p,), px; 0 for none.
     """
 
     place: IntArray
@@ -143,7 +144,7 @@ class Peaks:
     core: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Peaks:
-        """Return those that `chosen` picks."""
+        """Return the peaks that `chosen` selects."""
         return select(self, chosen)
 
     def __len__(self) -> int:
@@ -161,11 +162,12 @@ def find_peaks(areas: Areas) -> Peaks:
 
 
 def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return which peaks (p,) to measure, highest first, without bumps on brighter stars' wings.
+    """Return the numbers (k,) of the peaks to measure, highest first, without maxima on the wings of others.
 
-    Of those in the `open_sky` (p,) `most`, and of a cell of a sixteenth of `shape` a quarter of them at most,
-    so that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others
-    show what the sources of the foreground look like, and take no star's place.
+    At most `most` peaks of the open sky are chosen, `open_sky` (p,) being a mask, and at most a quarter of
+    `most` from each sixteenth of the frame of `shape`, so that a cloud that is brighter than all stars leaves
+    room for the stars beside it. As many peaks outside of the open sky are chosen too: they show what the
+    sources of the foreground look like, without displacing stars.
     """
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
@@ -176,7 +178,7 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
 
 
 def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
-    """Return the first `most` of the peaks, of a cell of a sixteenth of `shape` a quarter of them at most."""
+    """Return the first `most` of the peaks, at most a quarter of them from each sixteenth of `shape`."""
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
@@ -186,10 +188,10 @@ def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
 
 
 def on_wings(peaks: Peaks) -> BoolArray:
-    """Return which peaks (p,), highest first, are no higher than a brighter one's wings might be there."""
+    """Return which peaks (p,), highest first, may be maxima on the wings of a brighter peak."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    # Only a few pairs are near enough to ask: at 60 px wings are a millionth of the peak.
+    # Only pairs nearer than 60 px are compared: there the wings are a millionth of the peak.
     lower, higher = np.nonzero(np.tri(len(x), k=-1, dtype=bool) & (square < _WINGS_END**2))
     # A saturated disc's wings begin at its rim.
     apart = np.maximum(np.sqrt(square[lower, higher]) - peaks.core[higher], 0.0)
@@ -199,7 +201,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
 
 
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
-    """Return the peaks with one at each saturated disc's centre, and none else on the disc or its rim."""
+    """Return the peaks with one at the centre of each saturated disc, and no other on the disc or its rim."""
     row, column = areas.row[areas.saturated], areas.column[areas.saturated]
     owner, count = label_pixels(row * areas.shape[1] + column, areas.shape[1])
     size = np.bincount(owner, minlength=count)
@@ -219,17 +221,17 @@ def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
     )
 
 
-# This many times the stars wanted are measured: some will prove to be none.
+# Number of measured peaks per requested star: some peaks prove not to be stars.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Where the sky itself seems this many times as noisy as elsewhere it is no sky.
+# Noise relative to the median of the frame above which a block is foreground and not sky.
 _RESTLESS = 2.5
-# A saturated disc wider than this is no star's but a planet's, the Moon's, a lamp's.
+# Radius (px) of a saturated disc above which it is not a star but a planet, the Moon or a lamp.
 _WIDEST_CORE = 7.0
 _SHARPER, _BROADER = 0.55, 1.8
 _SURE = 3.0
 _LONGER_THAN_COMA = 12.0
-# Where most of the sources about one have no star's shape, it is a leaf or a lamp, whatever its own.
+# Radius (px) around a source in which most sources must have the shape of a star; otherwise it is clutter.
 _ABOUT = 48.0
 _ODD_PART, _LEAST_ODD = 0.5, 8
 _ODD_WIDTH, _ODD_LENGTH = 1.25, 2.5
@@ -238,15 +240,15 @@ _FARTHEST = 2.0
 
 
 def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detections:
-    """Return the sources of a frame (rows, columns) of counts, brightest first; `stars()` selects stars.
+    """Return the sources of a frame (rows, columns), the brightest first; `stars()` selects the stars.
 
-    Raises ValueError when `pixels` is no finite frame of real numbers, 16 x 16 or larger.
+    Raises ValueError unless `pixels` is finite, of real numbers, and 16 x 16 pixels or larger.
     """
     return measure_areas(survey(pixels, settings))
 
 
 def measure_areas(seen: Survey) -> Detections:
-    """Return the sources of a survey's areas, brightest first."""
+    """Return the sources of the areas of a survey, the brightest first."""
     pixels, settings, areas = seen.pixels, seen.settings, seen.areas
     peaks = find_peaks(areas)
     if not len(peaks):
@@ -268,7 +270,7 @@ def measure_areas(seen: Survey) -> Detections:
 
 
 def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Targets) -> IntArray:
-    """Return the flags (n,) that stars' own pixels give: saturated, blended, clipped, hot, extended."""
+    """Return the flags (n,) that follow from the pixels of each star."""
     sure = _SURE * shapes.error
     alone = (targets.core == 0.0) & ~found.blended
     hot = alone & (shapes.hot | (shapes.width + sure < _SHARPER * spread.psf_sigma))
@@ -287,26 +289,26 @@ def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Ta
 
 
 def plain_ones(sound: BoolArray, targets: Targets) -> BoolArray:
-    """Return which of the `sound` (n,) give the point spread: the unsaturated, where there are any."""
+    """Return which of the `sound` stars (n,) determine the PSF: those not saturated, if there are any."""
     plain = sound & (targets.core == 0.0)
     return plain if plain.any() else sound
 
 
 def looks_odd(quality: IntArray, shapes: Shapes, spread: FrameSpread) -> BoolArray:
-    """Return which sources (n,) look like no star: streaks, clutter, or broader than the point spread."""
+    """Return which sources (n,) do not look like stars: streaks, clutter, or broader than the PSF."""
     refused = (quality & REFUSED & ~int(Quality.HOT)) != 0
     return np.asarray(refused | (shapes.width - shapes.error > _ODD_WIDTH * spread.psf_sigma))
 
 
 def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
-    """Return which sources (n,) at `points` (n, 2) px stand among sources most of which are `odd` (n,)."""
+    """Return which sources (n,) at `points` (n, 2) px are surrounded mostly by `odd` (n,) sources."""
     near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
     strange = near @ odd.astype(float)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
 
 
 def confirmed(found: Measured, targets: Targets, settings: DetectionSettings) -> BoolArray:
-    """Return which stars (n,) the measurement confirms: enough light, near its peak, inside the frame."""
+    """Return which stars (n,) have enough light, lie near their peak and inside of the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
     limits = np.array(targets.pixels.shape)[::-1] - 0.5
@@ -324,7 +326,7 @@ def assemble(
     spread: FrameSpread,
     prediction: IntArray,
 ) -> Detections:
-    """Return detections in the targets' order."""
+    """Return the detections in the order of the targets."""
     return Detections(
         found.points,
         np.sqrt(0.5 * np.trace(found.covariance, axis1=1, axis2=2)),
@@ -347,26 +349,26 @@ def _targets(pixels: Image, sky: Sky, areas: Areas, peaks: Peaks) -> Targets:
 
 
 def _flags_of_areas(sky: Sky, areas: Areas, peaks: Peaks) -> IntArray:
-    """Return the flags (p,) that the areas give: streak and clutter."""
+    """Return the flags (p,) that follow from the areas: streak and clutter."""
     noise = sky.smooth_noise
     restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
     clutter = restless | cluttered(areas, peaks.place, _CLUTTERED_SHARE)
     long = is_streak(areas)[peaks.area]
     if frame_shape(areas).kind is not FrameKind.STREAKS:
-        # Stars in a row are long too, but show their peaks; a bright one in a corner has a tail.
+        # Several stars in a row are long too, but have several peaks; a bright star in a corner has a tail.
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
 
 
 def _brightest(found: Detections, most: int) -> Detections:
-    """Return the brightest `most` stars and as many of the refused."""
+    """Return the brightest `most` stars and as many sources that are not stars."""
     star = found.is_star
     kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= most
     return found.select(kept)
 
 
-# Room about the search: the sky is taken from the pixels of its rim.
+# Width (px) of the rim around the search area from which the sky is measured.
 _RIM = 5
 _ROUNDING = 12.0**-0.5
 _TAIL_PART = 0.97725
@@ -379,19 +381,26 @@ def measure_near(
     settings: DetectionSettings | None = None,
     trail: FloatArray | None = None,
 ) -> Detections:
-    """Return the stars found near `predicted` (m, 2) px, brightest first; `prediction` says of which.
+    """Return the stars near predicted positions, the brightest first.
 
-    `trail` (m, 2) px is by how much each moves over the exposure, a few px at most; None: not at all.
+    Only windows around the predictions are read. A prediction without a peak above the threshold within the
+    search radius gives no star; a peak near several predictions is assigned to the nearest one.
 
-    Only windows about the predictions are read. Nothing is reported where no peak within the settings'
-    search radius exceeds the threshold, and one star is given to the nearest prediction only. Raises
-    ValueError when `pixels` is no frame of real numbers of 16 x 16 or larger, or a prediction is not finite.
+    Args:
+        pixels: frame (rows, columns).
+        predicted: predicted positions (m, 2), px; those outside of the frame are ignored.
+        settings: detection settings.
+        trail: displacement of each star over the exposure (m, 2), px, a few pixels at most; None: none.
+
+    Raises:
+        ValueError: unless `pixels` is a frame of real numbers of 16 x 16 pixels or larger, and the predictions
+            are finite.
     """
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
     predicted = np.asarray(predicted, dtype=float).reshape(-1, 2)
     if not np.all(np.isfinite(predicted)):
-        raise ValueError("a predicted place that is not finite")
+        raise ValueError("a predicted position is not finite")
     limits = np.array(pixels.shape)[::-1] - 0.5
     asked = np.flatnonzero(((predicted > -0.5) & (predicted < limits)).all(axis=1))
     if not len(asked):
@@ -399,7 +408,7 @@ def measure_near(
     ceiling = saturation_level(pixels, settings.saturation)
     half = int(np.ceil(settings.search_radius)) + _RIM
     whole = np.zeros(len(asked))
-    # Saturated pixels are light too in the search for the peak.
+    # The search for the peak uses saturated pixels too.
     path = None if trail is None else trail[asked]
     windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf, path)
     targets, number = _peaks_near(pixels, windows, predicted[asked], ceiling, settings)
@@ -418,7 +427,7 @@ def measure_near(
 def _peaks_near(
     pixels: Image, windows: Windows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
 ) -> tuple[Targets, IntArray]:
-    """Return the highest peaks within the search radius that exceed the threshold, and whose they are."""
+    """Return the highest peaks above the threshold within the search radius, and their predictions (k,)."""
     level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
     smooth = smoothed(light)
@@ -442,15 +451,16 @@ def _peaks_near(
 
 
 def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return the sky's level (n,), its noise (n,) of single pixels and of smoothed ones, and its correlation.
+    """Return background (n,), noise of single (n,) and of smoothed pixels (n,), and the correlation.
 
-    From the windows' rims. The smoothed noise has the light of faint stars in it, which the threshold of the
-    search needs; the correlation is how much more noisy a sum of pixels is than independent ones.
+    All are measured in the rims of the windows. The noise of smoothed pixels includes faint stars, as the
+    threshold of the search requires. The correlation is the noise of a sum of pixels relative to that of
+    independent pixels.
     """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
     mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
-    # Other stars and a rim of few counts widen or narrow single windows: they are taken together.
+    # Other stars, or a rim of few counts, falsify the noise of single windows: all windows share the median.
     common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
@@ -462,13 +472,13 @@ def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def _reach(values: FloatArray) -> float:
-    """Return how far 2.3 % of each line of `values` (n, k) reach upwards, of a typical line."""
+    """Return the 97.7th percentile of each row of `values` (n, k), as the median over the rows."""
     place = int(_TAIL_PART * values.shape[1])
     return float(np.median(np.partition(values, place, axis=1)[:, place]))
 
 
 def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance (n,) of each line of `values` (n, k), inf for nothing, without its tails."""
+    """Return the clipped mean and variance (n,), (n,) of each row of `values` (n, k); infinity is ignored."""
     level = _median(values)
     apart = np.abs(values - level[:, None])
     kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
@@ -479,13 +489,13 @@ def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _median(values: FloatArray) -> FloatArray:
-    """Return the lower median of each line of `values` (n, k), in which inf stands for nothing."""
+    """Return the lower median (n,) of each row of `values` (n, k), in which infinity is ignored."""
     count = np.maximum(np.isfinite(values).sum(axis=1), 1)
     return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])
 
 
 def _nearest(points: IntArray, apart: FloatArray) -> BoolArray:
-    """Return which (n,) are the nearest to their prediction of all that found the same peak."""
+    """Return which peaks (n,) are nearer to their prediction than all others at the same position."""
     same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
     order = np.arange(len(points))
     better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))

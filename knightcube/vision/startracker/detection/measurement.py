@@ -42,26 +42,34 @@ FIRST_WIDTH = 1.0
 _HALF_OF_FIRST = 4
 LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
-"""Half a window, in sigmas of the point spread, and its least and greatest, px."""
+"""Half width of a window, in sigmas of the PSF; its limits are `LEAST_HALF` and `MOST_HALF`, px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Of a shape that is nearly found: under the first noise bright stars are fitted by their wings alone, which
-# leaves as much of their cores as if the shape were wrong.
+# Mismatch of the second fit. With the first noise model bright stars are fitted by their wings alone, and the
+# residuals of their cores are as large as those of a wrong PSF.
 _NEXT_MISMATCH = 0.02
-# Of the shape, where no star shows it.
+# Mismatch that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
-# Stars that show the width themselves, so that a given one is not needed.
+# Number of stars from which the measured width replaces a given one.
 _MANY = 8
 _LEAST_LONE = 3
-# Of a pixel's noise: fainter ones are not called hot.
+# Minimum height of a hot pixel, in units of the noise of a pixel.
 _LEAST_HOT = 10.0
-# Two windows of the first look that do not touch.
+# Distance (px) of two windows of the first look that do not overlap.
 _APART = 2 * _HALF_OF_FIRST + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """Each star fitted alone: its width (n,) px, its error (n,) px, whether it is hot (n,)."""
+    """The first fits of n stars, each with a free width.
+
+    Attributes:
+        width: sigma of the Gaussian (n,), px.
+        error: standard deviation of the width (n,), px.
+        hot: whether the star is a hot pixel (n,).
+        fitted: the fits.
+        windows: the windows of the fits.
+    """
 
     width: FloatArray
     error: FloatArray
@@ -72,19 +80,19 @@ class Shapes:
 
 @dataclass(frozen=True, slots=True)
 class FrameSpread:
-    """The point spread of one frame's stars and the noise of their pixels."""
+    """The width of the PSF of one frame, px, and the noise of the pixels of its stars."""
 
     psf_sigma: float
     noise: NoiseModel
 
     @property
     def half(self) -> int:
-        """Half the window that holds a star, px."""
+        """The half width of the window of a star, px."""
         return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
 
 
 def first_look(targets: Targets, gain: float | None = None) -> Shapes:
-    """Return the shapes of stars whose point spread is not known yet; `gain` electrons a count if known."""
+    """Return the shapes of stars before their PSF is known; `gain` is in electrons per count, if known."""
     windows = targets.windows(_HALF_OF_FIRST)
     offset, flux = start(windows)
     width = np.full(len(windows), FIRST_WIDTH)
@@ -93,15 +101,15 @@ def first_look(targets: Targets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # Widths are judged by the first noise, which forgives an unlike shape.
+    # The errors of the widths are those of the first noise model, which tolerates other shapes.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
-    """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
+    """Return the width of the PSF and the noise from the stars `plain` (n,), a mask; the brightest are first.
 
-    Settings that are given are kept, but for a width of which many stars show their own. Without a usable
-    star the width is 1 px and no photon noise is known.
+    A gain in the settings is kept; a width in the settings is kept unless eight stars or more determine it.
+    Without a usable star the width is 1 px and the photon noise 0, unless the settings give them.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -122,7 +130,7 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
-    # A given point spread needs no second look, which is half of a tracking frame's time.
+    # A given PSF needs no second fit, which takes half of the time of a tracking frame.
     for _ in range(0 if given else 2):
         part = fit(windows, part.offset, part.flux, part.width, noise, free_width=True, steps=2)
         noise = _noise_of(part, windows, settings)
@@ -139,35 +147,35 @@ def _noise_of(fitted: PsfFit, windows: Windows, settings: DetectionSettings) -> 
 
 
 def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
-    """Return offset (n, 2) px and flux (n,) to begin with, from the middle 3 x 3 pixels."""
+    """Return initial offsets (n, 2), px, and fluxes (n,), counts, from the middle 3 x 3 pixels."""
     h = windows.half
     core = np.maximum(windows.light[:, h - 1 : h + 2, h - 1 : h + 2], 0.0)
     whole = np.maximum(core.sum(axis=(1, 2)), 1e-12)
     x = (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / whole
     y = (core[:, 2] - core[:, 0]).sum(axis=1) / whole
-    # Three quarters of the light of a star of sigma 1 px; more pixels would hold neighbours' too.
+    # These pixels hold three quarters of the light of a star of sigma 1 px; more would include neighbours.
     flux = np.maximum(whole / 0.75, windows.noise)
     return np.clip(np.stack([x, y], axis=-1), -0.6, 0.6), flux
 
 
 def single_pixels(windows: Windows) -> BoolArray:
-    """Return which windows (n,) hold one or two bright pixels with dark neighbours, which no optics make."""
+    """Return which windows (n,) hold hot pixels: one or two bright pixels with dark neighbours."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
     return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
 
 
 def crowded(middle: IntArray) -> BoolArray:
-    """Return which targets (n,) have another in their window of the first look."""
+    """Return which targets (n,) have another target in their window of the first look."""
     apart = np.abs(middle[:, None] - middle).max(axis=-1)
     np.fill_diagonal(apart, _APART)
     return np.asarray(apart.min(axis=1) < _APART)
 
 
 def _evenly_spread(middle: IntArray, chosen: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the first four of `chosen` in each sixteenth of what they cover, and weights (k,).
+    """Return the first four of `chosen` (k,) in each sixteenth of the area that they cover, and weights (k,).
 
-    Each sixteenth weighs the same: stars are everywhere, a tree's leaves in a corner.
+    Each sixteenth has the same total weight: stars are everywhere, but the leaves of a tree in one corner.
     """
     place = middle[chosen] - middle.min(axis=0)
     column, row = (place * 4 // (np.ptp(middle, axis=0) + 1)).T
@@ -185,15 +193,15 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 
 
 Centroid = tuple[FloatArray, FloatArray]
-"""Places (n, 2) px from the middle, and their slopes (n, 2, m, m) px a count of each pixel."""
+"""Positions (n, 2), px, relative to the middle, and their derivatives by pixel (n, 2, m, m), px/count."""
 
 _ROUNDS = 12
 _STANDS_OUT = 3.0
-"""Standard deviations; fainter pixels have no logarithm worth fitting."""
+"""Minimum light of a pixel whose logarithm is fitted, in standard deviations."""
 _LEAST = 6
-"""Pixels for a parabola of four unknowns."""
+"""Minimum number of pixels for a parabola with four unknowns."""
 _INSIDE = 1.5
-"""px from the centre of mass: a parabola's top farther away is no star's."""
+"""Maximum distance (px) of the vertex of the parabola from the centre of mass."""
 
 
 def weighted(clean: FloatArray, _: FloatArray, start: Centroid, __: float) -> Centroid:
@@ -216,7 +224,7 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
         off = steps - place[:, :, None, None]
         window = np.exp(-0.5 * np.sum(off * off, axis=1) / psf_sigma**2)
         seen = (window * clean)[:, None]
-        # How fast the sum of window, light and distance falls as the window moves: by half the light seen.
+        # The derivative of the weighted sum by the position of the window, about half of the weighted light.
         gain = np.sum(seen * (1.0 - off * off / psf_sigma**2), axis=(2, 3))
         half = 0.5 * np.sum(seen, axis=(2, 3))
         gain = np.maximum(gain, np.maximum(0.5 * half, 1e-30))
@@ -227,7 +235,10 @@ def iterative(clean: FloatArray, _: FloatArray, start: Centroid, psf_sigma: floa
 
 
 def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float) -> Centroid:
-    """Return the tops of parabolas through the light's logarithm; the start where few pixels stand out."""
+    """Return the vertices of parabolas through the logarithm of the light.
+
+    Where too few pixels exceed the noise, the start is returned.
+    """
     x, y = (np.broadcast_to(step, clean.shape) for step in _steps(clean))
     used: BoolArray = clean > _STANDS_OUT * np.sqrt(variance)
     light = np.where(used, clean, 1.0)
@@ -235,7 +246,7 @@ def gaussian(clean: FloatArray, variance: FloatArray, start: Centroid, _: float)
     columns = np.stack([np.ones_like(x), x, y, -(x * x + y * y)], axis=1).reshape(len(clean), 4, -1)
     weighed = columns * weight.reshape(len(clean), 1, -1)
     normal = weighed @ columns.transpose(0, 2, 1) + 1e-12 * np.eye(4)
-    # Of the four unknowns, how each pixel's logarithm moves them.
+    # The derivatives of the four unknowns by the logarithm of each pixel.
     moved = np.linalg.solve(normal, weighed)
     found = np.sum(moved * np.log(light).reshape(len(clean), 1, -1), axis=2)
     bend = np.where(found[:, 3] > 0.0, found[:, 3], np.inf)
@@ -258,7 +269,7 @@ METHODS: dict[str, Callable[[FloatArray, FloatArray, Centroid, float], Centroid]
 
 
 def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pixels' places along x (1, m) and y (m, 1), from the middle."""
+    """Return the pixel positions along x (1, m) and y (m, 1) relative to the middle, px."""
     half = clean.shape[1] // 2
     step = np.arange(-half, half + 1, dtype=float)
     return step[None, :], step[:, None]
@@ -266,18 +277,19 @@ def _steps(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 _PHASES = np.linspace(-0.45, 0.45, 10)
 _FAINTEST = 1e-3
-"""Noise of a pixel, of the star's light, by which a method without noise still leaves pixels out."""
+"""Noise of a pixel, as a fraction of the star's light, in the simulation of the systematic error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowCentroids:
-    """Centres of mass.
+    """Centroids of n stars in their windows.
 
     Attributes:
-        offset: (n, 2) px from the middle pixel; clipped to the window where the light is noise.
-        flux, sky: (n,) counts within the border, and a pixel on the border.
-        variance: (n,) px^2 along one axis, of the noise and of the light that the window cuts off.
-        flux_variance: (n,) counts^2.
+        offset: position relative to the middle pixel (n, 2), px; limited to the window.
+        flux: light within the border of the window (n,), counts.
+        sky: mean of the border (n,), counts per pixel.
+        variance: variance along one axis (n,), px^2, due to the noise and to the finite window.
+        flux_variance: variance of the flux (n,), counts^2.
     """
 
     offset: FloatArray
@@ -290,9 +302,9 @@ class WindowCentroids:
 def centre_of_mass(
     windows: Windows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
-    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of the pixels there.
+    """Return the centroids in `windows` (eq. 12-20) by a method of `METHODS`, or the centre of mass.
 
-    Another `method` replaces the place by that of `centroids`.
+    In a window that the edge of the frame cuts, pixels outside of the frame count as zero.
     """
     half = windows.half
     offset, flux, sky = _moments(windows.light)
@@ -300,7 +312,7 @@ def centre_of_mass(
     variance = noise.variance(inner - sky[:, None, None], windows.noise)
     offset, slopes = _places(windows.light, variance, psf_sigma, method)
     both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
-    # The border's mean is off by its noise, and pulls the centre of mass towards the window's middle.
+    # The noise of the mean of the border changes the sky level, and so the centre of mass.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
     both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
@@ -314,7 +326,7 @@ def centre_of_mass(
 
 
 def _places(window: FloatArray, variance: FloatArray, psf_sigma: float, method: Method) -> Centroid:
-    """Return the centroids of a method and their slopes by the pixels within the border."""
+    """Return the centroids of a method and their derivatives by the pixels within the border."""
     offset, flux, sky = _moments(window)
     clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
     half = window.shape[1] // 2
@@ -340,7 +352,7 @@ def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
-    """Return the rms error in px of window, border and method over a pixel's places, without noise."""
+    """Return the rms systematic error (px) of a method over the positions within a pixel, without noise."""
     place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
     stars = light(place, np.full(len(_PHASES), psf_sigma), half)
     places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)
@@ -349,13 +361,21 @@ def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12
-# Least error, px: pixels differ, and no star is exactly a Gaussian.
+# Minimum standard deviation (px): pixels differ, and no PSF is exactly Gaussian.
 _FLOOR = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """Stars (n,) measured: places px, covariance px^2, flux and its sigma, sky, whether blended."""
+    """The measurements of n stars.
+
+    Attributes:
+        points: positions (n, 2), px.
+        covariance: of the positions (n, 2, 2), px^2.
+        flux, flux_sigma: light and its standard deviation (n,), counts.
+        sky: residual sky level (n,), counts per pixel.
+        blended: whether the image overlaps with that of another star (n,).
+    """
 
     points: FloatArray
     covariance: FloatArray
@@ -366,7 +386,7 @@ class Measured:
 
 
 def measure(targets: Targets, shapes: Shapes, spread: FrameSpread, settings: DetectionSettings) -> Measured:
-    """Return the stars measured by the settings' method; saturated ones are fitted in any case."""
+    """Return the stars measured by the method of the settings; saturated stars are always fitted."""
     parts = [(targets.core == 0.0, False), (targets.core > 0.0, True)]
     count = len(targets)
     out = Measured(
@@ -401,7 +421,7 @@ def _fitted(targets: Targets, before: PsfFit, spread: FrameSpread, half: int, fr
     windows = targets.windows(half)
     offset, flux = start(windows)
     if free_width:
-        # At the rim of the saturated disc the light is the ceiling's.
+        # At the rim of the saturated disc the light equals the saturation level.
         steep = np.minimum(0.5 * (targets.core / spread.psf_sigma) ** 2, 12.0)
         flux = 2.0 * np.pi * spread.psf_sigma**2 * (targets.ceiling - targets.level) * np.exp(steep)
     else:
@@ -419,7 +439,7 @@ def _fitted(targets: Targets, before: PsfFit, spread: FrameSpread, half: int, fr
     freedom = np.maximum(found.used - found.covariance.shape[1], 1)
     excess = found.chi2 / freedom
     excess = np.where(excess > 1.0 + 3.0 * np.sqrt(2.0 / freedom), excess, 1.0) * targets.correlation**2
-    # Neighbours share their pixels' information: the nearer, the less is left to each.
+    # Overlapping stars share the information of their pixels: the nearer they are, the less each has.
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation
@@ -437,9 +457,9 @@ def _shared(
     noise: NoiseModel,
     free_width: bool,
 ) -> PsfFit:
-    """Return `found` with the stars that have neighbours fitted again, each without the others' light.
+    """Return `found` with blended stars fitted again, each after the light of its neighbours is subtracted.
 
-    They begin at `begin`, offset (n, 2) and flux (n,): a fit of two stars as one is no start for either.
+    The fits start from `begin`, offset (n, 2) and flux (n,): the fit of two stars as one is a bad start.
     """
     some = np.unique(pairs.first)
     own = windows.select(some)
@@ -454,7 +474,7 @@ def _shared(
 
 
 def _flux_sigma(found: PsfFit, windows: Windows, noise: NoiseModel) -> FloatArray:
-    """Return the noise (n,) of fluxes, counts: of sky and photons alone, a wrong shape is none."""
+    """Return the standard deviation (n,) of the fluxes, counts, due to sky and photon noise only."""
     flux = np.where(found.flux > 0.0, found.flux, np.inf)[:, None, None]
     seen = np.where(windows.good, found.model / flux, 0.0)
     counted = NoiseModel(noise.photon).variance(found.model, windows.noise)
@@ -464,7 +484,7 @@ def _flux_sigma(found: PsfFit, windows: Windows, noise: NoiseModel) -> FloatArra
 def _centred(targets: Targets, spread: FrameSpread, settings: DetectionSettings) -> Measured:
     half = settings.window // 2
     windows = targets.windows(half)
-    # The window stands about the brightest pixel (text before eq. 12), not about the smoothed peak.
+    # The window is centred on the brightest pixel (text before eq. 12), not on the smoothed peak.
     core = windows.light[:, half - 1 : half + 2, half - 1 : half + 2].reshape(len(windows), 9)
     row, column = np.divmod(core.argmax(axis=1), 3)
     limits = np.array(targets.pixels.shape)[::-1] - 1

@@ -24,15 +24,15 @@ from knightcube.vision.records import select
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Windows:
-    """Windows of k x k pixels, k = 2 half + 1.
+    """Square windows of k x k pixels around n stars, k = 2 half + 1.
 
     Attributes:
-        middle: (n, 2) column and row of the middle pixel.
-        half: px.
-        light: (n, k, k) counts above the sky, 0 where there is no pixel; saturated ones as they are.
-        good: (n, k, k) which pixels exist and are usable.
-        noise: (n,) counts, of a pixel without a star.
-        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
+        middle: column and row of the middle pixel (n, 2).
+        half: half width of the windows, px.
+        light: counts above the sky (n, k, k); 0 outside of the frame; saturated pixels are unchanged.
+        good: which pixels are inside of the frame and not saturated (n, k, k).
+        noise: noise of a pixel without a star (n,), counts.
+        trail: displacement of the star from the beginning to the end of the exposure (n, 2), px.
     """
 
     middle: IntArray
@@ -47,7 +47,7 @@ class Windows:
         return select(self, chosen, "half")
 
     def without(self, light: FloatArray) -> Windows:
-        """Return the windows with `light` (n, k, k) taken off."""
+        """Return the windows with `light` (n, k, k) subtracted."""
         return replace(self, light=self.light - light)
 
     def __len__(self) -> int:
@@ -63,10 +63,16 @@ def cut(
     ceiling: float,
     trail: FloatArray | None = None,
 ) -> Windows:
-    """Return the windows of `pixels` (rows, columns) about the pixels `middle` (n, 2), which are inside.
+    """Return the windows around the pixels `middle` (n, 2), which must be inside of the frame.
 
-    `level` (n,) is the sky's, `noise` (n,) its noise; pixels at `ceiling` counts or above are saturated and
-    not used. Without `trail` (n, 2) the stars stand still.
+    Args:
+        pixels: frame (rows, columns), counts.
+        middle: columns and rows of the middle pixels (n, 2).
+        half: half width of the windows, px.
+        level: sky background (n,), counts.
+        noise: noise of a pixel without a star (n,), counts.
+        ceiling: pixels of this many counts or more are saturated and not used.
+        trail: displacement of the stars over the exposure (n, 2), px; None: none.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
@@ -80,7 +86,7 @@ def cut(
 
 
 def smoothed(light: FloatArray) -> FloatArray:
-    """Return windows (n, k, k) under the search's kernel, [1 2 1] each way; the outermost pixels are zero."""
+    """Return windows (n, k, k) smoothed by [1 2 1] along rows and columns; the outermost pixels are zero."""
     down = light[:, :-2] + 2.0 * light[:, 1:-1] + light[:, 2:]
     out = np.zeros_like(light)
     out[:, 1:-1, 1:-1] = down[:, :, :-2] + 2.0 * down[:, :, 1:-1] + down[:, :, 2:]
@@ -89,16 +95,16 @@ def smoothed(light: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Where stars are to be measured.
+    """The pixels around which n stars are measured, with the sky there.
 
     Attributes:
-        pixels: (rows, columns) counts.
-        middle: (n, 2) column and row.
-        level, noise: (n,) counts of a pixel without a star.
+        pixels: frame (rows, columns), counts.
+        middle: column and row of each star (n, 2).
+        level, noise: background and noise of a pixel without a star (n,), counts.
         ceiling: counts at which pixels saturate.
-        core: (n,) px, radius of the saturated disc.
-        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
-        correlation: how much more noisy sums of pixels are than of independent ones.
+        core: radius of the saturated disc (n,), px; 0 if no pixel is saturated.
+        trail: displacement of the star from the beginning to the end of the exposure (n, 2), px.
+        correlation: noise of a sum of pixels relative to that of independent pixels.
     """
 
     pixels: Image
@@ -111,7 +117,7 @@ class Targets:
     correlation: float
 
     def windows(self, half: int, middle: IntArray | None = None) -> Windows:
-        """Return the windows about all targets, or about `middle` (n, 2) beside them."""
+        """Return the windows around all targets, or around `middle` (n, 2) instead."""
         about = self.middle if middle is None else middle
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
@@ -123,18 +129,18 @@ class Targets:
         return len(self.middle)
 
 
-# A path shorter than this, px, is a point: it widens one of 1 px by 0.2 %.
+# Length (px) below which a path counts as a point: it widens a PSF of 1 px by 0.2 %.
 _SHORTEST = 0.2
-# Enough for paths of four sigmas, to 1e-3 of the light.
+# Number of quadrature nodes: accurate to 1e-3 of the light for paths of four sigmas.
 _NODES = 4
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the share (n, k) of a star's light in each of k = 2 half + 1 pixels, and its derivatives.
+    """Return the share (n, k) of a star's light in each of k = 2 half + 1 pixels along one axis.
 
-    `offset` (n,) px is the star's place from the middle pixel's centre, `sigma` (n,) px. The derivatives
-    (n, k) are by place and by sigma.
+    Also return its derivatives (n, k) by position and by sigma. `offset` (n,) is the position of the star
+    relative to the centre of the middle pixel, px; `sigma` (n,) is the width of the PSF, px.
     """
     from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
 
@@ -148,7 +154,7 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
 
 
 def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
-    """Return places (n, 2) px along paths of `trail` (n, 2) px, from the middle, and each place's share."""
+    """Return positions (n, 2), px, along paths of `trail` (n, 2), relative to the middle, with weights."""
     if not len(trail) or float(np.abs(trail).max()) < _SHORTEST:
         return [(np.zeros_like(trail), 1.0)]
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
@@ -156,9 +162,13 @@ def path(trail: FloatArray) -> list[tuple[FloatArray, float]]:
 
 
 def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | None = None) -> FloatArray:
-    """Return the share (n, k, k), rows first, of each star's light.
+    """Return the share of each star's light in each pixel of its window (n, k, k), rows first.
 
-    `offset` (n, 2) px, `sigma` (n,) px; `trail` (n, 2) px by which it moves over the exposure, None: none.
+    Args:
+        offset: position relative to the centre of the middle pixel (n, 2), px.
+        sigma: width of the PSF (n,), px.
+        half: half width of the window, px.
+        trail: displacement of the star over the exposure (n, 2), px; None: none.
     """
     out = np.zeros((len(offset), 2 * half + 1, 2 * half + 1))
     for shift, share in path(np.zeros_like(offset) if trail is None else trail):
@@ -168,7 +178,7 @@ def light(offset: FloatArray, sigma: FloatArray, half: int, trail: FloatArray | 
     return out
 
 
-# Residuals allowed before they are another thing's light, as part of the star's light in the pixel.
+# Residual that a wrong PSF may cause, as a fraction of the star's light in the pixel.
 _TOLERATED = 0.25
 _LEAST_PIXELS = 40
 _ROUNDS = 3
@@ -176,18 +186,23 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """`photon` counts^2 a count of light (1/gain) and `mismatch`, a part of the light."""
+    """The noise of a pixel with the light of a star.
+
+    Attributes:
+        photon: photon noise, counts^2 per count of light (1/gain).
+        mismatch: difference between the PSF and a Gaussian, as a fraction of the light.
+    """
 
     photon: float = 0.0
     mismatch: float = 0.0
 
     def variance(self, light: FloatArray, noise: FloatArray) -> FloatArray:
-        """Return counts^2 (n, k, k) of pixels with `light` (n, k, k) on a sky of `noise` (n,)."""
+        """Return the variance (n, k, k), counts^2, of pixels with `light` (n, k, k) and sky `noise` (n,)."""
         seen = np.maximum(light, 0.0)
         return np.asarray((noise**2)[:, None, None] + self.photon * seen + (self.mismatch * seen) ** 2)
 
     def tolerant(self, light: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return `variance` widened for shapes that no Gaussian has."""
+        """Return `variance` (n, k, k) increased for PSFs that are not Gaussian."""
         return np.asarray(variance + (_TOLERATED * light) ** 2)
 
 
@@ -199,10 +214,18 @@ def measure_noise(
     noise: FloatArray,
     gain: float | None,
 ) -> NoiseModel:
-    """Return the noise model that the residuals (n, k, k) of a fit show; a given `gain` is kept.
+    """Return the noise model from the residuals of a fit; a given `gain` is kept.
 
-    Least squares of residual^2 - noise^2 on light and light^2, weighted by the spread of squared normal
-    residuals and never negative. `leverage` is the part of each residual that the fit absorbed.
+    This is a non-negative least-squares fit of residual^2 - noise^2 by light and light^2, weighted with the
+    variance of the square of a normal residual.
+
+    Args:
+        residual: residuals of the fit (n, k, k), counts.
+        variance: their assumed variance (n, k, k), counts^2; infinite for unused pixels.
+        leverage: part of the variance of each residual that the fit absorbed (n, k, k).
+        light: fitted light of the stars (n, k, k), counts.
+        noise: noise of a pixel without a star (n,), counts.
+        gain: electrons per count, if known.
     """
     used = np.isfinite(variance) & (light > 0.5 * noise[:, None, None]) & (leverage < 0.8)
     given = 0.0 if gain is None else 1.0 / gain
@@ -217,7 +240,7 @@ def measure_noise(
     for _ in range(_ROUNDS):
         expected = floor + photon * m + square * m * m
         weight = 1.0 / expected**2
-        # Residuals beyond 5 sigma of the present model are let go: neighbours and hot pixels.
+        # Residuals beyond 5 sigma of the present model are ignored: neighbours and hot pixels.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
         photon, square = _non_negative(m, excess, weight)
     return NoiseModel(photon, float(np.sqrt(square)))
@@ -231,9 +254,9 @@ def _shared_mismatch(
     used: BoolArray,
     photon: float,
 ) -> float:
-    """Return the mismatch that stars of a known photon noise share: the median of theirs, by their weight.
+    """Return the mismatch as the weighted median over the stars, for a known photon noise.
 
-    A wrong shape is the same in all of them; a neighbour's light, which is none, is in a few.
+    A wrong PSF affects all stars alike; the light of a neighbour, which is not a mismatch, affects a few.
     """
     m = np.where(used, light, 0.0)
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
@@ -251,7 +274,7 @@ def _shared_mismatch(
 
 
 def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Return the parts of `excess` that go with m and with m^2, neither below zero."""
+    """Return the non-negative least-squares coefficients of `excess` by m and m^2."""
     first, second, third = (float(np.sum(weight * m**power)) for power in (2, 3, 4))
     along, square = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
     determinant = first * third - second**2
@@ -269,27 +292,30 @@ def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tupl
 
 X, Y, FLUX, SKY, WIDTH = range(5)
 NARROWEST, WIDEST = 0.25, 6.0
-# Steps are cut to this, px: a start one pixel off must not fly away.
+# Maximum steps of position and width (px): a start one pixel off must not diverge.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residuals beyond this many sigmas, in the last steps, are another thing's light.
+# Residuals (sigmas) beyond which a pixel is excluded, and the number of last steps in which this is done.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
-# The condition is made by this, in units of the scaled diagonal: a star without information stays put.
+# Regularisation of the scaled normal matrix: a star without information keeps its position.
 _RIDGE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PsfFit:
-    """Fitted stars.
+    """The fits of n stars in their windows.
 
     Attributes:
-        offset: (n, 2) px from the middle of the window.
-        flux, sky, width: (n,).
-        covariance: (n, p, p) of x, y, flux, sky and width if it was free.
-        chi2: (n,) of `used` pixels (n,).
-        residual, variance, leverage: (n, k, k); variance is inf where a pixel was left out.
-        model: (n, k, k) counts of the star alone.
+        offset: position relative to the middle of the window (n, 2), px.
+        flux: counts (n,).
+        sky: residual sky level, counts per pixel (n,).
+        width: sigma of the Gaussian (n,), px.
+        covariance: of x, y, flux and sky, and of the width if it was free (n, p, p).
+        chi2: sum of the squared residuals over their variance (n,).
+        used: number of pixels used (n,).
+        residual, variance, leverage: of each pixel (n, k, k); the variance of an unused pixel is infinite.
+        model: light of the star alone (n, k, k), counts.
     """
 
     offset: FloatArray
@@ -309,7 +335,7 @@ class PsfFit:
         return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
-        """Return these with `part` in the place of the stars `chosen` (k,)."""
+        """Return these fits with the stars `chosen` (k,) replaced by `part`."""
         out = {item.name: getattr(self, item.name).copy() for item in fields(self)}
         for name, values in out.items():
             values[chosen] = getattr(part, name)
@@ -325,7 +351,17 @@ def fit(
     free_width: bool,
     steps: int = 4,
 ) -> PsfFit:
-    """Return the stars of `windows`, started at `offset` (n, 2) px, `flux` (n,) and `width` (n,) px."""
+    """Return the fits of the stars in `windows`.
+
+    Args:
+        windows: windows around the stars.
+        offset: initial positions relative to the middle of the window (n, 2), px.
+        flux: initial fluxes (n,), counts.
+        width: initial widths (n,), px.
+        noise: noise of the pixels.
+        free_width: whether the width of each star is fitted.
+        steps: number of Gauss-Newton steps.
+    """
     count = 5 if free_width else 4
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
     for step in range(steps + 1):
@@ -370,7 +406,7 @@ def _jacobian(values: FloatArray, windows: Windows, count: int) -> tuple[FloatAr
 
 
 def _derivatives(values: FloatArray, shift: FloatArray, half: int, count: int) -> FloatArray:
-    """Return the derivatives (n, count, k, k) of the light of stars that stand `shift` (n, 2) px off."""
+    """Return the derivatives (n, count, k, k) of the light of stars displaced by `shift` (n, 2) px."""
     across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], half)
     down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], half)
     flux = values[:, FLUX, None]
@@ -391,7 +427,7 @@ def _foreign(residual: FloatArray, variance: FloatArray) -> BoolArray:
 
 
 def _advance(values: FloatArray, step: FloatArray, half: int) -> None:
-    """Move `values` (n, 5) by `step` (n, p), none too far."""
+    """Change `values` (n, 5) in place by `step` (n, p), limited to the maximum step."""
     step[:, :2] = np.clip(step[:, :2], -_LONGEST_STEP, _LONGEST_STEP)
     if step.shape[1] > WIDTH:
         step[:, WIDTH] = np.clip(step[:, WIDTH], -_WIDEST_STEP, _WIDEST_STEP)
@@ -401,13 +437,13 @@ def _advance(values: FloatArray, step: FloatArray, half: int) -> None:
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
-    """Return the inverses of normal matrices (n, p, p), scaled to a unit diagonal on the way."""
+    """Return the inverses of normal matrices (n, p, p), which are scaled to a unit diagonal meanwhile."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
     outer = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal / outer + _RIDGE * np.eye(normal.shape[1])) / outer)
 
 
-# A neighbour farther than this many sigmas of the point spread beyond the window gives it nothing.
+# Distance (PSF sigmas) beyond a window's edge from which a neighbour contributes no light to it.
 _BEYOND = 3.0
 _MOST_OVERLAP = 0.8
 _LEAST_OVERLAP = 0.01
@@ -415,7 +451,12 @@ _LEAST_OVERLAP = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Ordered pairs: `first` (p,) has `second` (p,) in its window; `overlap` (n,) of each star's image."""
+    """Ordered pairs of stars whose light overlaps.
+
+    Attributes:
+        first, second: numbers of stars (p,), (p,); the second sends light into the window of the first.
+        overlap: largest overlap of each star with a neighbour (n,), 0 to 1.
+    """
 
     first: IntArray
     second: IntArray
@@ -423,10 +464,10 @@ class Pairs:
 
 
 def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int) -> Pairs:
-    """Return which of the stars at `points` (n, 2) px send light into another's window.
+    """Return which of the stars at `points` (n, 2) px send light into the window of another star.
 
-    The overlap is that of the two images, exp(-d^2 / 4 sigma^2): 0 for a lone star and where the neighbour
-    is too faint to matter.
+    The overlap of two images at the distance d is exp(-d^2 / 4 sigma^2); it is 0 for an isolated star and
+    where it is below 1 %.
     """
     apart = points[:, None] - points
     reach = half + _BEYOND * psf_sigma
@@ -443,9 +484,10 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
 def neighbour_light(
     pairs: Pairs, windows: Windows, middle: IntArray, offset: FloatArray, flux: FloatArray, width: FloatArray
 ) -> FloatArray:
-    """Return the light (n, k, k) of all neighbours in each star's window about `middle` (n, 2).
+    """Return the light (n, k, k), counts, of all neighbours in the window of each star.
 
-    The stars are at `offset` (n, 2) px from there, of `flux` (n,) and `width` (n,) px.
+    The stars are at `offset` (n, 2) px from the middle pixels `middle` (n, 2) of their windows, with `flux`
+    (n,), counts, and `width` (n,), px.
     """
     size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))

@@ -1,9 +1,9 @@
-"""The sky of a frame, its noise, and where the smoothed frame stands above it.
+"""The sky background of a frame, its noise, and the pixels of the smoothed frame above it.
 
-Smoothing is by [1 2 1] each way, nearly the matched filter of a star of sigma 0.7 to 1.5 px. The noise of the
-smoothed frame is measured in it, not derived: demosaicing and JPEG correlate pixels, and a threshold from
-single pixels would then pass thousands of peaks. The frame is gone through in bands of rows that stay in the
-processor's cache; no image of its size is ever made.
+The smoothing kernel is [1 2 1] along rows and columns, nearly the matched filter for a star of sigma 0.7 to
+1.5 px. The noise of the smoothed frame is measured in the smoothed frame: demosaicing and JPEG correlate
+pixels, and a threshold derived from single pixels would pass thousands of peaks. The frame is processed in
+bands of rows that fit into the processor cache; no second image of its size is allocated.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from knightcube.vision.frame.hot_pixels import find_hot_pixels
 Float32Array = npt.NDArray[np.float32]
 
 KERNEL_NORM = 6.0
-"""Root of the sum of squares of the smoothing kernel: the noise of white noise of 1."""
+"""Noise of the smoothed frame for white noise of 1: the root of the sum of squares of the kernel."""
 LEAST_SIDE = 16
-# A frame without whole counts is brought to this many counts of noise.
+# Noise (counts) to which a frame of floating-point numbers is scaled.
 _FLOATING_NOISE = 16.0
 _BAND = 32
 _BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 _TAIL_PART = 0.97725
-# Correlations below this are chance, and the light of the faintest stars.
+# Ratio below which a correlation of pixels is attributed to chance and to the faintest stars.
 _CORRELATED = 1.05
-# Noise that reaches less than this part of its two deviations downwards is cut off at zero counts.
+# Ratio of the lower tail of the noise to two standard deviations, below which it is clipped at zero counts.
 _CUT_OFF = 0.8
-# Noise below this, counts, is hidden by the steps of the counts, which may be of many.
+# Noise (counts) below which quantisation hides it.
 _HIDDEN = 0.5
 _ROUNDING = 12.0**-0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Values (down, across) of equal blocks of a frame of `shape`, bilinear between their centres."""
+    """A surface over a frame of `shape`: `values` (down, across) at block centres, bilinear between them."""
 
     values: FloatArray
     shape: tuple[int, int]
@@ -71,13 +71,14 @@ class Surface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """The sky of a frame between its stars.
+    """The sky background of a frame between its stars.
 
     Attributes:
-        level, noise: counts of single pixels; the light of faint stars is in the noise.
-        pixel_noise: counts of single pixels, what a pixel without a star scatters by.
-        smooth_level, smooth_noise: of the smoothed frame (kernel of sum 16), faint stars included.
-        correlation: how much more noisy a sum of pixels is than independent pixels would make it; 1 or more.
+        level, noise: background and noise of single pixels, counts; the noise includes faint stars.
+        pixel_noise: noise of a pixel without a star, counts.
+        smooth_level, smooth_noise: background and noise of the smoothed frame (kernel of sum 16), including
+            faint stars.
+        correlation: noise of a sum of pixels relative to that of independent pixels; 1 or more.
     """
 
     level: Surface
@@ -93,9 +94,9 @@ class BrightPixels:
     """The pixels (m,) of the smoothed frame above the noise, row by row.
 
     Attributes:
-        index: of the pixel in the flat frame, increasing.
-        smooth: counts of the smoothed frame, its level taken off.
-        shape: rows, columns.
+        index: numbers of the pixels in the flattened frame, increasing.
+        smooth: counts of the smoothed frame above its background.
+        shape: rows and columns of the frame.
     """
 
     index: IntArray
@@ -104,9 +105,10 @@ class BrightPixels:
 
 
 def in_counts(pixels: Image) -> tuple[Image, float]:
-    """Return `pixels` (rows, columns) in whole counts or as if they were, and the unit of one.
+    """Return `pixels` (rows, columns) scaled to counts, and the size of one count in the original unit.
 
-    Raises ValueError unless it is a finite frame of real numbers, 16 x 16 or larger.
+    Integer frames are returned unchanged. Raises ValueError unless the frame is finite, of real numbers, and
+    16 x 16 pixels or larger.
     """
     if pixels.ndim != 2 or min(pixels.shape) < LEAST_SIDE:
         raise ValueError(f"a frame of shape {pixels.shape}: give (rows, columns), {LEAST_SIDE} or more each")
@@ -124,7 +126,7 @@ def in_counts(pixels: Image) -> tuple[Image, float]:
 
 
 def measure_sky(pixels: Image) -> Sky:
-    """Return level and noise of `pixels` (rows, columns), of single ones and of the smoothed frame."""
+    """Return background and noise of `pixels` (rows, columns), for single pixels and the smoothed frame."""
     shape = (pixels.shape[0], pixels.shape[1])
     single = estimate_background(pixels, _BLOCK, _SINGLE_STRIDE)
     level = Surface(single.level, shape)
@@ -137,8 +139,8 @@ def measure_sky(pixels: Image) -> Sky:
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
-    # The light of faint stars reaches upwards too, and a sum of pixels has more of it: no noise of a star's
-    # place. Only where the noise is cut off below do the tails say how large it is.
+    # Faint stars lengthen the upper tail too, and more so in a sum of pixels, but are no noise of a star's
+    # position. Only where the noise is clipped at zero do the tails determine it.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return Sky(
         level,
@@ -151,27 +153,27 @@ def measure_sky(pixels: Image) -> Sky:
 
 
 def correlation_of(smooth: float, single: float) -> float:
-    """Return how much more noisy sums of pixels are than independent pixels would make them, 1 or more.
+    """Return the noise of a sum of pixels relative to that of independent pixels, 1 or more.
 
-    `smooth` is the noise of the smoothed frame, `single` that of its pixels.
+    `smooth` is the noise of the smoothed frame, `single` the noise of single pixels, counts.
     """
     ratio = smooth / (KERNEL_NORM * single)
     return ratio if ratio > _CORRELATED else 1.0
 
 
 def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return where a noise (n,) is cut off at zero counts or hidden by their steps: only its tail shows it.
+    """Return where a noise (n,) is clipped at zero counts or hidden by quantisation, as a mask (n,).
 
-    `reach` (n,) counts is how far its lower 2.3 % reach down.
+    `reach` (n,) is the distance from the median to the lower 2.3rd percentile, counts.
     """
     return np.asarray((reach < 2.0 * _CUT_OFF * noise) | (noise < _HIDDEN))
 
 
 def without_hot_pixels(pixels: Image, most: int) -> Image:
-    """Return `pixels` (rows, columns) with the hot ones replaced, if there are more of them than `most`.
+    """Return `pixels` (rows, columns) with hot pixels replaced, if there are more of them than `most`.
 
-    A few are left, to be measured and refused by name; a worn sensor's thousands would take the places of all
-    stars, and widen the noise.
+    A few hot pixels are kept: they are measured and flagged. The thousands of a damaged sensor would displace
+    all stars from the list and raise the noise.
     """
     single = estimate_background(pixels, _BLOCK, _SINGLE_STRIDE)
     signal = pixels - single.map(single.level)
@@ -187,7 +189,7 @@ def without_hot_pixels(pixels: Image, most: int) -> Image:
 
 
 def find_bright(pixels: Image, sky: Sky, sigmas: float) -> BrightPixels:
-    """Return where the smoothed frame exceeds its level by more than `sigmas` of its noise."""
+    """Return the pixels of the smoothed frame that exceed its background by `sigmas` times its noise."""
     rows, columns = pixels.shape
     limit = Surface(sky.smooth_level.values + sigmas * sky.smooth_noise.values, (rows, columns))
     down, across = limit.factors()
@@ -222,7 +224,7 @@ def find_bright(pixels: Image, sky: Sky, sigmas: float) -> BrightPixels:
 
 
 def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
-    """Return the smoothed frame at every crossing of `row` (r,) and `column` (c,), evenly spaced."""
+    """Return the smoothed frame (r, c) at the evenly spaced rows `row` (r,) and columns `column` (c,)."""
     total = np.zeros((len(row), len(column)), dtype=np.float32)
     for dy in (-1, 0, 1):
         rows = slice(row[0] + dy, row[-1] + dy + 1, _STRIDE)
@@ -233,14 +235,14 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
 
 
 def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return how much farther each block's noise reaches upwards than a normal one, and where it is cut off.
+    """Return the upper tail of each block's noise relative to a normal distribution, and where it is clipped.
 
-    2.3 % of a block should stand above twice its noise, and as much below. A sky cut off at zero counts has
-    noise on one side only, whose clipped moments underestimate it. A foreground's texture reaches far, its
-    neighbours' sky does not: each block takes the median of the 3 x 3 about it, which a few stars hardly
-    move. The reach is 1 or more.
+    2.3 % of the pixels of a block should exceed twice its noise, upwards and downwards. A sky that is clipped
+    at zero counts has noise on one side only, and its moments underestimate the noise. Each block takes the
+    median of the 3 x 3 blocks around it: the texture of a foreground has a long tail, but the sky beside it
+    does not, and a few stars hardly change the median. The relative tail is 1 or more.
     """
-    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators need not hold it
+    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
     (rows, columns), (down, across) = sample.shape, level.shape
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)

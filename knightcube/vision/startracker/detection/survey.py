@@ -32,20 +32,21 @@ CENTROIDS: tuple[Method, ...] = get_args(Method)
 
 @dataclass(frozen=True, slots=True)
 class DetectionSettings:
-    """How stars are found and measured.
+    """Settings of star detection; the defaults suit a camera of which nothing is known.
 
     Attributes:
-        method: `psf` fits the point spread, `window` takes the centre of mass of eq. 12-21, the others weigh
-            its pixels otherwise (`centroids`).
-        threshold_sigmas: least height of a peak of the smoothed frame, over that frame's measured noise.
-        most_stars: the brightest are kept, no more; no sixteenth of the frame gives more than its share
-            (`selection`).
-        psf_sigma: px; None measures it from the frame. Tracking frames hold few stars: give it there.
-        gain: electrons per count; None measures it from the scatter of the stars' own pixels.
-        saturation: counts at which a pixel clips; None for the frame's highest count where several pixels
-            share it, else the top of the integer type.
-        window: px, a_ROI of eq. 12-15, odd.
-        search_radius: px, how far from its prediction `measure_near` looks for a star.
+        method: `psf` fits the point spread function, `window` takes the centre of mass (eq. 12-21), and the
+            other methods weigh the pixels of the window differently (`measurement`).
+        threshold_sigmas: minimum height of a peak of the smoothed frame, in units of its measured noise.
+        most_stars: maximum number of stars, the brightest; the number from any sixteenth of the frame is
+            limited to a quarter of it.
+        psf_sigma: width of the PSF, px. None: measured from the frame, which needs several stars; give it for
+            tracking windows with few stars.
+        gain: electrons per count. None: measured from the residuals of the stars.
+        saturation: counts at which a pixel saturates. None: the highest count of the frame if several pixels
+            share it, otherwise the maximum of the integer type.
+        window: side length of the centroid window, px, odd (a_ROI of eq. 12-15).
+        search_radius: radius around a prediction in which `measure_near` searches, px.
     """
 
     method: Method = "psf"
@@ -95,7 +96,7 @@ class FrameKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FrameShape:
-    """What kind of frame it is, and the median length of its streaks, px (about 0 for points)."""
+    """The kind of a frame, and the median length of its streaks, px (about 0 for points)."""
 
     kind: FrameKind
     length: float
@@ -103,21 +104,22 @@ class FrameShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Areas:
-    """Connected areas, `n` of them, and their `m` pixels.
+    """The n connected areas of bright pixels of a frame, and their m pixels.
 
     Attributes:
-        row, column, owner: (m,) of each pixel, and the number of its area.
-        smooth: (m,) counts of the smoothed frame above its level.
-        peak: (m,) whether no neighbour is higher.
-        saturated: (m,) whether the pixel is.
-        ceiling: counts at which pixels saturate; inf where nothing is known.
-        pixels: (n,) how many.
-        flux: (n,) counts.
-        centre: (n, 2) px, of light.
-        length: (n,) px, of the uniform line with the area's moments, free of the point spread.
-        thickness: (n,) px, rms across.
-        direction: (n,) rad, of the length to the rows.
-        shape: rows, columns of the frame.
+        row, column: position of each pixel (m,).
+        owner: number of the area of each pixel (m,).
+        smooth: counts of the smoothed frame above its background at each pixel (m,).
+        peak: whether no neighbour of the pixel is higher (m,).
+        saturated: whether the pixel is saturated (m,).
+        ceiling: counts at which pixels saturate; infinite if unknown.
+        pixels: number of pixels of each area (n,).
+        flux: sum of the counts above the background (n,).
+        centre: centre of light (n, 2), px.
+        length: length of a uniform line with the moments of the area, without the PSF (n,), px.
+        thickness: rms width across that line (n,), px.
+        direction: angle of that line to the rows (n,), rad.
+        shape: rows and columns of the frame.
     """
 
     row: IntArray
@@ -140,7 +142,7 @@ class Areas:
 
 
 def find_areas(pixels: Image, sky: Sky, bright: BrightPixels, saturation: float | None) -> Areas:
-    """Return the 8-connected areas of `bright` pixels, with moments in `pixels` less the sky."""
+    """Return the 8-connected areas of `bright` pixels, with the moments of `pixels` above the background."""
     owner, count = label_pixels(bright.index, bright.shape[1])
     row, column = np.divmod(bright.index, bright.shape[1])
     counts = pixels[row, column].astype(np.float64)
@@ -166,9 +168,10 @@ def find_areas(pixels: Image, sky: Sky, bright: BrightPixels, saturation: float 
 
 
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
-    """Return which pixels `place` (p, 2) lie in blocks of 32 px of which the areas fill more than `share`.
+    """Return which pixels `place` (p, 2) lie in a 32 px block of which areas fill more than `share`.
 
-    Half a block's step each way is looked at too, so that where the blocks begin does not matter.
+    Blocks shifted by half a block in each direction are tested too, so that the result does not depend on
+    where the blocks begin.
     """
     down, across = areas.shape[0] // _BLOCK + 2, areas.shape[1] // _BLOCK + 2
     found = np.zeros(len(place), dtype=bool)
@@ -182,9 +185,9 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 
 
 def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
-    """Return the pairs (p,) of pixels that touch, by number in `index` (m,), flat and increasing.
+    """Return pairs (p,), (p,) of adjacent pixels, as positions in the increasing flat numbers `index` (m,).
 
-    Two pixels that the frame's border parts are never both given: the outermost columns hold none.
+    The outermost columns hold no bright pixel, so pixels at opposite borders of the frame are never paired.
     """
     pairs = []
     for step in (1, columns - 1, columns, columns + 1):
@@ -196,7 +199,7 @@ def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
 
 
 def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
-    """Return which pixels (m,) are higher than all that touch them; of equals the last one wins.
+    """Return which pixels (m,) are higher than all adjacent pixels; of equal neighbours, the last one is.
 
     Pixels below the noise threshold are lower than those above it.
     """
@@ -206,7 +209,7 @@ def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
     return best
 
 
-# The brightest areas decide; a rate shows in all of them, or in all but those on its axis.
+# Number of the brightest areas that decide; a rotation streaks all of them, except those on its axis.
 _LOOKED_AT = 20
 _LEAST_PIXELS = 4
 _SHORTEST_STREAK = 5.0
@@ -215,17 +218,17 @@ _LEAST_STREAKS = 4
 _STREAKED_PART = 0.4
 _ROUND = 3.0
 _THICKEST = 6.0
-# Sine of the angle by which a tree's twigs miss one rotation's flow, and streaks do not.
+# Maximum median sine between streaks and the flow of one rotation; lines of a foreground exceed it.
 _CROOKED = 0.12
 
 
 def is_streak(areas: Areas) -> BoolArray:
-    """Return which areas (n,) are thin and long."""
+    """Return which areas (n,) are long and thin."""
     return np.asarray((areas.length > _SHORTEST_STREAK) & (areas.length > _SLENDER * areas.thickness))
 
 
 def frame_shape(areas: Areas) -> FrameShape:
-    """Return the kind of the frame; four streaks are needed, at least four in ten of its areas."""
+    """Return the kind of the frame: streaks if four, and 40 % of the brightest areas, are streaks."""
     chosen = np.argsort(-areas.flux, kind="stable")[: 3 * _LOOKED_AT]
     usable = (areas.pixels[chosen] >= _LEAST_PIXELS) & (areas.thickness[chosen] < _THICKEST)
     chosen = chosen[usable][:_LOOKED_AT]
@@ -246,8 +249,9 @@ def frame_shape(areas: Areas) -> FrameShape:
 def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
     """Return whether lines at `centre` (n, 2) px, `direction` (n,) rad, follow one rotation of the camera.
 
-    Near the boresight its flow is t + w (-y, x): normal to no line that follows it. The t and w that are
-    the least so are the smallest singular vector of the normals' products with the flow.
+    Near the boresight the flow of a rotation is t + w (-y, x), and lines that follow it have no component of
+    it along their normals. The best t and w are the smallest right singular vector of the products of the
+    normals with the flow.
     """
     middle = centre.mean(axis=0)
     scale = float(np.abs(centre - middle).max()) or 1.0
@@ -262,11 +266,14 @@ def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """One pass over a frame: its sky, and the areas that stand above the noise.
+    """The first pass over a frame: its sky background and the areas above the noise.
 
     Attributes:
-        pixels: (rows, columns) in counts, `unit` of the frame's own numbers each; many hot ones are replaced.
-        settings: in these counts.
+        pixels: the frame (rows, columns) in counts; hot pixels are replaced if there are many.
+        unit: size of one count in the original unit of the frame.
+        settings: detection settings, in counts.
+        sky: the sky background.
+        areas: the connected areas above the noise.
     """
 
     pixels: Image
@@ -277,12 +284,12 @@ class Survey:
 
     @property
     def shape(self) -> FrameShape:
-        """Whether they are points or streaks."""
+        """Whether the areas are points or streaks."""
         return frame_shape(self.areas)
 
 
 def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
-    """Return what stands above the noise of a frame (rows, columns). Raises ValueError as `detect`."""
+    """Return sky and areas above the noise of a frame (rows, columns). Raises ValueError as `detect`."""
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
     pixels = without_hot_pixels(pixels, settings.most_stars)
@@ -292,7 +299,7 @@ def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
 
 
 def kind_of_frame(pixels: Image, settings: DetectionSettings | None = None) -> FrameShape:
-    """Return whether a frame (rows, columns) shows points, streaks or neither, and how long they are.
+    """Return whether a frame (rows, columns) shows points, streaks or neither, and the median length.
 
     Raises ValueError as `detect`.
     """
