@@ -156,7 +156,7 @@ def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> N
         (["--fov", "wide"], "is not a number"),
         (["--raw", "1024x1024"], "such as 1280x960x16"),
         (["--raw", "9000x9000x16"], "pixels of 16 bits are 162000000"),
-        (["--index", "{tmp}/none.index"], "no sky index can be read"),
+        (["--index", "{tmp}/none.index"], "the sky index cannot be read"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_status_2(

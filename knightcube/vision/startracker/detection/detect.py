@@ -393,7 +393,7 @@ def measure_near(
         trail: displacement of each star over the exposure (m, 2), px, a few pixels at most; None: none.
 
     Raises:
-        ValueError: unless `pixels` is a frame of real numbers of 16 x 16 pixels or larger, and the predictions
+        ValueError: unless `pixels` is a frame of real numbers, 16 x 16 pixels or larger, and all predictions
             are finite.
     """
     pixels, unit = in_counts(pixels)

@@ -33,23 +33,23 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 _CROSS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
 )
-# A step d leaves an error of about d^2: a hundredth of the arcsecond that a star tracker sees.
+# Step (rad) at which the iteration ends: a step d leaves an error of about d^2, 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Directions within about 1e-6 rad of one line leave the turn about it to rounding.
+# Minimum reciprocal condition: for directions within 1e-6 rad of one line the rotation about it is undefined.
 _LEAST_INFORMATION = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """Attitude and scale of the least squares.
+    """The attitude and scale of a least-squares fit.
 
     Attributes:
-        matrix: (3, 3) A, ICRS to camera.
+        matrix: attitude matrix A (3, 3), ICRS to camera.
         scale: factor of the tangents.
-        covariance: (4, 4) of the turn about the camera's axes, rad^2, and of ln scale; (3, 3) when the scale
-            was held.
-        squares: (n,) |e|^2 / sigma^2 of each star.
+        covariance: of the rotation about the camera axes, rad^2, and of ln scale (4, 4); (3, 3) if the scale
+            was fixed.
+        squares: |e|^2 / sigma^2 of each star (n,).
     """
 
     matrix: FloatArray
@@ -59,22 +59,22 @@ class Refinement:
 
     @property
     def scale_sigma(self) -> float:
-        """Relative standard deviation of the scale; 0 when it was held."""
+        """The relative standard deviation of the scale; 0 if it was fixed."""
         return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
 
     def fix(self) -> AttitudeFix:
-        """Return the attitude as the solvers of Wahba's problem do."""
+        """Return the attitude in the form of the solvers of Wahba's problem."""
         turn = np.ascontiguousarray(self.covariance[:3, :3])
         return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
 
     def widened(self) -> Refinement:
-        """Return the same with the covariance that the residuals themselves bear out."""
+        """Return the same fit with its covariance increased according to the residuals."""
         factor = inflation(self.squares, len(self.covariance))
         return replace(self, covariance=self.covariance * factor)
 
 
 def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
-    """Return unit vectors (n, 3) whose tangents x/z, y/z are `scale`, one or (n,), times `direction`'s."""
+    """Return `direction` (n, 3) with its tangents x/z, y/z multiplied by `scale`, a number or (n,)."""
     if isinstance(scale, float) and scale == 1.0:
         return direction
     x, y, z = direction.T
@@ -85,7 +85,7 @@ def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
 
 
 def scale_slope(direction: FloatArray) -> FloatArray:
-    """Return by how much directions (n, 3) move per unit of ln scale, across themselves."""
+    """Return the derivatives (n, 3) of unit vectors `direction` (n, 3) by ln scale."""
     squared = direction[:, 2:] * direction[:, 2:]
     slope = direction * squared
     slope[:, 2:] -= direction[:, 2:]
@@ -93,10 +93,11 @@ def scale_slope(direction: FloatArray) -> FloatArray:
 
 
 def inflation(squares: FloatArray, parameters: float) -> float:
-    """Return by how much the residuals say that the variances are too small; 1 where that may be chance.
+    """Return the factor by which the variances must be increased to agree with the residuals.
 
-    `squares` (n,), each |e|^2 / sigma^2 of two components, together are a chi-square of 2n - `parameters`
-    degrees of freedom, of which three of its sigmas are left to chance.
+    `squares` (n,) are |e|^2 / sigma^2, each of two components. Their sum has a chi-square distribution with
+    2n - `parameters` degrees of freedom. The factor is 1 if the sum exceeds its mean by less than three
+    standard deviations.
     """
     freedom = 2 * len(squares) - parameters
     if freedom <= 0:
@@ -113,10 +114,17 @@ def refine(
     scale: float,
     free_scale: bool,
 ) -> Refinement | None:
-    """Return attitude and scale that best turn `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+    """Return the attitude and scale that best rotate `reference` into `observed`.
 
-    `observed` and `sigma` are those at scale 1; `matrix` (3, 3) and `scale` are the start. None where the
-    stars do not determine the parameters, or the fit diverges.
+    Returns None if the stars do not determine the parameters, or the fit diverges.
+
+    Args:
+        observed: unit vectors (n, 3), camera frame, at scale 1.
+        reference: unit vectors (n, 3), ICRS.
+        sigma: standard deviation of each observed direction (n,), rad, at scale 1.
+        matrix: initial attitude (3, 3).
+        scale: initial scale, or the fixed scale.
+        free_scale: whether the scale is fitted.
     """
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
@@ -144,7 +152,7 @@ def refine(
             scale *= math.exp(float(step[3]))
         if longest < _SETTLED:
             break
-    # The residuals after the last step, squared.
+    # The squares of the residuals after the last step.
     left = (residual + flat @ step).reshape(-1, 3)
     return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
 
@@ -159,7 +167,7 @@ def _determined(normal: FloatArray, covariance: FloatArray) -> bool:
 
 
 def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return the attitude (3, 3) after a turn (3,) rad about the camera's own axes (Rodrigues)."""
+    """Return the attitude (3, 3) after a rotation `turn` (3,), rad, about the camera axes (Rodrigues)."""
     x, y, z = (float(component) for component in turn)
     angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 0.0 else 1.0
@@ -169,31 +177,31 @@ def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 PRIOR = 0.05
-"""Standard deviation of c, the relative shift at the corner, of lenses that are not calibrated."""
+"""Standard deviation of c, the relative shift in the corner, of lenses that are not calibrated."""
 _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half width of the gate while the match grows: of a star's sigma, and of the corner's tangent.
+# Half width of the gate while the match grows: in sigmas of a star, and relative to the corner's tangent.
 _GATE_SIGMAS = 8.0
 _GATE_SHARE = 0.004
-# Deviations of the scatter beyond which a star is left out of the final fit.
+# Standard deviations of the scatter beyond which a star is excluded from the final fit.
 _OUTLIER = 4.0
-# Median of the square root of a chi-square of 2.
+# Median of the square root of a chi-square with 2 degrees of freedom.
 _RAYLEIGH_MEDIAN = 1.1774
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DistortedFit:
-    """Matched stars, and the attitude with a distorted lens.
+    """The matched stars and the attitude of a camera with a distorted lens.
 
     Attributes:
-        observed: (k,) numbers of observed stars.
-        star: (k,) numbers of guide stars.
-        refined: attitude, scale and their covariance, widened, with the distortion free.
-        distortion: c of the module's text.
-        seen: (n, 3) true directions, camera frame, of all stars of the field by this lens.
-        from_lens: (3, 3) rad^2, the part of the attitude's covariance that an uncertain c adds.
+        observed: numbers of observed stars (k,).
+        star: numbers of guide stars (k,).
+        refined: attitude, scale and their covariance, increased according to the residuals.
+        distortion: the coefficient c of the module docstring.
+        seen: directions of all observed stars, corrected for the distortion (n, 3), camera frame.
+        from_lens: part of the attitude covariance that is due to the uncertainty of c (3, 3), rad^2.
     """
 
     observed: IntArray
@@ -212,9 +220,10 @@ def fit_with_distortion(
     star: IntArray,
     start: Refinement,
 ) -> DistortedFit | None:
-    """Return the match grown from `observed` and `star` (k,) at `start`; None if they fix no lens.
+    """Return the match grown from the stars `observed` and `star` (k,), starting at `start`.
 
-    `expected` are the guide stars in and about the field, the brightest first.
+    `expected` are the numbers of the guide stars in and around the field, the brightest first. Returns None
+    if the matched stars do not determine the lens.
     """
     corner = math.hypot(*field.half_width)
     pose = _Pose(start.matrix, start.scale, 0.0)
@@ -248,7 +257,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Residuals beyond the sigmas widen the whole; the prior is not of their making.
+    # Residuals beyond the sigmas increase the covariance, except for the part of the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
@@ -268,11 +277,11 @@ class _Pose:
     distortion: float
 
     def true(self, direction: FloatArray, corner: float) -> FloatArray:
-        """Return the true directions (n, 3) of those observed (n, 3)."""
+        """Return the directions (n, 3) corrected for scale and distortion, of observed ones (n, 3)."""
         return stretched(direction, self.scale * self.ratio(direction, corner))
 
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
-        """Return true over seen tangents (n,) at the scale: Newton's method on r (1 + c s^2 r^2) = 1."""
+        """Return true over observed tangents (n,) at the scale: Newton's method for r (1 + c s^2 r^2) = 1."""
         squared = self.distortion * _squared_tangent(direction) / corner**2
         ratio = np.ones(len(direction))
         for _ in range(4):
@@ -296,7 +305,7 @@ def _distorted_fit(
         predicted = reference @ pose.matrix.T
         residual = weight[:, None] * (seen - predicted)
         slope = np.empty((len(seen), 3, 5))
-        # d(A r) for a turn d is -[A r x] d, of which the residual takes the negative.
+        # A rotation d changes A r by -[d x] A r = [A r x] d, and the residual by the negative of it.
         slope[:, :, :3] = -cross_matrices(predicted)
         slope[:, :, 3] = scale_slope(seen)
         share = _squared_tangent(direction) * ratio**2 / corner**2

@@ -44,8 +44,8 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Of the field's width: larger triangles are in the index only if their stars are bright, smaller ones are
-# less sharp.
+# Limits of the longest side, relative to the width of the field: the index has larger triangles of bright
+# stars only, and smaller triangles are less accurate.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
@@ -54,8 +54,8 @@ class BatchSizes:
     """Numbers of triangles that are looked up at once, batch after batch.
 
     Attributes:
-        bright: of the brightest stars, at each step of scale; these solve most frames.
-        spread: of triangles spread over many stars, where the brightest are false.
+        bright: batches of the brightest stars, at each step of scale; these solve most frames.
+        spread: batches of triangles spread over many stars, for frames whose brightest points are false.
     """
 
     bright: tuple[int, ...] = (60, 250)
@@ -63,10 +63,10 @@ class BatchSizes:
 
 
 def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
-    """Yield triangles (t, 3) and whether they are spread over many stars.
+    """Yield batches of triangles (t, 3), and whether they are spread over many stars.
 
-    With many `steps` of scale a batch of the brightest is smaller, by the root of their number. The last
-    batch has triangles of neighbours too, for a list that is not in order of brightness.
+    With many `steps` of scale a batch of the brightest stars is smaller, by the square root of their number.
+    The last batch includes triangles of neighbours, for a list that is not sorted by brightness.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0
@@ -84,7 +84,7 @@ def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tupl
 
 
 def middle_sized(field: StarField) -> IntArray:
-    """Return triangles (t, 3) of middle size of the brightest stars, in a random order."""
+    """Return medium-sized triangles (t, 3) of the brightest stars, in a random order."""
     triangles = triples(min(len(field), _MOST_STARS))
     first, second, third = triangles.T
     direction = field.direction[:_MOST_STARS]
@@ -92,13 +92,13 @@ def middle_sized(field: StarField) -> IntArray:
     least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
     longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
     kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
-    # The same order in every run: the same list has the same answer.
+    # A fixed seed: the same list always gives the same result.
     return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
 
 
 @lru_cache(maxsize=32)
 def triples(count: int) -> IntArray:
-    """Return all triangles (t, 3) of `count` stars, in order of the faintest star of each."""
+    """Return all triangles (t, 3) of `count` stars, sorted by the faintest star of each."""
     first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
     ascending = (first < second) & (second < third)
     triangles = np.stack([first[ascending], second[ascending], third[ascending]], axis=-1)
@@ -106,7 +106,7 @@ def triples(count: int) -> IntArray:
 
 
 def neighbours(field: StarField) -> IntArray:
-    """Return triangles (t, 3) of stars and their nearest neighbours, which need not be bright."""
+    """Return triangles (t, 3) of stars and their nearest neighbours of any brightness."""
     cosines = field.direction[:_CENTRES] @ field.direction.T
     near = np.argsort(-cosines, axis=1)[:, 1 : _NEIGHBOURS + 1]
     one, two = np.triu_indices(_NEIGHBOURS, 1)
@@ -121,11 +121,11 @@ _LARGEST_SIZE = (1 << SIZE_BITS) - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleSteps:
-    """Ranges of scale that together cover the lens's range, each narrow enough for one set of shapes.
+    """Ranges of scale that together cover the range of the lens, each narrow enough for one set of shapes.
 
     Attributes:
-        middle: (s,) scale at which the shapes are computed.
-        lowest, highest: (s,) ends of each range.
+        middle: scale at which the shapes are computed (s,).
+        lowest, highest: ends of each range (s,).
     """
 
     middle: FloatArray
@@ -137,10 +137,10 @@ class ScaleSteps:
 
     @classmethod
     def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return the steps for the scales of a field, with ratios of sides within `tolerance` in each.
+        """Return the steps for the scale range of a field; side ratios vary by `tolerance` within a step.
 
         At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
-        1 + t^2 / 2 across it, so the ratio of two sides at half the way to the corner varies by t^2 / 2.
+        1 + t^2 / 2 across it. The ratio of two sides half-way to the corner therefore varies by t^2 / 2.
         """
         lowest, highest = field.scale
         half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
@@ -151,12 +151,12 @@ class ScaleSteps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleMatches:
-    """Observed triangles that look like triangles of guide stars, corner by corner.
+    """Matches of observed triangles with triangles of guide stars, corner by corner.
 
     Attributes:
-        observed: (k, 3) uint32, numbers of observed stars.
-        star: (k, 3) uint32, numbers of guide stars.
-        scale: (k,) factor of the tangents that makes the longest sides equal.
+        observed: numbers of observed stars (k, 3), uint32.
+        star: numbers of guide stars (k, 3), uint32.
+        scale: factor of the tangents that makes the longest sides equal (k,).
     """
 
     observed: npt.NDArray[np.uint32]
@@ -168,7 +168,7 @@ class TriangleMatches:
 
     @classmethod
     def of(cls, parts: Sequence[TriangleMatches]) -> TriangleMatches:
-        """Return several as one."""
+        """Return the concatenation of several sets of matches."""
         if len(parts) == 1:
             return parts[0]
         return cls(
@@ -178,11 +178,11 @@ class TriangleMatches:
         )
 
     def votes(self) -> IntArray:
-        """Return for each pair of each match (k, 3) how many matches of about the same scale have it."""
+        """Return for each pair of each match (k, 3) how many matches of similar scale contain it."""
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
         bins -= bins.min()
         bits = max(13, self.star.size.bit_length())
-        # A multiplicative hash: two pairs rarely share a slot, and if they do it is harmless.
+        # A multiplicative hash: two pairs rarely share a slot, and a collision is harmless.
         code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
         code += bins.astype(np.uint32)[:, None]
         slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
@@ -201,22 +201,22 @@ def look_up(
     distortion: float,
     most: int,
 ) -> tuple[TriangleMatches, int]:
-    """Return the matches of observed `triangles` (t, 3), and the number of index entries read.
+    """Return the matches of observed triangles in the index, and the number of index entries read.
 
     Args:
         field: the observed stars.
-        sky: the guide stars' triangles.
+        sky: the index.
         steps: ranges of scale.
-        triangles: numbers of observed stars.
-        tolerance: of a ratio of sides, in its sigmas.
-        distortion: additional error of a ratio.
-        most: entries that may be read; the first triangles take precedence.
+        triangles: numbers of observed stars (t, 3).
+        tolerance: tolerance of a side ratio, in its sigmas.
+        distortion: additional error of a side ratio.
+        most: maximum number of entries to read; the first triangles take precedence.
     """
     corners, sides, left = _forms(field, triangles, steps)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
     sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
     step = np.tile(np.arange(len(steps)), len(triangles))
-    # The error of a difference of two directions, and of the side that it is divided by.
+    # The error of the difference of two directions, and of the side by which it is divided.
     slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
     ratio = sides[:, :2] / size[:, None]
     usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
@@ -234,14 +234,14 @@ def look_up(
     for column, cells in enumerate((short, middle)):
         lowest_place, width = _places(ratio[query, column], slack[query], cells)
         place = sky.triangles.shape[:, column][entry]
-        # Below the lowest place the difference of the bytes wraps round to a large one.
+        # Below the lowest position the difference of the unsigned bytes wraps around to a large number.
         near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
     chosen = np.flatnonzero(near)
     total = len(entry)
     entry = entry[chosen]
     query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
     longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
-    # The runs hold some triangles too small or too large for the step.
+    # The runs contain some triangles that are too small or too large for the step.
     fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
     entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * steps.middle[step[query]]
@@ -250,7 +250,7 @@ def look_up(
 
 
 def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
-    """Return begin and length of the first runs, which hold `most` entries at most."""
+    """Return the beginnings and lengths of the first runs that hold at most `most` entries in total."""
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     return begin[:kept], count[:kept]
@@ -259,8 +259,8 @@ def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, In
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest place in its cell that is within `slack` of each ratio, and how many follow it."""
-    # In units of the finest division of a ratio, from its middle.
+    """Return the lowest position in the cell within `slack` of each ratio, and the number of further ones."""
+    # In units of the finest division of a ratio, from the middle of the division.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
     lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
@@ -271,7 +271,7 @@ def _places(
 def _forms(
     field: StarField, triangles: IntArray, steps: ScaleSteps
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return corners (t s, 3) in order of the sides opposite, sides (t s, 3), whether they turn left."""
+    """Return corners and sides (t s, 3), sorted by the opposite sides, and whether triangles turn left."""
     x, y, z = field.direction.T
     direction = np.empty((len(steps), len(field), 3))
     direction[:, :, 0] = steps.middle[:, None] * x
@@ -300,10 +300,10 @@ def _runs(
     lowest: FloatArray,
     highest: FloatArray,
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
-    """Return the runs of keys that hold triangles like the queries.
+    """Return the runs of keys that contain triangles similar to the queries.
 
-    For each run: its query, the cells of the short and the middle ratio, its begin and end. A query's ratios
-    may lie in up to three cells each.
+    Each run has the number of its query, the cells of the short and of the middle ratio, and its beginning
+    and end. Each ratio of a query may lie in up to three cells.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
@@ -324,18 +324,18 @@ def _runs(
 
 @dataclass(frozen=True, slots=True)
 class IdentificationSettings:
-    """Tolerances and budget of the search.
+    """Tolerances and limits of the search.
 
     Attributes:
-        tolerance: of the ratios of sides, in their sigmas.
-        distortion: additional error of a ratio of sides, for a lens that is no pinhole.
-        batches: numbers of triangles looked up.
-        work: entries of the index that may be read in total.
-        verified: candidates of each batch that are verified at most.
-        mirror: whether the field is searched for as a mirror shows it too.
-        hint_error: factor by which a scale within a narrow range, a hint, may lie outside of that range after
-            all; 1 where the range is certain. A calibrated scale, (1, 1), is always believed.
-        verification: when a candidate is accepted.
+        tolerance: tolerance of the side ratios, in their sigmas.
+        distortion: additional error of a side ratio, for a lens that is not a pinhole.
+        batches: numbers of triangles to look up.
+        work: maximum number of index entries to read.
+        verified: maximum number of candidates of each batch to verify.
+        mirror: whether the mirrored field is searched too.
+        hint_error: factor by which the scale may lie outside of a narrow range, which is considered a hint;
+            1 if the range is certain. A calibrated scale, (1, 1), is always considered certain.
+        verification: conditions under which a candidate is accepted.
     """
 
     tolerance: float = 3.0
@@ -348,10 +348,10 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Tolerance and verified candidates of triangles spread over many stars: of these there are enough that some
-# may be missed, and the true ones have many votes.
+# Factor of tolerance and of verified candidates for triangles spread over many stars: some of these may be
+# missed, because there are many, and the true ones have many votes.
 _OF_SPREAD = 0.6
-# A match in a mirror, or against a hint, must be ten times less likely by chance: most pictures need neither.
+# Factor by which a match of the mirrored field, or against a hint, must be less likely by chance.
 _RARE = 10.0
 DEFAULT = IdentificationSettings()
 
@@ -359,7 +359,7 @@ DEFAULT = IdentificationSettings()
 def identify(
     observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT
 ) -> Identification:
-    """Return which stars the frame shows and their attitude, or why it cannot be identified."""
+    """Return the identified stars and the attitude of a frame, or why it cannot be identified."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, Status.TOO_FEW_STARS)
     answer = _search(observed, sky, settings, 1.0)
@@ -376,7 +376,7 @@ def identify(
 def _search(
     observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
 ) -> Identification:
-    """Return the identification of the field as it is."""
+    """Return the identification of a field without trying its mirror image or another scale."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried: set[tuple[int, int]] = set()
@@ -411,7 +411,7 @@ def _candidates(
     if not len(finds):
         return
     votes = finds.votes().sum(axis=1)
-    # Of all matches, which may be a hundred thousand, only the first in order are sorted.
+    # There may be a hundred thousand matches: only those with the most votes are sorted.
     first = np.argpartition(-votes, min(8 * most, len(votes) - 1))[: 8 * most]
     order = first[np.lexsort((first, -votes[first]))]
     yielded = 0
@@ -420,7 +420,7 @@ def _candidates(
         if sum(pair in tried for pair in pairs) >= 2:
             continue
         tried.update(pairs)
-        # One triangle gives a poor scale: it is clipped to the lens's range.
+        # One triangle gives an inaccurate scale, which is limited to the range of the lens.
         scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
         yield _attitude_of(observed, sky, finds, find), scale
         yielded += 1
@@ -435,7 +435,7 @@ def _attitude_of(observed: StarField, sky: SkyIndex, finds: TriangleMatches, fin
 
 
 def _frame(corners: FloatArray) -> FloatArray:
-    """Return the rows of a frame (3, 3) fixed in a triangle (3, 3): its middle, along its longest side."""
+    """Return the axes, as rows (3, 3), of a frame fixed in a triangle (3, 3): the first is its centre."""
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
     mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
     norm = math.sqrt(mx * mx + my * my + mz * mz)

@@ -13,15 +13,15 @@ from knightcube.astro.attitude.wahba import AttitudeFix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarField:
-    """Observed points, brightest first; some of them may not be stars.
+    """The observed points of a frame, the brightest first; some of them may not be stars.
 
     Attributes:
-        direction: (n, 3) unit vectors, camera frame, by the assumed focal length.
-        sigma: (n,) rad, standard deviation of each direction along one axis.
-        half_width: (2,) tangents of the half field along x and y.
-        scale: (lowest, highest) factor of all tangents x/z, y/z for the true focal length: (1, 1) for a
-            calibrated camera.
-        magnitude: (n,) instrumental, up to one common constant; None if only the order is known.
+        direction: unit vectors (n, 3) in the camera frame, for the assumed focal length.
+        sigma: standard deviation of each direction along one axis (n,), rad.
+        half_width: tangents of half the field of view along x and y (2,).
+        scale: lowest and highest factor by which the tangents x/z, y/z must be multiplied for the true focal
+            length; (1, 1) for a calibrated camera.
+        magnitude: instrumental magnitudes (n,), up to a common constant; None if only the order is known.
     """
 
     direction: FloatArray
@@ -34,7 +34,7 @@ class StarField:
         return len(self.direction)
 
     def rescaled(self, factor: float) -> StarField:
-        """Return the field with all tangents multiplied by `factor`, about which the scale is known."""
+        """Return the field with all tangents multiplied by `factor`, and the range of the scale adapted."""
         stretched = self.direction * np.array([factor, factor, 1.0])
         return replace(
             self,
@@ -45,7 +45,7 @@ class StarField:
         )
 
     def mirrored(self) -> StarField:
-        """Return the field as a mirror shows it: left and right exchanged about the boresight."""
+        """Return the mirrored field: left and right are exchanged about the boresight."""
         return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
 
     def subset(self, chosen: IntArray) -> StarField:
@@ -65,19 +65,20 @@ class Status(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """Which guide star each observed star is.
+    """The guide stars assigned to the observed stars, and the attitude that follows.
 
     Attributes:
-        status: the rest is meaningful for IDENTIFIED only.
-        star: (n,) numbers of guide stars, -1 for an observed star that is none of them.
+        status: the other attributes are valid for IDENTIFIED only.
+        star: numbers of the guide stars (n,); -1 for an observed point without one.
         fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
-        scale: by which the tangents of the observed directions had to be multiplied.
-        scale_sigma: its standard deviation; 0 when the scale was given.
-        log10_false_alarm: of the probability that random stars would match as well anywhere in the sky; 0 if
-            unknown.
-        distortion: relative shift of a star in the corner that the lens was found to have (see the module
-            `distortion`); 0 where the stars matched without.
-        from_lens: (3, 3) rad^2, the part of the covariance of `fix` that is the uncertainty of `distortion`.
+        scale: factor by which the tangents of the observed directions had to be multiplied.
+        scale_sigma: standard deviation of the scale; 0 if the scale was given.
+        log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
+            0 if unknown.
+        distortion: fitted distortion of the lens, as the relative shift of a star in the corner
+            (`attitude_fit`); 0 if the stars matched without distortion.
+        from_lens: part of the covariance of `fix` that is due to the uncertainty of `distortion` (3, 3),
+            rad^2.
         mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the
             attitude of that field.
     """

@@ -39,10 +39,10 @@ def track(
     sigma: float,
     settings: VerificationSettings = _DEFAULT,
 ) -> Identification:
-    """Return which stars the frame shows near the prior attitude, NO_MATCH if it points elsewhere.
+    """Return the identification of the frame near a prior attitude; NO_MATCH if it points elsewhere.
 
-    `attitude` (4,) ICRS to camera has the standard deviation `sigma` rad about each axis; beyond some degrees
-    `identify` is faster and more reliable.
+    `attitude` (4,), ICRS to camera, has the standard deviation `sigma`, rad, about each axis. If `sigma`
+    exceeds some degrees, `identify` is faster and more reliable.
     """
     if len(field) < settings.least_matches:
         return nothing(field, Status.TOO_FEW_STARS)
@@ -61,7 +61,7 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # Volume of the ball of turns over that of all turns, 8 pi^2 in the same measure.
+    # Volume of the ball of rotations around the prior over that of all rotations, 8 pi^2 in this measure.
     searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify_matrix(field, sky, matrix, scale, searched, settings)
 

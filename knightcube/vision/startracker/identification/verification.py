@@ -37,16 +37,16 @@ _MOST_ORDERED = 12
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """The parameters of a chance match.
+    """The parameters of the probability of a chance match.
 
     Attributes:
-        observed: number of stars.
+        observed: number of observed stars.
         spread: sigma^2 of a star over the area of the field.
         fields: number of such fields in the searched part of the sky.
         scales: ln of the highest over the lowest scale.
-        choices: how many gates the matching chooses from.
-        least: the fewest stars that are accepted.
-        enough: log10 below which the exact value does not matter.
+        choices: number of gates from which the matching chooses.
+        least: minimum number of matched stars.
+        enough: log10 of the bound below which the exact value does not matter.
     """
 
     observed: int
@@ -58,11 +58,10 @@ class Chance:
     enough: float
 
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
-        """Return log10 of the bound for observed stars that match the expected ones of `ranks` within `gate`.
+        """Return log10 of the bound for `observed` stars that match the expected stars `ranks` within `gate`.
 
         Both are numbered in order of brightness. The matching chooses the faintest star that counts: for
-        the j-th choice, with j - 1 brighter expected stars missing, the bound is raised by j^2
-        pi^2/6.
+        the j-th choice, with j - 1 brighter expected stars missing, the bound is multiplied by j^2 pi^2/6.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -78,12 +77,13 @@ class Chance:
         return best
 
     def _of_places(self, gate: float, matched: int, expected: int) -> float:
-        """Return log10 of the number of chance matches of `matched` stars or more with `expected` ones.
+        """Return log10 of the expected number of chance matches of `matched` or more of `expected` stars.
 
-        The first star may be any of those of the sky; the second any in the ring about it that the distance
-        of the two leaves, as wide as scale and gate are; each star besides has to lie within the gate of an
-        expected one: for all choices of the matched among the observed. The fit draws its own stars to it:
-        left out of the fit, each would lie farther off by 1/(1 - leverage).
+        The first star may be any star of the sky. The second star lies in a ring around it that the distance
+        of the two defines, with a width given by the range of the scale and the gate. Each other star must
+        lie within the gate of an expected star. This is counted for all choices of the matched stars among
+        the observed ones. The fit moves towards its own stars: excluded from the fit, each star would be
+        farther away by 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -94,7 +94,7 @@ class Chance:
         lost = self.observed - matched
         ways = math.lgamma(self.observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
         rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
-        # The terms for still more stars fall faster than a geometric series (Feller VI.3).
+        # The terms for more matched stars fall faster than a geometric series (Feller VI.3).
         ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
 
@@ -108,7 +108,7 @@ def order_probability(sequence: Sequence[int]) -> float:
 
 @lru_cache(maxsize=_MOST_ORDERED + 1)
 def _inversion_counts(length: int) -> tuple[int, ...]:
-    """Return how many of the orders of `length` things have 0, 1, 2 ... inversions (Mahonian numbers)."""
+    """Return how many permutations of `length` items have 0, 1, 2, ... inversions (Mahonian numbers)."""
     counts = [1]
     for more in range(1, length):
         counts = [sum(counts[max(0, total - more) : total + 1]) for total in range(len(counts) + more)]
@@ -117,15 +117,15 @@ def _inversion_counts(length: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class VerificationSettings:
-    """When a candidate is accepted.
+    """The conditions under which a candidate is accepted.
 
     Attributes:
-        log10_false_alarm: limit of the expected number of chance matches in the whole sky.
-        gates: half widths within which a star matches, in its sigmas; the gate with the least chance is used.
-            The wide ones serve a lens with distortion, or sigmas that are too small.
-        least_matches: of stars, for acceptance.
-        rounds: of matching and refining.
-        most: number of the brightest observed stars that decide; all are matched in the end.
+        log10_false_alarm: log10 of the maximum expected number of chance matches in the searched sky.
+        gates: half widths within which a star matches, in its sigmas; the most significant gate is used. The
+            wide gates serve a lens with distortion, or sigmas that are too small.
+        least_matches: minimum number of matched stars.
+        rounds: maximum number of rounds of matching and refinement.
+        most: number of the brightest observed stars that decide; finally all stars are matched.
     """
 
     log10_false_alarm: float = -4.5
@@ -144,13 +144,13 @@ class _Matching:
     log10_chance: float
 
 
-# Share of the bright expected stars that match: with less a distorted lens is supposed.
+# Share of matched bright expected stars below which distortion of the lens is fitted.
 _FEW_MISSED = 0.8
-# An answer is refused if more than this share of the bright expected stars is missed with an unmatched star
-# within this share of the corner's tangent, beyond chance: the lens is fitted wrongly there. A foreground
-# hides stars and puts none beside them.
+# Maximum share of bright expected stars, beyond chance, without a match although an unmatched star is near,
+# and the radius of "near" relative to the corner's tangent. A larger share means that the fit of the lens is
+# wrong; a foreground hides stars, but adds none beside them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# A candidate that begins more than this, in powers of ten, above the limit is given up.
+# Excess over the limit, in powers of ten, above which a new candidate is rejected at once.
 _HOPELESS = 7.0
 
 
@@ -162,15 +162,15 @@ def verify(
     searched: float = 1.0,
     settings: VerificationSettings = VerificationSettings(),
 ) -> Identification:
-    """Return the whole field's identification if the candidate holds, NO_MATCH if it may be chance.
+    """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
 
     Args:
         field: the observed stars.
         sky: the guide stars.
-        attitude: (4,) of the candidate, ICRS to camera, within some sigmas of the answer.
-        scale: of the candidate.
-        searched: share of all attitudes that candidates were taken from: 1 if lost in space.
-        settings: when a candidate is accepted.
+        attitude: attitude of the candidate (4,), ICRS to camera, within some sigmas of the true attitude.
+        scale: scale of the candidate.
+        searched: share of all attitudes from which candidates were taken; 1 if lost in space.
+        settings: conditions of acceptance.
     """
     return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
 
@@ -183,7 +183,7 @@ def verify_matrix(
     searched: float = 1.0,
     settings: VerificationSettings = VerificationSettings(),
 ) -> Identification:
-    """Do as `verify` with the attitude matrix (3, 3)."""
+    """Return the identification as `verify` does, for an attitude matrix (3, 3)."""
     expected = expected_stars(sky, matrix, _half_width(field, scale), int(1.3 * len(field)) + 8)
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
     start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
@@ -201,7 +201,7 @@ def verify_matrix(
         if decided is None:
             return nothing(field)
         matching, refined = decided
-    # A calibrated lens has no distortion left; another has it where stars are missed or scatter.
+    # A calibrated lens has no unknown distortion. Other lenses have, if stars are missed or scatter.
     if field.scale[1] > field.scale[0] and (
         _share_of_bright(expected, matching.star) < _FEW_MISSED
         or inflation(refined.squares, len(refined.covariance)) > 1.0
@@ -211,7 +211,7 @@ def verify_matrix(
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> Identification:
-    """Return the identification with distortion fitted; NO_MATCH if bright stars are seen out of place."""
+    """Return the identification with distortion fitted; NO_MATCH if bright stars are displaced."""
     width = _half_width(field, refined.scale)
     expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
@@ -223,7 +223,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 
 
 def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
-    """Return how many of the bright expected stars match."""
+    """Return the share of the bright expected stars that match."""
     matched = _bright_matched(expected, star)
     return float(np.mean(matched)) if len(matched) else 0.0
 
@@ -231,7 +231,7 @@ def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.intege
 def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
-    """Return which of the expected stars match, of those as bright as the brighter half of `star`."""
+    """Return which bright expected stars match: those at least as bright as the median matched star."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
@@ -240,7 +240,7 @@ def _bright_matched(
 def _share_displaced(
     field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
 ) -> float:
-    """Return how many of the bright expected stars are missed with an unmatched star near, less chance."""
+    """Return the share of bright expected stars, beyond chance, without a match but with a star nearby."""
     matched = _bright_matched(expected, found.star)
     missed = sky.stars.direction[expected[: len(matched)][~matched]]
     unmatched = np.delete(found.seen, found.observed, axis=0)
@@ -255,7 +255,7 @@ def _share_displaced(
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
-    """Return an identification without stars."""
+    """Return an identification without matched stars."""
     return Identification(status, np.full(len(field), -1))
 
 
@@ -265,7 +265,8 @@ def expected_stars(
     """Return the numbers of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # Of twice as many as the whole sky should hold for `count` here: the Milky Way is denser, the poles less.
+    # Search twice as many of the brightest stars as an even sky would need for `count` stars in the field:
+    # the density varies between the Milky Way and the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
     x, y, z = matrix @ sky.stars.direction[near].T
@@ -285,7 +286,7 @@ def _settle(
     searched: float,
     settings: VerificationSettings,
 ) -> tuple[_Matching, Refinement] | None:
-    """Return matched stars and the refinement of `start` by them, once both agree; None if they do not."""
+    """Return the matched stars and the refined `start` once both no longer change; None if they diverge."""
     refined, previous = start, None
     for _ in range(settings.rounds):
         matching = _match(field, sky, expected, refined, searched, settings)
@@ -318,7 +319,7 @@ def _match(
     searched: float,
     settings: VerificationSettings,
 ) -> _Matching | None:
-    """Return which observed stars have an expected one within a gate, for the most significant gate."""
+    """Return the observed stars with an expected star within a gate, for the most significant gate."""
     if len(expected) < settings.least_matches:
         return None
     cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
@@ -341,7 +342,7 @@ def _match(
     matched = settings.least_matches - 1
     for gate in settings.gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A wider gate about the same stars is less significant.
+        # A wider gate with the same stars is less significant.
         if len(within) <= matched:
             continue
         matched = len(within)
@@ -352,7 +353,7 @@ def _match(
 
 
 def _plausible(refined: Refinement, field: StarField) -> bool:
-    """Return whether the scale found lies in the lens's range, within five of its sigmas."""
+    """Return whether the fitted scale lies in the range of the lens, within five of its sigmas."""
     lowest, highest = field.scale
     if lowest == highest:
         return True

@@ -41,12 +41,12 @@ from knightcube.vision.startracker.index import table_file
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GuideStars:
-    """Stars as the camera resolves them, brightest first.
+    """Stars as the camera resolves them, the brightest first.
 
     Attributes:
-        hip: (n,) int32 Hipparcos number, of a merged group its brightest.
-        direction: (n, 3) unit vectors, ICRS, at `epoch`.
-        magnitude: (n,) Johnson V, joint where merged.
+        hip: Hipparcos numbers (n,), int32; of a merged group that of its brightest star.
+        direction: unit vectors (n, 3), ICRS, at `epoch`.
+        magnitude: Johnson V magnitudes (n,); of a merged group the joint magnitude.
         epoch: Julian year.
     """
 
@@ -59,7 +59,7 @@ class GuideStars:
         return len(self.hip)
 
     def brighter_than(self, magnitude: float) -> GuideStars:
-        """Return the stars with V below `magnitude`, without copying."""
+        """Return the stars with V below `magnitude`, as views of the same arrays."""
         count = int(np.searchsorted(self.magnitude, magnitude, side="left"))
         return GuideStars(self.hip[:count], self.direction[:count], self.magnitude[:count], self.epoch)
 
@@ -69,8 +69,8 @@ def choose_guide_stars(
 ) -> GuideStars:
     """Return the stars with a joint V below `faintest` at Julian year `epoch`.
 
-    Stars closer together than `resolution` rad, directly or through others, are merged.
-    Raises ValueError when `epoch` is not finite.
+    Stars closer together than `resolution`, rad, directly or through other stars, are merged. Raises
+    ValueError if `epoch` is not finite.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -82,7 +82,7 @@ def choose_guide_stars(
     centre = np.stack(
         [np.bincount(group, light * axis, minlength=len(catalogue)) for axis in direction.T], axis=-1
     )
-    # A group bears the number of its first member, and the catalogue is in order of brightness.
+    # A group has the number of its first member, and the catalogue is sorted by brightness.
     first = np.flatnonzero(group == np.arange(len(catalogue)))
     magnitude = -2.5 * np.log10(joint[first])
     seen = np.flatnonzero(magnitude < faintest)
@@ -106,32 +106,34 @@ def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
 
 CELLS = 80
 CELL = 1.0 / CELLS
-"""Ratios of sides from 0 to 1 are counted in cells of this width; a byte gives the place in the cell."""
+"""Width of the cells of side ratios from 0 to 1; a byte gives the position within the cell."""
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
-"""Of the longest side's chord, which is below 1."""
+"""Resolution of the longest side's chord in a key; the chord is below 1."""
 RUN_BITS = 12
-"""Keys are counted in steps of 2^12 units of size: about one key each."""
+"""Keys are counted in steps of 2^12 units of size, about one key per step."""
 TIE = 1e-9
-"""Relative tolerance of a side against a limit: the limits are sides themselves."""
+"""Relative tolerance of a side against a limit, because the limits are sides themselves."""
 LEAST_RATIO = 0.1
-"""Of the shortest to the longest side: flatter triangles discriminate little better than a pair."""
+"""Minimum ratio of the shortest to the longest side: flatter triangles are hardly better than a pair."""
 
 
-# Of the radius, between the centres of circles; and how many stars more than needed are looked through first.
+# Distance of the centres of circles, relative to their radius.
 _CIRCLES_APART = 0.7
+# Factor of the average number of stars needed that are searched first.
 _ENOUGH = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleIndex:
-    """Triangles in order of their keys.
+    """Triangles sorted by their keys.
 
     Attributes:
-        key: (m,) uint32: cell of shape and turning, then size.
-        corners: (m, 3) uint16 numbers of guide stars, opposite the shortest, the middle, the longest side.
-        shape: (m, 2) uint8: where in the cell the two ratios are.
+        key: cell of shape and orientation, then size (m,), uint32.
+        corners: numbers of the guide stars opposite the shortest, the middle and the longest side (m, 3),
+            uint16.
+        shape: positions of the two ratios within their cells (m, 2), uint8.
     """
 
     key: npt.NDArray[np.uint32]
@@ -143,16 +145,16 @@ class TriangleIndex:
 
     @cached_property
     def below(self) -> npt.NDArray[np.int32]:
-        """How many keys are below each multiple of 2^RUN_BITS (f,), so that runs need no search."""
+        """The number of keys below each multiple of 2^RUN_BITS (f,), which finds runs without a search."""
         run = self.key >> np.uint32(RUN_BITS)
         count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
         return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
 
 def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
-    """Return for each star (n,), the brightest first, the chord to the `rank`-th nearest brighter one.
+    """Return for each star (n,), the brightest first, the chord to the `rank`-th nearest brighter star.
 
-    At most `farthest`, as for those that have fewer than `rank` brighter ones.
+    The chord is limited to `farthest`, which is also the value of stars with fewer than `rank` brighter ones.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -161,7 +163,7 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
     begin = 0
     while begin < count:
         end = min(max(2 * begin, 4 * rank), count)
-        # About half of the neighbours among twice as many stars are brighter: three times `rank` hold enough.
+        # About half of the neighbours among twice as many stars are brighter: 4 x `rank` contain enough.
         neighbours = min(4 * rank, end)
         distance, number = cKDTree(direction[:end]).query(direction[begin:end], neighbours)
         brighter = number < np.arange(begin, end)[:, None]
@@ -177,10 +179,10 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
 
 
 def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
-    """Return the triangles of stars (n, 3), the brightest first.
+    """Return the index of the triangles of stars `direction` (n, 3), the brightest first.
 
-    Between sizes[i] and sizes[i + 1] (b + 1,), chords of the longest side, are those of ranks[i] (b,);
-    besides those of the `few` brightest stars of circles of these radii.
+    Triangles whose longest side is a chord between sizes[i] and sizes[i + 1], (b + 1,), are those of rank
+    ranks[i], (b,). The triangles of the `few` brightest stars of circles of these radii are added.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
     found = [np.sort(_band(direction, *band), axis=1) for band in bands]
@@ -190,9 +192,9 @@ def build_triangles(direction: FloatArray, sizes: FloatArray, ranks: IntArray, f
 
 
 def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
-    """Return the triangles (m, 3) of the `few` brightest stars of each of many circles over the whole sky.
+    """Return the triangles (m, 3) of the `few` brightest stars of each of the circles that cover the sky.
 
-    Their longest sides are chords from `smallest` to the diameter.
+    Their longest sides are chords between `smallest` and the diameter.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
@@ -230,7 +232,7 @@ def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> 
 
     limit = reach(direction, rank, largest)
     able = np.flatnonzero(limit >= smallest)
-    # In order of reach, so that each triangle is found once: from its last star, the one of least reach.
+    # Sorted by reach, so that each triangle is found once: from its last star, which has the smallest reach.
     able = able[np.argsort(-limit[able], kind="stable")]
     limit, place = limit[able] * (1.0 + TIE), direction[able]
     first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
@@ -278,14 +280,14 @@ def _indexed(direction: FloatArray, corners: IntArray) -> TriangleIndex:
 
 
 def cell(ratio: FloatArray) -> IntArray:
-    """Return the numbers of the cells that ratios of sides lie in."""
+    """Return the numbers of the cells that contain side ratios."""
     return np.clip(np.floor(ratio * CELLS), 0, CELLS - 1).astype(np.int64)
 
 
 def keys(
     short: IntArray, middle: IntArray, left: npt.NDArray[np.bool_], size: FloatArray
 ) -> npt.NDArray[np.uint32]:
-    """Return the keys of triangles: cells of the two ratios, turning, chord of the longest side."""
+    """Return the keys of triangles from the cells of both ratios, the orientation, and the longest chord."""
     form = ((left * CELLS + short) * CELLS + middle).astype(np.int64)
     step = np.clip(size / SIZE_UNIT, 0, (1 << SIZE_BITS) - 1).astype(np.int64)
     return ((form << SIZE_BITS) | step).astype(np.uint32)
@@ -301,7 +303,7 @@ KIND = table_file.Kind(
 PATH = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "knightcube" / f"sky-{_VERSION}.index"
 )
-"""Where the default index is kept."""
+"""Path of the default index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +322,7 @@ class SkyIndex:
 
     @cached_property
     def coarse(self) -> npt.NDArray[np.float32]:
-        """The stars' directions, one axis a row (3, n): for a quick search near a boresight."""
+        """The directions of the stars by axis (3, n), float32, for a fast search near a boresight."""
         return np.ascontiguousarray(self.stars.direction.T, dtype=np.float32)
 
     def at(self, epoch: float) -> SkyIndex:
@@ -338,7 +340,7 @@ class SkyIndex:
 
 
 def save(sky: SkyIndex, path: Path) -> None:
-    """Write the index to `path`, whole or not at all."""
+    """Write the index to `path` atomically: a partly written file is never left there."""
     columns: table_file.Columns = {
         "hip": sky.stars.hip,
         "direction": sky.stars.direction.astype(np.float32),
@@ -351,9 +353,9 @@ def save(sky: SkyIndex, path: Path) -> None:
 
 
 def load(path: Path = PATH) -> SkyIndex:
-    """Return the index of a file, its triangles mapped and not read.
+    """Return the index of a file; its triangles are memory-mapped.
 
-    Raises InputError when the file is missing, damaged, or of another version.
+    Raises InputError if the file is missing, damaged, or of another version.
     """
     columns, facts = table_file.load(path, KIND)
     direction: FloatArray = columns["direction"].astype(np.float64)
@@ -365,5 +367,5 @@ def load(path: Path = PATH) -> SkyIndex:
 
 @cache
 def load_once(path: Path) -> SkyIndex:
-    """Return the index of a file, read once a process. Raises InputError as `load`."""
+    """Return the index of a file, which is read once per process. Raises InputError as `load`."""
     return load(path)

@@ -1,8 +1,9 @@
-"""Columns in one memory-mapped file with a version and a checksum.
+"""Table columns in one memory-mapped file with a version and a checksum.
 
-Layout: 8 bytes of magic that name the kind of table, uint32 version, uint32 CRC-32 of all that follows the
-header, uint32 length of a JSON table of contents; the contents; then the columns, each on a multiple of 64
-bytes, little-endian. The same columns make the same bytes.
+The file begins with a header: 8 bytes of magic that identify the kind of table, the version (uint32), the
+CRC-32 of everything after the header (uint32), and the length of the table of contents (uint32). The table of
+contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. The same columns give the
+same bytes.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ Facts = dict[str, float]
 _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
 _UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
-"""What contents raise that another program wrote under a right checksum."""
+"""Exceptions that invalid contents with a correct checksum may raise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of table.
+    """A kind of table file.
 
     Attributes:
-        magic: 8 bytes that a file of it begins with.
-        version: of its columns.
-        name: that a person knows it by.
-        cure: what to do when a file of it is of no use.
+        magic: first 8 bytes of the file.
+        version: version of the columns.
+        name: name in messages.
+        cure: advice in messages about a file that cannot be used.
     """
 
     magic: bytes
@@ -47,13 +48,13 @@ class Kind:
     cure: str
 
     def __post_init__(self) -> None:
-        """Raise ValueError when the magic is not of 8 bytes."""
+        """Raise ValueError unless the magic has 8 bytes."""
         if len(self.magic) != 8:
-            raise ValueError(f"magic {self.magic!r}: 8 bytes name a kind of table")
+            raise ValueError(f"magic {self.magic!r}: give 8 bytes")
 
 
 def save(path: Path, kind: Kind, columns: Columns, facts: Facts) -> None:
-    """Write columns and numbers to `path`, whole or not at all."""
+    """Write columns and numbers to `path` atomically: a partly written file is never left there."""
     little = {name: _little(column) for name, column in columns.items()}
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
@@ -65,34 +66,34 @@ def save(path: Path, kind: Kind, columns: Columns, facts: Facts) -> None:
     body = bytearray(table)
     for column in little.values():
         body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
-    # Two processes may make it at once: each its own, and the last one stays.
+    # Two processes may write at once: each writes a file of its own, and the last one replaces the other.
     temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
     temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
     temporary.replace(path)
 
 
 def load(path: Path, kind: Kind) -> tuple[Columns, Facts]:
-    """Return the columns, read-only and mapped, and the numbers.
+    """Return the columns, memory-mapped and read-only, and the numbers.
 
-    Raises InputError when the file is missing, damaged, of another kind or of another version.
+    Raises InputError if the file is missing, damaged, of another kind or of another version.
     """
     name, cure = kind.name, kind.cure
     try:
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        raise InputError(str(path), f"no {name} can be read here ({error}); {cure}") from error
+        raise InputError(str(path), f"the {name} cannot be read ({error}); {cure}") from error
     if len(mapped) < _HEADER.size or mapped[: len(kind.magic)] != kind.magic:
-        raise InputError(str(path), f"this is no {name}; {cure}")
+        raise InputError(str(path), f"the file is not a {name}; {cure}")
     _, version, checksum, length = _HEADER.unpack_from(mapped)
     if version != kind.version:
-        raise InputError(str(path), f"a {name} of version {version}, {kind.version} is wanted; {cure}")
+        raise InputError(str(path), f"the {name} has version {version} instead of {kind.version}; {cure}")
     if zlib.crc32(memoryview(mapped)[_HEADER.size :]) != checksum:
-        raise InputError(str(path), f"the {name} is damaged, its CRC-32 is wrong; {cure}")
+        raise InputError(str(path), f"the {name} is damaged: its CRC-32 is wrong; {cure}")
     try:
         return _columns(mapped, _HEADER.size + length)
     except _UNFIT as error:
-        raise InputError(str(path), f"the {name}'s contents cannot be read ({error}); {cure}") from error
+        raise InputError(str(path), f"the contents of the {name} cannot be read ({error}); {cure}") from error
 
 
 def _columns(mapped: mmap.mmap, begin: int) -> tuple[Columns, Facts]:
@@ -102,7 +103,7 @@ def _columns(mapped: mmap.mmap, begin: int) -> tuple[Columns, Facts]:
         for name, (kind, shape, offset) in contents["columns"].items()
     }
     if any(column.dtype.hasobject for column in columns.values()):
-        raise TypeError("a column is not of numbers")
+        raise TypeError("a column does not contain numbers")
     return columns, {str(name): float(fact) for name, fact in contents["facts"].items()}
 
 

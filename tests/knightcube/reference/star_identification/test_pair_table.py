@@ -152,7 +152,7 @@ def test_a_damaged_foreign_or_outdated_file_is_refused_with_its_name(
     with pytest.raises(InputError, match="CRC-32"):
         pair_table.load_pairs(path)
     path.write_bytes(b"\x00" * 100)
-    with pytest.raises(InputError, match="no pair table"):
+    with pytest.raises(InputError, match="the file is not a pair table"):
         pair_table.load_pairs(path)
     table_file.save(path, replace(pair_table.KIND, version=pair_table.KIND.version + 1), {}, {})
     with pytest.raises(InputError, match="version"):

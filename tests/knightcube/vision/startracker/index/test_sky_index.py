@@ -138,20 +138,20 @@ def test_a_flipped_bit_is_told_with_its_cure(stored: Path, tmp_path: Path, place
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "problem"),
     [
         (b"", "cannot|no sky index"),
-        (b"nonsense" * 20, "no sky index"),
+        (b"nonsense" * 20, "not a sky index"),
         (b"KCSKYIDX" + b"\x63" * 40, "version"),
     ],
     ids=["empty", "another-file", "another-version"],
 )
-def test_another_file_is_told_with_its_cure(tmp_path: Path, content: bytes, said: str) -> None:
+def test_another_file_is_refused_with_advice(tmp_path: Path, content: bytes, problem: str) -> None:
     path = tmp_path / "other.index"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=problem):
         load(path)
-    with pytest.raises(InputError, match="no sky index can be read"):
+    with pytest.raises(InputError, match="the sky index cannot be read"):
         load(tmp_path / "missing.index")
 
 
