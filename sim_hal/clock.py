@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from hal.buses.contained_job import ContainedJob
+from hal.buses.clock import ContainedJob
 from hal.interfaces.wires import Ticker
 
 

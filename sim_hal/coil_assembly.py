@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.schema.sections import Config
-from hal.drivers.coil_settings import CoilSettings, wirings
+from hal.drivers.h_bridge import CoilSettings, wirings
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685

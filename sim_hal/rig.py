@@ -14,10 +14,9 @@ from pathlib import Path
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
-from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS, Clock
+from hal.interfaces.guardian import CoilReach
+from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from sim_hal import lockstep

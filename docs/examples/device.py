@@ -1,6 +1,6 @@
 """A new device from end to end: a TMP102 thermometer on the I2C bus that the coils use.
 
-Run with `python docs/examples/device.py`. In the tree the four parts stand in `hal/interfaces/readings.py`
+Run with `python docs/examples/device.py`. In the tree the four parts stand in `hal/interfaces/devices.py`
 and `devices.py`, `hal/drivers/tmp102.py`, `sim_hal/emulators/tmp102.py` and `tests/hal/`.
 Source of registers and scale: TI SBOS397.
 """

@@ -19,19 +19,17 @@ from hal.buses.serial_port import PySerialPort
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
-from hal.drivers.coil_settings import CoilSettings, wirings
 from hal.drivers.coils import PwmTorqueCoils
+from hal.drivers.h_bridge import CoilSettings, wirings
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685, switch_off
-from hal.drivers.ublox.receiver import UbloxReceiver
-from hal.drivers.v4l2_camera import V4l2Camera
-from hal.drivers.v4l2_settings import Stamp, V4l2Settings
+from hal.drivers.ublox import UbloxReceiver
+from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
-from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError, OutOfRange
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS, Clock, Wires
+from hal.interfaces.guardian import CoilReach
+from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
 from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
 from knightcube.astro.quaternion import attitude_matrix
 

@@ -25,8 +25,7 @@ from flight.loop.state.keeper import service_folder
 from flight.schema import reader as configuration
 from flight.schema.document import read_text
 from flight.schema.sections import Config
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS, Clock
+from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.errors import UsageError
 
 _GRID_NS = 25_000_000

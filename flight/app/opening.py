@@ -28,13 +28,11 @@ from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.keeper import open_state
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
-from hal.buses import real_time
-from hal.buses.real_time import worker_cores
-from hal.buses.service_manager import ServiceManager
-from hal.drivers.coil_settings import DEVICE as COILS
+from hal.buses import linux_process
+from hal.buses.linux_process import ServiceManager, worker_cores
+from hal.drivers.h_bridge import DEVICE as COILS
 from hal.guardian.client import GuardianLine
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS, Clock
+from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.vision import kept_frames
 from knightcube.vision.startracker.index.build import ensure_default_index
 
@@ -59,8 +57,8 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
     first = [thread for thread in threading.enumerate() if thread.name == COILS]
-    obtained = real_time.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
-    stack.callback(real_time.relinquish)
+    obtained = linux_process.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
+    stack.callback(linux_process.relinquish)
     stack.callback(overseer.stopping)
     coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
 
@@ -88,7 +86,7 @@ def prioritise_other_threads() -> None:
     """
     for thread in threading.enumerate():
         if thread is not threading.main_thread() and thread.name != COILS:
-            real_time.prioritise(thread.native_id or 0, NEXT_PRIORITY)
+            linux_process.prioritise(thread.native_id or 0, NEXT_PRIORITY)
 
 
 def open_flight(

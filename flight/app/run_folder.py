@@ -13,8 +13,7 @@ from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.errors import UsageError
 
 

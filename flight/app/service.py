@@ -32,7 +32,7 @@ from flight.loop.state.keeper import service_folder
 from flight.loop.state.store import LinuxFiles, replace_file
 from flight.schema.errors import UnreadConfigError
 from hal.buses.clock import SystemClock
-from hal.buses.service_manager import ServiceManager
+from hal.buses.linux_process import ServiceManager
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flight.app.request import RunRequest
 from flight.schema.sections import Config
-from hal.interfaces.rig import Rig
+from hal.interfaces.wires import Rig
 from knightcube.astro.arrays import FloatArray
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from flight.loop.fdir.coil_watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned, learned_of
 from flight.schema.sections import Config
-from hal.interfaces.readings import CoilState, Frame, GpsReading, ImuReading, StringReading
+from hal.interfaces.devices import CoilState, Frame, GpsReading, ImuReading, StringReading
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge

@@ -12,7 +12,7 @@ from flight.link.telemetry.definitions import RUN
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.fdir.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Facts
 from flight.schema.sections import Config
-from hal.interfaces.readings import CoilState
+from hal.interfaces.devices import CoilState
 
 
 @dataclass(frozen=True, slots=True)

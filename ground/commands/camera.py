@@ -17,9 +17,8 @@ from flight.schema.carried import config_path
 from flight.schema.devices import Camera
 from ground.commands.options import finite
 from ground.truth import sky_truth, write_truth
-from hal.interfaces.devices import FrameSource
+from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError

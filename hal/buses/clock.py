@@ -1,4 +1,4 @@
-"""The real clock: absolute monotonic deadlines, and tickers on threads of their own."""
+"""The real clock: absolute monotonic deadlines, and periodic jobs on threads of their own."""
 
 from __future__ import annotations
 
@@ -7,10 +7,35 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from hal.buses.contained_job import ContainedJob
-
 if TYPE_CHECKING:  # at run time the Protocols would bring numpy in, which the guardian does without
     from hal.interfaces.wires import Ticker
+
+
+class ContainedJob:
+    """Runs a job; keeps an exception that escapes instead of raising it.
+
+    Attributes:
+        name: of the job.
+        error: the exception of the last run as text, empty when it completed.
+        served_ns: when a run last completed, or when this object was made.
+    """
+
+    def __init__(self, name: str, job: Callable[[], None], now_ns: Callable[[], int]) -> None:
+        self.name = name
+        self.error = ""
+        self.served_ns = now_ns()
+        self._job = job
+        self._now_ns = now_ns
+
+    def run(self) -> None:
+        """Run the job once. Never raises."""
+        try:
+            self._job()
+        except Exception as error:  # noqa: BLE001 - containment boundary: the ticker
+            self.error = f"{type(error).__name__}: {error}"
+        else:
+            self.error = ""
+            self.served_ns = self._now_ns()
 
 
 class SystemClock:

@@ -1,12 +1,17 @@
 """A Linux I2C bus through smbus2: one file descriptor, one lock, bounded waits.
 
-A call waits for the previous transaction and then at most for the adapter's own time-out, which is set here
-(ioctl I2C_TIMEOUT). The adapter does not retry by itself (I2C_RETRIES 0), so that drivers count each failure.
+A call waits for the previous transaction and then at most for the adapter's own timeout, which is set here
+(ioctl I2C_TIMEOUT). The adapter does not retry by itself (I2C_RETRIES 0), so that drivers count each
+failure.
+
+An advisory lock on the device file reserves the bus for one flight; the kernel releases it when the process
+ends. The guardian and `deploy/coils-off` take no lock, because they may switch the coils off at any time.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -16,8 +21,16 @@ from typing import TypeVar
 
 from smbus2 import I2cFunc, SMBus
 
-from hal.buses.exclusive import hold
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+
+
+def lock_bus(descriptor: int) -> None:
+    """Lock an open file until it is closed. Raises OSError (EUSERS) when another process holds the lock."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise OSError(errno.EUSERS, "another flight drives the coils on this bus") from error
+
 
 _Answer = TypeVar("_Answer")
 
@@ -122,7 +135,7 @@ class LinuxI2cBus:
             bus.open(self.name)
             if bus.fd is not None:
                 if self._exclusive:
-                    hold(bus.fd)
+                    lock_bus(bus.fd)
                 ioctl(bus.fd, I2C_TIMEOUT, self._timeout_units)
                 ioctl(bus.fd, I2C_RETRIES, 0)
         except OSError:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hal.interfaces.devices import StringReading
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
-from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import Clock, I2cBus
 
 CONVERSION, CONFIG = 0x00, 0x01

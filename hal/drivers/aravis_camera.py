@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from hal.drivers.camera import CameraCounts, FrameNumbers
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
 
 PIXEL_KINDS: dict[str, np.dtype[Any]] = {

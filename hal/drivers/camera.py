@@ -11,8 +11,8 @@ import threading
 from dataclasses import dataclass
 from typing import Protocol
 
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import DeviceError, NotResponding, Refused
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
 
 PERIOD_NS = 10_000_000

@@ -1,15 +1,124 @@
-"""A torque coil on two inputs of an SN754410: current to PWM counts and back (Sease 2013, Table 5.2, 5.33).
+"""Torque coils on the SN754410's H-bridges: wiring, settings, and the PWM count of a current.
 
-A signed count gives direction and duty: +n drives input A for n/4096 of the period with input B low, -n the
-reverse, 0 keeps both low. The coil's L/R of 0.1 ms is far below the 20 ms period, so the mean current over a
-period follows from the mean voltage: n/4096 V/R.
+A coil is connected to two inputs of the bridge (Sease 2013, Table 5.2, eq. 5.33). The sign of a count gives
+the direction and its magnitude the duty: +n drives input A for n/4096 of the period with input B low, -n
+drives input B, and 0 keeps both inputs low. The coil's L/R of 0.1 ms is far below the PWM period of 20 ms,
+so the mean current over a period follows from the mean voltage: n/4096 V/R.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-from hal.drivers.pca9685 import COUNTS, FULL_OFF, FULL_ON, PwmCounts
+from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS, COUNTS, FULL_OFF, FULL_ON, PwmCounts
+from hal.interfaces.errors import OutOfRange
+
+DEVICE = "coils"
+
+
+@dataclass(frozen=True, slots=True)
+class CoilWiring:
+    """Wiring of one coil to the PWM chip, as measured.
+
+    Attributes:
+        channel_a: PWM channel of bridge input A, high for a positive current.
+        channel_b: PWM channel of input B.
+        resistance: ohm, of the coil.
+        sign: +1, or -1 for a coil with its leads swapped.
+        enable_channel: PWM channel of the bridge's enable input, None when it is tied high.
+    """
+
+    channel_a: int
+    channel_b: int
+    resistance: float
+    sign: int = 1
+    enable_channel: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.resistance < math.inf:
+            raise OutOfRange(DEVICE, "coil resistance", self.resistance, 0.0, math.inf, "ohm")
+        if self.sign not in {1, -1}:
+            raise OutOfRange(DEVICE, "coil sign", self.sign, -1, 1, "(-1 or +1)")
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """The PWM channels in use: A, B and, when wired, enable."""
+        enable = () if self.enable_channel is None else (self.enable_channel,)
+        return (self.channel_a, self.channel_b, *enable)
+
+
+Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
+
+
+def wirings(
+    channels: Sequence[tuple[int, int]],
+    resistance: Sequence[float],
+    signs: Sequence[int],
+    enable_channels: Sequence[int] | None,
+) -> Wirings:
+    """Return the wiring of the three coils from three values of each kind. Raises OutOfRange."""
+    enables = enable_channels or (None, None, None)
+    x, y, z = (
+        CoilWiring(a, b, ohm, sign, enable)
+        for (a, b), ohm, sign, enable in zip(channels, resistance, signs, enables, strict=True)
+    )
+    return x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class CoilSettings:
+    """Wiring and drive of the three coils.
+
+    Attributes:
+        coils: wiring of the coils on body x, y, z.
+        supply_voltage: V across a coil that is fully on, after the losses of the bridge.
+        current_limit: A, of each coil; V/R is a limit too.
+        stale_after: s without a command until the coils go to zero; at most 0.4, so that they are at zero
+            within 0.5.
+        tries: attempts of one write before it counts as failed.
+        retry_wait: s between them.
+    """
+
+    coils: Wirings
+    supply_voltage: float
+    current_limit: float
+    stale_after: float
+    tries: int = 3
+    retry_wait: float = 0.002
+
+    def __post_init__(self) -> None:
+        for quantity, value, low, high, unit in (
+            ("number of coils", len(self.coils), 3, 3, ""),
+            ("supply voltage", self.supply_voltage, 0.1, 36.0, "V"),
+            ("current limit", self.current_limit, 1e-3, 1.0, "A"),
+            ("stale_after", self.stale_after, 0.05, 0.4, "s"),
+            ("tries", self.tries, 1, 5, ""),
+            ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
+        ):
+            # Written so that NaN is rejected too.
+            if not low <= value <= high:
+                raise OutOfRange(DEVICE, quantity, value, low, high, unit)
+        used = [channel for coil in self.coils for channel in coil.channels]
+        for channel in used:
+            if not 0 <= channel < CHANNELS or used.count(channel) > 1:
+                raise OutOfRange(DEVICE, "PWM channel (each once)", channel, 0, CHANNELS - 1, "")
+
+    def blocks(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
+        """Return the pins grouped into blocks of neighbouring channels: (first channel, pins).
+
+        Pins are numbered coil by coil, in the order of `CoilWiring.channels`; a block is one transaction.
+        """
+        channels = [channel for coil in self.coils for channel in coil.channels]
+        blocks: list[tuple[int, tuple[int, ...]]] = []
+        for pin in sorted(range(len(channels)), key=channels.__getitem__):
+            first, pins = blocks[-1] if blocks else (-1, ())
+            if pins and channels[pin] == first + len(pins) and len(pins) < BLOCK_CHANNELS:
+                blocks[-1] = (first, (*pins, pin))
+            else:
+                blocks.append((channels[pin], (pin,)))
+        return tuple(blocks)
 
 
 def current_step(resistance: float, supply_voltage: float) -> float:

@@ -12,8 +12,8 @@ import math
 import threading
 from collections import deque
 
+from hal.interfaces.devices import PowerReading
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
-from hal.interfaces.readings import PowerReading
 from hal.interfaces.wires import Clock, I2cBus
 
 CONFIG, SHUNT, BUS, POWER = 0x00, 0x01, 0x02, 0x03

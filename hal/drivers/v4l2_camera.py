@@ -1,23 +1,234 @@
-"""A monochrome camera of Video for Linux: USB (UVC) or a board's own, free-running, with manual exposure.
+"""A monochrome camera of Video for Linux (USB or a board's own), free-running, with manual exposure.
 
-Such a camera has no trigger: it exposes frame after frame, and the kernel stamps each on the monotonic clock.
-A trigger here selects the first whole exposure that began after it; all other frames are returned unread.
+Such a camera has no trigger: it exposes frame after frame, and the kernel stamps each frame on the monotonic
+clock. `trigger` selects the first frame whose whole exposure lies after the call; all other frames are
+returned unread.
+
+The driver's flag states whether a time stamp is that of the start of exposure (SOE) or of the frame's end.
+The kernel's uvcvideo always flags SOE, but unless its parameter `hwtimestamps` is set it stamps the arrival
+of the frame's first packet (uvc_video_decode_start), after the exposure has ended; `Stamp` accounts for
+that.
 """
 
 from __future__ import annotations
 
 import errno
+import os
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
 
-from hal.buses import videodev2
-from hal.buses.v4l2 import ControlRange, Filled, Layout, VideoDevice
-from hal.buses.videodev2 import EXPOSURE_UNIT_NS
+import numpy as np
+
+from hal.buses import v4l2
+from hal.buses.v4l2 import EXPOSURE_UNIT_NS, ControlRange, Filled, Layout, VideoDevice
 from hal.drivers.camera import CameraCounts, FrameNumbers
-from hal.drivers.v4l2_set_up import identity, manual_exposures, meaning, open_device, set_format, set_gain
-from hal.drivers.v4l2_settings import V4l2Settings
-from hal.drivers.v4l2_timing import ExposureTiming
-from hal.interfaces.errors import NotResponding, OutOfRange
-from hal.interfaces.readings import Frame
+from hal.interfaces.devices import Frame
+from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock
+
+PIXEL_KINDS: dict[str, np.dtype[Any]] = {
+    "GREY": np.dtype("u1"),
+    "Y10": np.dtype("<u2"),
+    "Y12": np.dtype("<u2"),
+    "Y16": np.dtype("<u2"),
+}
+"""V4L2's grey pixel formats, "Luma-Only Formats": those of 10 and 12 bits use the low bits of 16."""
+
+
+class Stamp(Enum):
+    """The instant of the kernel's stamp: as the driver flags it, or start or end of exposure regardless."""
+
+    TOLD = "told"
+    START = "start"
+    END = "end"
+
+
+@dataclass(frozen=True, slots=True)
+class V4l2Settings:
+    """Settings of a V4L2 camera.
+
+    Attributes:
+        path: of its device, such as /dev/knightcube-camera.
+        columns, rows: of the image.
+        pixel_format: a key of PIXEL_KINDS.
+        exposure_ns: the usual exposure; the interval between frames is set to it.
+        gain: in the camera's own steps, None to leave it unchanged.
+        stamp: the instant of the stamps.
+        stamp_delay_ns: from that instant to the stamp.
+        settling: frames that may still have the old exposure after it was changed.
+        buffers: how many frames the kernel may hold.
+    """
+
+    path: str
+    columns: int
+    rows: int
+    pixel_format: str
+    exposure_ns: int
+    gain: int | None
+    stamp: Stamp
+    stamp_delay_ns: int
+    settling: int = 2
+    buffers: int = 4
+
+    @property
+    def kind(self) -> np.dtype[Any]:
+        """The type of a pixel."""
+        return PIXEL_KINDS[self.pixel_format]
+
+
+UVC_STAMPS = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
+
+# A stamp may be ahead of the clock by its rounding and by the fit of a camera's clock to the host's.
+_STAMP_AHEAD_NS = 10_000_000
+# Of the exposure: a shorter interval between frames contradicts the exposure.
+_INTERVAL_SLACK = 0.05
+_CONTRADICTIONS = 3
+
+
+class ExposureTiming:
+    """Derives the start of each exposure; detects a camera that exposes for less time than it claims."""
+
+    def __init__(self, settings: V4l2Settings, clock: Clock, counts: CameraCounts) -> None:
+        """Use the camera's settings and clock; contradictory frames are added to `counts`."""
+        self._name = settings.path
+        self._settings = settings
+        self._clock = clock
+        self._counts = counts
+        self._arrival_stamps = False
+        self._contradictions = 0
+
+    def begin(self, driver: str) -> None:
+        """Begin with a camera of this kernel driver."""
+        self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
+        self._contradictions = 0
+
+    def start_of(self, filled: Filled, exposure_ns: int) -> int:
+        """Return when a frame's exposure began. Raises CorruptData for a stamp of another clock."""
+        if filled.flags & v4l2.STAMP_MASK != v4l2.STAMP_MONOTONIC:
+            raise CorruptData(self._name, "stamps its frames by another clock than the monotonic one")
+        ahead_ns = filled.stamp_ns - self._clock.now_ns()
+        if ahead_ns > _STAMP_AHEAD_NS:
+            raise CorruptData(
+                self._name,
+                f"a frame is stamped {ahead_ns * 1e-9:.3f} s ahead of the monotonic clock: "
+                "has uvcvideo been loaded with clock=CLOCK_REALTIME?",
+            )
+        flagged_start = filled.flags & v4l2.STAMP_SOURCE_MASK == v4l2.STAMP_START_OF_EXPOSURE
+        stamp = self._settings.stamp
+        at_start = stamp is Stamp.START or (
+            stamp is Stamp.TOLD and flagged_start and not self._arrival_stamps
+        )
+        start_ns = filled.stamp_ns - self._settings.stamp_delay_ns
+        return start_ns if at_start else start_ns - exposure_ns
+
+    def contradicts(self, interval_ns: int, exposure_ns: int) -> bool:
+        """Return whether a frame followed the previous one sooner than its exposure takes.
+
+        A rate is the streak's length over the exposure: a camera that exposes for less time than it claims
+        makes every rate wrong. One such frame may have a late stamp; several in a row raise Refused.
+        """
+        if interval_ns >= exposure_ns * (1.0 - _INTERVAL_SLACK):
+            self._contradictions = 0
+            return False
+        self._counts.contradictory += 1
+        self._contradictions += 1
+        if self._contradictions >= _CONTRADICTIONS:
+            raise Refused(
+                self._name,
+                f"frames come every {interval_ns * 1e-6:.1f} ms, so none is exposed for the "
+                f"{exposure_ns * 1e-6:.1f} ms that the camera claims: ask for a shorter exposure",
+            )
+        return True
+
+
+def _uvc_uses_device_clock() -> bool:
+    try:
+        return UVC_STAMPS.read_text(encoding="ascii").strip() not in {"0", "N"}
+    except OSError:
+        return False  # the kernel's default
+
+
+def open_device(name: str) -> VideoDevice:
+    """Return the open device. Raises NotResponding or Refused, with the cure."""
+    try:
+        return VideoDevice(name)
+    except FileNotFoundError as error:
+        raise NotResponding(
+            name,
+            "no such camera: is it plugged in, and does a udev rule give it this name "
+            "(deploy/99-knightcube.rules)? `v4l2-ctl --list-devices` lists what there is",
+        ) from error
+    except PermissionError as error:
+        raise Refused(name, "no permission: add the user to the group video") from error
+    except OSError as error:
+        raise meaning(name, error, "opening it") from error
+
+
+def meaning(name: str, error: OSError, doing: str) -> DeviceError:
+    """Return the device error that an errno of the kernel means."""
+    if error.errno in {errno.ENODEV, errno.ENXIO}:
+        return NotResponding(name, f"gone while {doing}: was it unplugged?")
+    if error.errno == errno.EBUSY:
+        return Refused(name, f"busy while {doing}: another program has the camera")
+    if error.errno == errno.ENOTTY:
+        return Refused(name, f"is no V4L2 device (found {doing})")
+    return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
+
+
+def identity(name: str, device: VideoDevice) -> tuple[str, str]:
+    """Return the names of driver and card. Raises Refused when this node delivers no video."""
+    driver, card, can = device.capability()
+    if not (can & v4l2.CAP_VIDEO_CAPTURE and can & v4l2.CAP_STREAMING):
+        raise Refused(name, f"{card} ({driver}) delivers no video here: give its capture node")
+    return driver, card
+
+
+def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> Layout:
+    """Set the image format; raises Refused or CorruptData when the camera has no such format."""
+    name = settings.path
+    layout = device.set_format(settings.columns, settings.rows, settings.pixel_format)
+    if layout.fourcc != settings.pixel_format:
+        offered = ", ".join(device.formats()) or "none"
+        raise Refused(name, f"{card} has no pixel format {settings.pixel_format}; it offers {offered}")
+    if (layout.columns, layout.rows) != (settings.columns, settings.rows):
+        raise Refused(
+            name,
+            f"{card} gives {layout.columns} x {layout.rows} pixels, not {settings.columns} x "
+            f"{settings.rows}: `v4l2-ctl --list-formats-ext` lists its sizes",
+        )
+    if layout.stride < layout.columns * settings.kind.itemsize:
+        raise CorruptData(name, f"{card} claims rows of {layout.stride} bytes for {layout.columns} pixels")
+    return layout
+
+
+def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
+    """Set the gain and switch its automatic control off. Raises Refused or OutOfRange."""
+    if device.control_range(v4l2.AUTO_GAIN) is not None:
+        device.set_control(v4l2.AUTO_GAIN, 0)
+    gain = settings.gain
+    if gain is None:
+        return
+    for control in (v4l2.GAIN, v4l2.ANALOGUE_GAIN):
+        known = device.control_range(control)
+        if known is not None:
+            if not known.minimum <= gain <= known.maximum:
+                raise OutOfRange(settings.path, "gain", gain, known.minimum, known.maximum, "")
+            device.set_control(control, gain)
+            return
+    raise Refused(settings.path, "has no gain to set: leave `gain` out")
+
+
+def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:
+    """Switch automatic exposure off; return the range of exposures. Raises Refused without one."""
+    exposures = device.control_range(v4l2.EXPOSURE_ABSOLUTE)
+    if exposures is None:
+        raise Refused(name, f"{card} has no exposure to be set in units of time (exposure_absolute)")
+    if device.control_range(v4l2.EXPOSURE_AUTO) is not None:
+        device.set_control(v4l2.EXPOSURE_AUTO, v4l2.EXPOSURE_MANUAL)
+    return exposures
+
 
 _SEQUENCE_MODULUS = 1 << 32
 _EXPOSURE_LIMIT = (1 << 31) - 1
@@ -133,7 +344,7 @@ class V4l2Camera:
         steps = round(exposure_ns / EXPOSURE_UNIT_NS)
         if steps == self._asked_steps:
             return
-        actual = device.set_control(videodev2.EXPOSURE_ABSOLUTE, steps)
+        actual = device.set_control(v4l2.EXPOSURE_ABSOLUTE, steps)
         self._exposure_ns = actual * EXPOSURE_UNIT_NS
         self._asked_steps = steps
         self._changed_ns = self._clock.now_ns()
@@ -146,7 +357,7 @@ class V4l2Camera:
         if before is not None:
             self.counts.missed += max(0, number - before[0] - 1)
         layout = self._layout
-        if filled.flags & videodev2.FLAG_ERROR:
+        if filled.flags & v4l2.FLAG_ERROR:
             self.counts.spoiled += 1
             return None
         if filled.used_bytes < layout.stride * (layout.rows - 1) + layout.columns * self._kind.itemsize:

@@ -7,54 +7,27 @@ once the flight has begun: a heartbeat is one byte that is written or dropped.
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import socket
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
-from hal.guardian import line
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.guardian import GuardianNews
+from hal.interfaces.guardian import ACTED, BEAT, BYE, FAILED, READY, CoilReach, GuardianNews
 
 DEVICE = "guardian"
-NOTE = "coils"
 _ROOT = Path(__file__).resolve().parents[2]
 _QUEUE_BYTES = 16384  # about a second of heartbeats, each with the kernel's bookkeeping
 _RETRY_NS = 1_000_000_000
 _END_TIMEOUT_S = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class CoilReach:
-    """How a process without numpy accesses the coils' PWM chip.
-
-    `opener` names the function that opens the bus as `module:function`, `where` is its argument.
-    """
-
-    opener: str
-    where: str
-    address: int
-
-    def note(self, folder: Path) -> None:
-        """Write bus and address durably to a file in a folder, for `deploy/coils-off`. Never raises."""
-        beside = folder / f"{NOTE}.part"
-        with contextlib.suppress(OSError):
-            with beside.open("wb") as note:
-                note.write(f"{self.where} 0x{self.address:02x}\n".encode())
-                note.flush()
-                os.fsync(note.fileno())
-            beside.replace(folder / NOTE)
-            names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            try:
-                os.fsync(names)
-            finally:
-                os.close(names)
-
-
-_NEWS = {line.READY: GuardianNews.READY, line.ACTED: GuardianNews.ACTED, line.FAILED: GuardianNews.FAILED}
+_NEWS = {
+    READY: GuardianNews.READY,
+    ACTED: GuardianNews.ACTED,
+    FAILED: GuardianNews.FAILED,
+}
 
 
 class GuardianLine:
@@ -79,25 +52,27 @@ class GuardianLine:
         Raises NotResponding when that takes more than `patience` s, except where the flight is `patient` and
         waits for its coils as well: the guardian then keeps trying and reports when it succeeds.
         """
-        heard = b""
+        received = b""
         if select.select([self._line], [], [], patience)[0]:
             with contextlib.suppress(OSError):
-                heard = self._line.recv(1)
-        if heard != line.READY and not patient:
-            raise NotResponding(DEVICE, "it does not reach the coils' PWM chip, see above: nothing is flown")
+                received = self._line.recv(1)
+        if received != READY and not patient:
+            raise NotResponding(
+                DEVICE, "it cannot reach the coils' PWM chip, see above: the flight does not start"
+            )
 
     def beat(self) -> None:
         """Report that a control cycle succeeded. Never waits, never raises."""
         if self._lost:
             return
         try:
-            self._line.send(line.BEAT, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            self._line.send(BEAT, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except OSError:  # it died; or, BlockingIOError, it has not read for a second
             self._lost = True
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
         """Replace a lost guardian; return what happened since the last call."""
-        news = self._hear()
+        news = self._receive()
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
@@ -112,14 +87,14 @@ class GuardianLine:
     def close(self) -> None:
         """End the guardian, the coils being off; it zeroes them once more. Safe to call twice."""
         try:
-            self._line.send(line.BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            self._line.send(BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
             self._process.wait(_END_TIMEOUT_S)
         except (OSError, subprocess.TimeoutExpired):
             self._process.kill()
             self._process.wait()
         self._line.close()
 
-    def _hear(self) -> list[GuardianNews]:
+    def _receive(self) -> list[GuardianNews]:
         try:
             words = self._line.recv(256, socket.MSG_DONTWAIT)
         except BlockingIOError:

@@ -1,6 +1,6 @@
-"""All that the flight application uses of the hardware: readings, commands, Protocols, errors.
+"""The hardware interface of the flight application: Protocols, readings, errors.
 
-`readings` are the values from devices, `devices` the Protocols of the devices, `wires` the Protocols of the
-buses below the drivers (hal and sim_hal both implement them), `guardian` those of the processes that watch
-the flight from outside.
+`devices` holds the Protocols of the devices and their readings, `wires` the Protocols of the buses below the
+drivers (hal and sim_hal implement them), `guardian` the Protocols of the processes that watch the flight,
+`errors` the exceptions.
 """

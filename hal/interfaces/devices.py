@@ -1,20 +1,169 @@
-"""Protocols of the devices that the flight application uses."""
+"""Protocols of the devices that the flight application uses, and their readings.
+
+Times are integer nanoseconds of the injected clock (`hal.interfaces.wires.Clock`), so a grid of 25 ms stays
+exact for years. Arrays are float64 and must be treated as read-only.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
-from hal.interfaces.readings import (
-    CoilState,
-    FloatArray,
-    Frame,
-    GpsLink,
-    GpsReading,
-    ImuLink,
-    ImuReading,
-    PowerReading,
-    StringReading,
-)
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReading:
+    """One sample of the inertial unit, in the body frame and the mission's reference frame.
+
+    Attributes:
+        time_ns: host clock at the instant of the sample (arrival less the time on the wire).
+        arrival_ns: host clock when the last byte of the packet was received.
+        device_time_ns: the unit's own clock, since its start-up.
+        quaternion: (4,) scalar last, reference frame into body.
+        rate: (3,) rad/s, body with respect to inertial, body axes.
+        field: (3,) tesla, body axes.
+        acceleration: (3,) m/s^2, specific force, body axes.
+    """
+
+    time_ns: int
+    arrival_ns: int
+    device_time_ns: int
+    quaternion: FloatArray
+    rate: FloatArray
+    field: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ImuLink:
+    """Counters of the inertial unit's line since start; they only grow, so differences give rates.
+
+    On a silent line `last_byte_ns` does not change; on a corrupt one bytes arrive without packets.
+    `last_byte_ns` and `last_packet_ns` are -1 before the first.
+    """
+
+    bytes_received: int
+    packets: int
+    bad_checksum: int
+    discarded_bytes: int
+    out_of_range: int
+    not_finite: int
+    last_byte_ns: int
+    last_packet_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class GpsReading:
+    """One epoch of a GPS receiver.
+
+    Attributes:
+        time_ns: host clock when the receiver began to send; the epoch itself is up to 0.2 s older.
+        arrival_ns: host clock when the last byte was received.
+        utc_ns: UTC of the epoch, ns since 1970; 0 where the receiver does not know the time.
+        position: (3,) m, ITRS. velocity: (3,) m/s with respect to the ground, ITRS.
+        sigma: m, of each axis, as the receiver claims. velocity_sigma: m/s.
+        satellites: in use.
+        valid: whether the receiver vouches for time and place.
+    """
+
+    time_ns: int
+    arrival_ns: int
+    utc_ns: int
+    position: FloatArray
+    velocity: FloatArray
+    sigma: float
+    velocity_sigma: float
+    satellites: int
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GpsLink:
+    """Counters of the receiver's line since start; they only grow. Times are -1 before the first.
+
+    `refused` counts commands that the receiver did not take, `out_of_range` impossible epochs.
+    """
+
+    bytes_received: int
+    frames: int
+    bad_checksum: int
+    discarded_bytes: int
+    out_of_range: int
+    refused: int
+    last_byte_ns: int
+    last_fix_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class StringReading:
+    """Currents (n,) A of the solar strings at `time_ns` of the host clock."""
+
+    time_ns: int
+    currents: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One image: `pixels` is (rows, columns), uint8 or uint16; times are of the host clock.
+
+    The exposure lasts `exposure_ns` from `exposure_start_ns`; `sequence` is the camera's own count, which
+    reveals a frozen camera.
+    """
+
+    sequence: int
+    exposure_start_ns: int
+    exposure_ns: int
+    arrival_ns: int
+    pixels: npt.NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class PowerReading:
+    """A measurement of bus voltage (V), total current of the coils (A) and power (W).
+
+    The values are means over about a second; `newest` (A) is the current of the last conversion alone, whose
+    window lies between `newest_since_ns` and `time_ns`. `clipped`: a conversion was beyond the monitor's
+    range, so the currents are at least these.
+    """
+
+    time_ns: int
+    voltage: float
+    current: float
+    power: float
+    newest: float
+    newest_since_ns: int
+    clipped: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class CoilState:
+    """The coil driver's last command and last acknowledged output.
+
+    Attributes:
+        command: (3,) A, as requested, finite.
+        current: (3,) A, as written, after limiting and rounding to PWM counts; zeros when off.
+        written_ns: host clock since when that current is on the wire, -1 before the first.
+        saturated: whether any axis was limited.
+        command_ns: host clock of the newest command, -1 before the first.
+        stale: the command was too old, so the driver brought the coils to zero.
+        faults: failed transactions since start.
+        error: the text of the last failure while it lasts, empty when the last transaction succeeded.
+        braked: (3,) bridges with both inputs high, so that a leg stuck high drives no current.
+    """
+
+    command: FloatArray
+    current: FloatArray
+    written_ns: int
+    saturated: bool
+    command_ns: int
+    stale: bool
+    faults: int
+    error: str
+    braked: tuple[bool, bool, bool] = (False, False, False)
 
 
 class InertialUnit(Protocol):

@@ -1,15 +1,18 @@
-"""Protocols at the wire: clock, serial port, I2C bus. hal implements them on Linux, sim_hal with emulators.
+"""Protocols at the wire: clock, serial port, I2C bus, and the rig that holds them.
 
-Flight and simulation differ here and nowhere above, so every simulated run exercises the flight drivers.
+hal implements these Protocols on Linux, sim_hal with emulated devices. Flight and simulation differ only
+below these Protocols, so every simulated run exercises the flight drivers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 from hal.interfaces.devices import FrameSource
+from hal.interfaces.guardian import CoilReach
 
 SECOND_NS = 1_000_000_000
 
@@ -123,3 +126,37 @@ class Wires:
     frames: FrameSource | None
     gps: SerialPort | None = None
     wide: tuple[FrameSource, ...] = ()
+
+
+class HostFaults(Protocol):
+    """Simulated faults inside the flight process itself: its workers and its disk."""
+
+    def workers(self, specs: Sequence[Any]) -> list[Any]:
+        """Return the worker specifications with functions that may fail."""
+
+    def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
+        """Return a job runner before `runner` that may fail; `result` makes a job's result."""
+
+    def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
+        """Return an opener of files on a disk that may fail."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A clock, the wires, and what else depends on the kind of hardware.
+
+    Attributes:
+        release: is called with mission time zero.
+        latency: of planner and vision in ns, in lock-step only.
+        reach: how a guardian zeroes the coils, in real time only.
+        host: faults inside this process, where a simulation asks for them.
+    """
+
+    clock: Clock
+    wires: Wires
+    release: Callable[[int], None]
+    realtime: bool
+    seed: int
+    latency: tuple[int, int] = (0, 0)
+    reach: CoilReach | None = None
+    host: HostFaults | None = None

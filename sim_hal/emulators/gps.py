@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from hal.drivers.ublox.codec import (
+from hal.drivers.ublox import (
     ACK_ACK,
     ACK_NAK,
     CFG_MSG,

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import Frame
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import multiply
 from sim_hal.emulators.device import NEVER

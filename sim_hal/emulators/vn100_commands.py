@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hal.drivers.vn100.ascii import Checksum, Sentence, build, parse
+from hal.drivers.vn100.protocol import Checksum, Sentence, build, parse
 from sim_hal.emulators.device import SerialEnd
 from sim_hal.emulators.vn100_attitude import ATTITUDE_COMMANDS, AttitudeCommands, flag
 from sim_hal.emulators.vn100_outputs import REPORT_BY_REGISTER, Instant

@@ -85,7 +85,7 @@ def _in_ned(vector: FloatArray, now: Instant) -> Values:
     return tuple((now.measured.matrix.T @ vector).tolist())
 
 
-# By (group bit, field bit), the numbers of `hal.drivers.vn100.codec.FIELDS`.
+# By (group bit, field bit), the numbers of `hal.drivers.vn100.protocol.FIELDS`.
 FIELD_VALUES: Mapping[tuple[int, int], Callable[[Instant], Values]] = {
     (0, 0): _time,
     (0, 2): _zero,

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from hal.drivers.vn100.codec import Layout, layout_of
+from hal.drivers.vn100.protocol import Layout, layout_of
 
 Rule = Callable[[str], str]
 """Returns the text as the unit stores it; raises ValueError for an invalid text."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from hal.drivers.vn100.ascii import Checksum, build
+from hal.drivers.vn100.protocol import Checksum, build
 from sim_hal.emulators.vn100_outputs import FIELD_VALUES, REPORT_BY_TYPE, Instant, Report, report_length
 from sim_hal.emulators.vn100_registers import (
     BINARY_OUTPUTS,

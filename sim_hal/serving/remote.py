@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from hal.buses.clock import SystemClock
-from hal.buses.exclusive import hold
+from hal.buses.i2c_bus import lock_bus
 from hal.buses.serial_port import PySerialPort
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Wires
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Link, RemoteI2cBus
@@ -139,7 +139,7 @@ def running(facts_path: Path) -> Iterator[Served]:
             problem = f"{facts_path} names no server: give what `sim_hal serve --facts` wrote"
             raise UsageError(problem) from error
         try:
-            hold(file.fileno())
+            lock_bus(file.fileno())
         except OSError as error:
             raise NotResponding(str(facts_path), error.strerror or "is locked") from error
         yield stack.enter_context(_connected(facts))

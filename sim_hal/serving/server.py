@@ -24,8 +24,8 @@ from flight.link.telemetry.log import FlightLog
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import Frame
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
 from sim_hal.emulators.pty_line import PtyLine

@@ -12,7 +12,7 @@ from enum import Enum
 
 import numpy as np
 
-from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.h_bridge import CoilSettings, CoilWiring
 from hal.drivers.pca9685 import COUNTS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685

@@ -14,7 +14,7 @@ import pytest
 
 from hal.buses import smbus_byte
 from hal.drivers.pca9685 import ALL_LED_OFF_H, AUTO_INCREMENT, CHANNELS, FULL, LED0_ON_L, MODE1
-from hal.guardian.client import CoilReach
+from hal.interfaces.guardian import CoilReach
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.serving.i2c_server import I2cServer
@@ -220,7 +220,7 @@ def test_the_note_is_on_the_disk_before_it_has_its_name(
         done.append("name")
         return real_replace(path, target)
 
-    monkeypatch.setattr("hal.guardian.client.os.fsync", sync)
+    monkeypatch.setattr("hal.interfaces.guardian.os.fsync", sync)
     monkeypatch.setattr(Path, "replace", replace)
     CoilReach("hal.buses.smbus_byte:open_bus", "/dev/knightcube-i2c", 0x42).note(tmp_path)
     assert done == ["note", "name", "folder"]

@@ -17,8 +17,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry.reader import Run, read_run
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.wires import SECOND_NS, Rig
 from sim_hal import lockstep
 from sim_hal.lockstep import LockStep
 from sim_hal.rig import with_host_faults

@@ -11,7 +11,7 @@ import pytest
 from flight.app.devices import open_devices
 from flight.link.modes import Mode
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.rig import Rig
+from hal.interfaces.wires import Rig
 from sim_hal import lockstep
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.lockstep import LockStep

@@ -28,8 +28,8 @@ from flight.schema.peers import peer_networks
 from flight.schema.reader import parse
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
+from hal.buses.linux_process import ServiceManager
 from hal.buses.serial_port import PySerialPort
-from hal.buses.service_manager import ServiceManager
 from knightcube.errors import FlightError, UsageError
 
 _NICE = 10

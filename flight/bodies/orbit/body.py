@@ -36,7 +36,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.orbit_devices import SolarStrings as StringsSection
 from flight.schema.sections import Config
-from hal.interfaces.readings import GpsReading, StringReading
+from hal.interfaces.devices import GpsReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements

@@ -22,7 +22,7 @@ from flight.bodies.orbit.guidance import PathPoint
 from flight.link import events
 from flight.loop.body import CoilCommand
 from flight.loop.fdir.facts import EventLog
-from hal.interfaces.readings import StringReading
+from hal.interfaces.devices import StringReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.field_ahead import FieldAhead
 from knightcube.astro.quaternion import attitude_matrix

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from hal.interfaces.readings import GpsReading
+from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures, pressures

@@ -23,7 +23,7 @@ import numpy as np
 from flight.bodies.orbit.filter_steps import DipoleHistory, OpenStep, OrbitFilterSettings, StepReplay
 from flight.loop.body import ReadingAgreement
 from flight.loop.state.content import Learned
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.directions import cross_product

@@ -35,7 +35,7 @@ from flight.loop.state.content import Learned, start_from
 from flight.schema.devices import InertialUnit
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix

@@ -54,7 +54,7 @@ from flight.loop.fdir.supply_current import (
     fits,
     predict,
 )
-from hal.interfaces.readings import CoilState, PowerReading
+from hal.interfaces.devices import CoilState, PowerReading
 from knightcube.astro.arrays import FloatArray
 
 

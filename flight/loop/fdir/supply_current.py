@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 
 from flight.loop.fdir.stuck_leg import NONE, Axes, Supplied
-from hal.interfaces.readings import PowerReading
+from hal.interfaces.devices import PowerReading
 from knightcube.astro.arrays import FloatArray
 
 

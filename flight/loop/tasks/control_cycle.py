@@ -23,7 +23,7 @@ from flight.loop.tasks.mode_control import ModeControl
 from flight.loop.tasks.navigation import Navigation, Positioning, SunSensing
 from flight.loop.tasks.steering import CoilDrive, Steering
 from flight.loop.tasks.wide_imaging import WideImaging
-from hal.interfaces.readings import CoilState, ImuReading
+from hal.interfaces.devices import CoilState, ImuReading
 from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate
 
 ATTITUDE_EVERY = 4

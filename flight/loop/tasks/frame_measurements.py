@@ -13,7 +13,7 @@ from flight.link.telemetry.definitions import STARS, STREAK
 from flight.loop.body import BodyView
 from flight.loop.services import Services
 from flight.loop.tasks.navigation import Navigation
-from hal.interfaces.readings import Frame
+from hal.interfaces.devices import Frame
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector

@@ -28,8 +28,7 @@ from flight.loop.tasks.mode_control import ModeControl
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.steering import CoilDrive
 from flight.schema.sections import Health
-from hal.interfaces.devices import PowerMonitor, TorqueCoils
-from hal.interfaces.readings import CoilState
+from hal.interfaces.devices import CoilState, PowerMonitor, TorqueCoils
 from hal.interfaces.wires import Ticker
 
 CONTROL = "control"

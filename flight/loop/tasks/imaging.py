@@ -28,9 +28,8 @@ from flight.loop.tasks.frame_measurements import (
     middle_ns,
 )
 from flight.loop.tasks.navigation import Navigation
-from hal.interfaces.devices import FrameSource
+from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import Frame
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement

@@ -16,9 +16,17 @@ from flight.loop.body import BodyEstimation
 from flight.loop.fdir import facts
 from flight.loop.fdir.coil_watch import CurrentValidity
 from flight.loop.services import Services
-from hal.interfaces.devices import GpsReceiver, InertialUnit, SolarStrings
+from hal.interfaces.devices import (
+    CoilState,
+    GpsReading,
+    GpsReceiver,
+    ImuLink,
+    ImuReading,
+    InertialUnit,
+    SolarStrings,
+    StringReading,
+)
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import CoilState, GpsReading, ImuLink, ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.gnc.estimation.estimate import Estimate

@@ -21,8 +21,7 @@ from flight.loop.fdir.coil_watch import CoilVerdict, CoilWatch
 from flight.loop.fdir.stuck_leg import NONE, Axes
 from flight.loop.services import Services
 from flight.schema.sections import Modes
-from hal.interfaces.devices import PowerMonitor, TorqueCoils
-from hal.interfaces.readings import CoilState, ImuReading
+from hal.interfaces.devices import CoilState, ImuReading, PowerMonitor, TorqueCoils
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.gnc.control.allocation import allocate
 from knightcube.gnc.estimation.estimate import Estimate

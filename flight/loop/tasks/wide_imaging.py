@@ -16,9 +16,8 @@ from flight.loop.body import WideCameraUse
 from flight.loop.executive.jobs import JobResult
 from flight.loop.fdir import facts
 from flight.loop.services import Services
-from hal.interfaces.devices import FrameSource
+from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import Frame
 from knightcube.vision.wide_job import WideFound
 
 WORKER = "wide"

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hal.buses import videodev2 as v4l2
+from hal.buses import v4l2
 from hal.buses.v4l2 import fourcc
 
 MILLISECOND_NS = 1_000_000

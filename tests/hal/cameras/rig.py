@@ -15,11 +15,9 @@ from hal.buses.clock import SystemClock
 from hal.drivers import aravis_camera
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import ServedCamera
-from hal.drivers.v4l2_camera import V4l2Camera
-from hal.drivers.v4l2_settings import Stamp, V4l2Settings
-from hal.interfaces.devices import FrameSource
+from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
+from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import Refused
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.emulators.star_camera import EmulatedStarCamera
@@ -155,5 +153,5 @@ def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch)
     kernel = IoctlCamera(folder, clock.now_ns)
     monkeypatch.setattr("hal.buses.v4l2.ioctl", kernel)
     # Whatever this machine's kernel says of a driver that the double is not.
-    monkeypatch.setattr("hal.drivers.v4l2_timing.UVC_STAMPS", folder / "hwtimestamps")
+    monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
     return kernel

@@ -9,8 +9,8 @@ import pytest
 
 from hal.buses.clock import SystemClock
 from hal.drivers.camera import CameraCounts, FrameNumbers, ServedCamera
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding, OutOfRange
-from hal.interfaces.readings import Frame
 
 WAIT_S = 5.0
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.buses import videodev2 as v4l2
+from hal.buses import v4l2
 from hal.buses.v4l2 import VideoDevice
-from hal.drivers.v4l2_settings import Stamp
+from hal.drivers.v4l2_camera import Stamp
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
 from tests.hal.cameras.rig import EXPOSURE_NS, VideoRig, video_rig

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses import videodev2
+from hal.buses import v4l2
 from hal.buses.v4l2 import fourcc, fourcc_name
 
 # Of linux/videodev2.h on x86-64.
@@ -31,46 +31,46 @@ CODES = {
     "QUERYCTRL": 0xC0445624,
 }
 STRUCTURES = {
-    "v4l2_capability": videodev2.Capability,
-    "v4l2_fmtdesc": videodev2.FormatDescription,
-    "v4l2_format": videodev2.Format,
-    "v4l2_requestbuffers": videodev2.RequestBuffers,
-    "v4l2_buffer": videodev2.Buffer,
-    "v4l2_streamparm": videodev2.StreamParameters,
-    "v4l2_control": videodev2.Control,
-    "v4l2_queryctrl": videodev2.QueryControl,
+    "v4l2_capability": v4l2.Capability,
+    "v4l2_fmtdesc": v4l2.FormatDescription,
+    "v4l2_format": v4l2.Format,
+    "v4l2_requestbuffers": v4l2.RequestBuffers,
+    "v4l2_buffer": v4l2.Buffer,
+    "v4l2_streamparm": v4l2.StreamParameters,
+    "v4l2_control": v4l2.Control,
+    "v4l2_queryctrl": v4l2.QueryControl,
 }
 MEMBERS = [
     (
         "v4l2_buffer",
-        videodev2.Buffer,
+        v4l2.Buffer,
         ("bytesused", "flags", "timestamp", "sequence", "memory", "m", "length"),
     ),
-    ("v4l2_pix_format", videodev2.PixelFormat, ("pixelformat", "field", "bytesperline", "sizeimage")),
-    ("v4l2_capability", videodev2.Capability, ("card", "capabilities", "device_caps")),
-    ("v4l2_format", videodev2.Format, ("fmt",)),
-    ("v4l2_queryctrl", videodev2.QueryControl, ("minimum", "maximum", "step", "flags")),
+    ("v4l2_pix_format", v4l2.PixelFormat, ("pixelformat", "field", "bytesperline", "sizeimage")),
+    ("v4l2_capability", v4l2.Capability, ("card", "capabilities", "device_caps")),
+    ("v4l2_format", v4l2.Format, ("fmt",)),
+    ("v4l2_queryctrl", v4l2.QueryControl, ("minimum", "maximum", "step", "flags")),
 ]
 CONSTANTS = {
-    "V4L2_BUF_FLAG_ERROR": videodev2.FLAG_ERROR,
-    "V4L2_BUF_FLAG_TIMESTAMP_MASK": videodev2.STAMP_MASK,
-    "V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC": videodev2.STAMP_MONOTONIC,
-    "V4L2_BUF_FLAG_TSTAMP_SRC_MASK": videodev2.STAMP_SOURCE_MASK,
-    "V4L2_BUF_FLAG_TSTAMP_SRC_SOE": videodev2.STAMP_START_OF_EXPOSURE,
-    "V4L2_CAP_VIDEO_CAPTURE": videodev2.CAP_VIDEO_CAPTURE,
-    "V4L2_CAP_STREAMING": videodev2.CAP_STREAMING,
-    "V4L2_CAP_DEVICE_CAPS": videodev2.CAP_DEVICE_CAPS,
-    "V4L2_CAP_TIMEPERFRAME": videodev2.CAP_TIME_PER_FRAME,
-    "V4L2_BUF_TYPE_VIDEO_CAPTURE": videodev2.VIDEO_CAPTURE,
-    "V4L2_MEMORY_MMAP": videodev2.MMAP,
-    "V4L2_FIELD_NONE": videodev2.FIELD_NONE,
-    "V4L2_CTRL_FLAG_DISABLED": videodev2.CONTROL_DISABLED,
-    "V4L2_CID_AUTOGAIN": videodev2.AUTO_GAIN,
-    "V4L2_CID_GAIN": videodev2.GAIN,
-    "V4L2_CID_ANALOGUE_GAIN": videodev2.ANALOGUE_GAIN,
-    "V4L2_CID_EXPOSURE_AUTO": videodev2.EXPOSURE_AUTO,
-    "V4L2_EXPOSURE_MANUAL": videodev2.EXPOSURE_MANUAL,
-    "V4L2_CID_EXPOSURE_ABSOLUTE": videodev2.EXPOSURE_ABSOLUTE,
+    "V4L2_BUF_FLAG_ERROR": v4l2.FLAG_ERROR,
+    "V4L2_BUF_FLAG_TIMESTAMP_MASK": v4l2.STAMP_MASK,
+    "V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC": v4l2.STAMP_MONOTONIC,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_MASK": v4l2.STAMP_SOURCE_MASK,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_SOE": v4l2.STAMP_START_OF_EXPOSURE,
+    "V4L2_CAP_VIDEO_CAPTURE": v4l2.CAP_VIDEO_CAPTURE,
+    "V4L2_CAP_STREAMING": v4l2.CAP_STREAMING,
+    "V4L2_CAP_DEVICE_CAPS": v4l2.CAP_DEVICE_CAPS,
+    "V4L2_CAP_TIMEPERFRAME": v4l2.CAP_TIME_PER_FRAME,
+    "V4L2_BUF_TYPE_VIDEO_CAPTURE": v4l2.VIDEO_CAPTURE,
+    "V4L2_MEMORY_MMAP": v4l2.MMAP,
+    "V4L2_FIELD_NONE": v4l2.FIELD_NONE,
+    "V4L2_CTRL_FLAG_DISABLED": v4l2.CONTROL_DISABLED,
+    "V4L2_CID_AUTOGAIN": v4l2.AUTO_GAIN,
+    "V4L2_CID_GAIN": v4l2.GAIN,
+    "V4L2_CID_ANALOGUE_GAIN": v4l2.ANALOGUE_GAIN,
+    "V4L2_CID_EXPOSURE_AUTO": v4l2.EXPOSURE_AUTO,
+    "V4L2_EXPOSURE_MANUAL": v4l2.EXPOSURE_MANUAL,
+    "V4L2_CID_EXPOSURE_ABSOLUTE": v4l2.EXPOSURE_ABSOLUTE,
     "V4L2_PIX_FMT_GREY": fourcc("GREY"),
     "V4L2_PIX_FMT_Y10": fourcc("Y10"),
     "V4L2_PIX_FMT_Y12": fourcc("Y12"),
@@ -80,9 +80,9 @@ CONSTANTS = {
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the published codes are those of x86-64")
 def test_requests_are_the_published_ones() -> None:
-    assert {name: getattr(videodev2, name) for name in CODES} == CODES
-    assert [ctypes.sizeof(kind) for kind in (videodev2.Buffer, videodev2.Format)] == [88, 208]
-    assert videodev2.Format.fmt.offset == 8
+    assert {name: getattr(v4l2, name) for name in CODES} == CODES
+    assert [ctypes.sizeof(kind) for kind in (v4l2.Buffer, v4l2.Format)] == [88, 208]
+    assert v4l2.Format.fmt.offset == 8
     assert fourcc("GREY") == 0x59455247
     assert fourcc("Y10") == 0x20303159
 
@@ -106,6 +106,6 @@ def test_all_agree_with_this_machines_own_header(tmp_path: Path) -> None:
     output = subprocess.run([str(program)], check=True, timeout=10, capture_output=True, text=True).stdout
     ours = [ctypes.sizeof(kind) for kind in STRUCTURES.values()]
     ours += [getattr(kind, member).offset for _, kind, members in MEMBERS for member in members]
-    ours += [getattr(videodev2, name) for name in CODES]
+    ours += [getattr(v4l2, name) for name in CODES]
     ours += list(CONSTANTS.values())
     assert [int(word) for word in output.split()] == ours

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from hal.drivers.coil_settings import CoilWiring
-from hal.drivers.h_bridge import brake
+from hal.drivers.h_bridge import CoilWiring, brake
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.errors import Refused
 from sim_hal.worlds.coil_circuit import Condition

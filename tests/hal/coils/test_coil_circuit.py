@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.coil_settings import CoilWiring
+from hal.drivers.h_bridge import CoilWiring
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
 from sim_hal.worlds.chopped_supply import Bridge, Chopping, common_counts
 from sim_hal.worlds.coil_circuit import CoilCircuit

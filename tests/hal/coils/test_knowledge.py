@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from flight.loop.fdir.coil_watch import STOOD_NS, CoilKnowledge, CurrentValidity
-from hal.guardian.watch import SILENCE_NS
-from hal.interfaces.readings import CoilState
+from hal.guardian.process import SILENCE_NS
+from hal.interfaces.devices import CoilState
 
 MS = 1_000_000
 OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "", (False, False, False))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hal.drivers.ublox.receiver import UbloxReceiver
-from hal.interfaces.readings import GpsReading
+from hal.drivers.ublox import UbloxReceiver
+from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors

@@ -7,16 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyubx2 import UBXMessage, UBXReader
 
-from hal.drivers.ublox.codec import (
-    CFG_MSG,
-    NAV_PVT,
-    SYNC,
-    Pvt,
-    StreamParser,
-    checksum,
-    frame,
-    unpack_pvt,
-)
+from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, Pvt, StreamParser, checksum, frame, unpack_pvt
 
 PVT = Pvt(
     date=(2026, 3, 20, 12, 34, 56),

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from flight.app.flight import fly
 from flight.app.request import RunRequest
-from hal.buses.exclusive import hold
+from hal.buses.i2c_bus import lock_bus
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
@@ -120,7 +120,7 @@ def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     path.write_text(json.dumps(gone), encoding="utf-8")
     request = RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path)
     with path.open(encoding="utf-8") as held:
-        hold(held.fileno())
+        lock_bus(held.fileno())
         with pytest.raises(NotResponding, match="another flight drives the coils"):
             fly(request)
     with pytest.raises(NotResponding, match=r"ptmx|server"):

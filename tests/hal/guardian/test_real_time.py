@@ -10,8 +10,8 @@ import threading
 import pytest
 
 from flight.app import opening as watchers
-from hal.buses import real_time
-from hal.drivers.coil_settings import DEVICE as COILS
+from hal.buses import linux_process
+from hal.drivers.h_bridge import DEVICE as COILS
 
 
 def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,8 +19,8 @@ def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) ->
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    monkeypatch.setattr(real_time, "lock_memory", lambda: "locked memory refused (x): allow it with y")
-    obtained = real_time.obtain([0], 50)
+    monkeypatch.setattr(linux_process, "lock_memory", lambda: "locked memory refused (x): allow it with y")
+    obtained = linux_process.obtain([0], 50)
     assert (obtained.priority, obtained.locked) == (0, False)
     assert str(obtained) == (
         "ordinary scheduling, memory not locked; SCHED_FIFO 50 refused (Operation not permitted): "
@@ -35,16 +35,16 @@ def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatc
         "sched_setscheduler",
         lambda thread, policy, value: asked.append((thread, policy, value.sched_priority)),
     )
-    monkeypatch.setattr(real_time, "lock_memory", lambda: "")
-    assert str(real_time.obtain([0, 77], 50)) == "SCHED_FIFO 50, memory locked"
+    monkeypatch.setattr(linux_process, "lock_memory", lambda: "")
+    assert str(linux_process.obtain([0, 77], 50)) == "SCHED_FIFO 50, memory locked"
     assert asked == [(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 50) for thread in (0, 77)]
 
 
 def test_locked_memory_is_seen_by_the_kernel_or_refused_in_words() -> None:
     """Locking on fault leaves untouched address space out: a gigabyte that is only reserved costs nothing."""
     script = (
-        "import mmap; from hal.buses import real_time\n"
-        "said = real_time.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"
+        "import mmap; from hal.buses import linux_process\n"
+        "said = linux_process.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"
         "status = open('/proc/self/status').read()\n"
         "field = lambda name: int(status.split(name)[1].split()[0])\n"
         "print(said or (field('VmLck:') > 1 << 20 and field('VmRSS:') < 100_000))"
@@ -60,7 +60,7 @@ def test_the_threads_beside_the_control_thread_are_served_next(monkeypatch: pyte
         asked[thread_id] = priority
         return ""
 
-    monkeypatch.setattr(real_time, "prioritise", note)
+    monkeypatch.setattr(linux_process, "prioritise", note)
     done = threading.Event()
     beside, coils = (threading.Thread(target=done.wait, name=name) for name in ("log", COILS))
     for thread in (beside, coils):

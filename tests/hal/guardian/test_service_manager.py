@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses.service_manager import ServiceManager
+from hal.buses.linux_process import ServiceManager
 
 OWN = 4711
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.devices import ImuReading
 from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
 from knightcube.astro.quaternion import IDENTITY
 from sim_hal.clock import SimClock

@@ -9,9 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hal.drivers.vn100.ascii import AsciiLine, build, error_meaning, measurement, parse
-from hal.drivers.vn100.codec import BinaryPacket, crc16, layout_of
-from hal.drivers.vn100.stream import StreamParser
+from hal.drivers.vn100.protocol import (
+    AsciiLine,
+    BinaryPacket,
+    StreamParser,
+    build,
+    crc16,
+    error_meaning,
+    layout_of,
+    measurement,
+    parse,
+)
 from knightcube.astro.frames import NED_TO_TESTBED
 from knightcube.astro.quaternion import attitude_matrix
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hal.drivers.vn100.ascii import build
-from hal.drivers.vn100.codec import layout_of
 from hal.drivers.vn100.driver import OUTPUT_SET, Vn100, Vn100Settings
-from hal.drivers.vn100.set_up import Question
+from hal.drivers.vn100.protocol import build, layout_of
+from hal.drivers.vn100.setup import Question
 from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
 from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix, from_rotation_vector, multiply

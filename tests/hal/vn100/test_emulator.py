@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.ascii import AsciiLine, Sentence, build
-from hal.drivers.vn100.codec import FIELDS, BinaryPacket
-from hal.drivers.vn100.stream import StreamParser
+from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.emulators.device import NEVER
 from sim_hal.emulators.serial_line import SerialLine

@@ -17,8 +17,8 @@ import pytest
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
 from hal.drivers.vn100.driver import Vn100
+from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import CorruptData, NotResponding
-from hal.interfaces.readings import ImuReading
 from knightcube.astro.quaternion import angle_about_axis_y
 from tests.hal.vn100.bench_line import MISSION
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from hal.drivers.vn100.ascii import build
+from hal.drivers.vn100.protocol import build
+from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import ImuReading
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
 from tests.hal.vn100.bench_line import BenchLine, bench_line

@@ -8,10 +8,17 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.ascii import AsciiLine, build, parse
-from hal.drivers.vn100.codec import BinaryPacket, crc16, layout_of
 from hal.drivers.vn100.driver import OUTPUT_SET
-from hal.drivers.vn100.stream import LONGEST_LINE, StreamParser
+from hal.drivers.vn100.protocol import (
+    LONGEST_LINE,
+    AsciiLine,
+    BinaryPacket,
+    StreamParser,
+    build,
+    crc16,
+    layout_of,
+    parse,
+)
 from tests.pace import ordinary_seconds
 
 LAYOUT = layout_of(OUTPUT_SET)

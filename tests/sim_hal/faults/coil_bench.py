@@ -18,7 +18,7 @@ from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
 from hal.drivers.vn100.driver import Vn100
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.devices import ImuReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y
 from sim_hal import lockstep

@@ -20,7 +20,7 @@ from flight.loop.fdir.supply_current import (
     predict,
     supply_currents,
 )
-from hal.interfaces.readings import ImuReading, PowerReading
+from hal.interfaces.devices import ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
 from tests.sim_hal.faults.coil_bench import hold, observe
 

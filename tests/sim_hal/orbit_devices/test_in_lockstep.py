@@ -12,10 +12,9 @@ from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from ground.telemetry.scanner import scan
+from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import Frame, GpsReading
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS

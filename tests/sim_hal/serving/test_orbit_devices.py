@@ -11,9 +11,8 @@ import numpy as np
 
 from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
-from hal.interfaces.readings import Frame, GpsReading
-from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.devices import Frame, GpsReading
+from hal.interfaces.wires import SECOND_NS, Rig
 from sim_hal.serving import remote
 
 DEVICES = """

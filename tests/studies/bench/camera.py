@@ -20,8 +20,7 @@ import numpy as np
 
 from hal.buses.clock import SystemClock
 from hal.drivers.camera import ServedCamera
-from hal.drivers.v4l2_camera import V4l2Camera
-from hal.drivers.v4l2_settings import Stamp, V4l2Settings
+from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 
 COLUMNS, ROWS = 1280, 800

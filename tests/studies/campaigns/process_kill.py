@@ -26,7 +26,7 @@ import numpy as np
 
 from flight.link import events
 from ground.telemetry.reader import read_run
-from hal.buses import real_time
+from hal.buses import linux_process
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight
@@ -68,7 +68,7 @@ def run(case: Case) -> Result:
         stack.enter_context(answering("sim_hal", "serve", str(config), *words))
         for child in below(os.getpid()):
             if "sim_hal serve" in command(child):
-                real_time.prioritise(child, _HARDWARE)
+                linux_process.prioritise(child, _HARDWARE)
         bus = RemoteI2cBus(json.loads(facts.read_text(encoding="utf-8"))["socket"])
         stack.callback(bus.close)
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
@@ -117,9 +117,9 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
     children = flight.children()
     before = max(board.current() for _ in range(20))
     sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
-    real_time.prioritise(0, _HARDWARE)
+    linux_process.prioritise(0, _HARDWARE)
     zero_after, _ = watch_coils(board, flight.do(sent), before)
-    real_time.relinquish()
+    linux_process.relinquish()
     flight.process.kill()
     flight.process.wait()
     deadline = time.monotonic() + _GONE_S

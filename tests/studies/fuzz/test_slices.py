@@ -82,7 +82,7 @@ def test_accepted_corruption_a_crash_and_a_hang_are_each_found(monkeypatch: pyte
 
 
 def test_a_parser_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hal.drivers.vn100.stream.crc16", lambda _: 0)
+    monkeypatch.setattr("hal.drivers.vn100.protocol.crc16", lambda _: 0)
     assert not run("vn100", target_of("vn100"), 30, seed=7).sound
 
 

@@ -14,10 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hal.drivers.vn100.ascii import AsciiLine
-from hal.drivers.vn100.codec import HEADER_LENGTHS, BinaryPacket, layout_of_header
 from hal.drivers.vn100.driver import Vn100
-from hal.drivers.vn100.stream import StreamParser
+from hal.drivers.vn100.protocol import HEADER_LENGTHS, AsciiLine, BinaryPacket, StreamParser, layout_of_header
 from tests.hal.vn100.bench_line import MISSION
 from tests.manual_clock import ManualClock
 from tests.studies.fuzz.harness import Finding

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hal.drivers.vn100.ascii import build
-from hal.drivers.vn100.codec import FIELDS, HEADER_LENGTHS, Layout, layout_of, layout_of_header
 from hal.drivers.vn100.driver import OUTPUT_SET
+from hal.drivers.vn100.protocol import FIELDS, HEADER_LENGTHS, Layout, build, layout_of, layout_of_header
 from tests.studies.fuzz.mutation import Draw, chance, integer
 
 REAL_PACKETS = Path(__file__).resolve().parents[4] / "shared" / "data" / "vn100_packets.json"

@@ -23,8 +23,7 @@ from flight.loop.executive.messages import message_length, pack_values, unpack_v
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
-from hal.drivers.ublox.codec import NAV_PVT, Pvt, StreamParser, frame, unpack_pvt
-from hal.drivers.ublox.receiver import reading_of
+from hal.drivers.ublox import NAV_PVT, Pvt, StreamParser, frame, reading_of, unpack_pvt
 from hal.interfaces.errors import DeviceError, OutOfRange
 from knightcube.errors import FlightError
 from knightcube.vision.frame_job import FrameFound

@@ -11,7 +11,7 @@ from flight.bodies.orbit.coarse_attitude import CoarseSunFeed
 from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.filter_steps import OrbitFilterSettings
-from hal.interfaces.readings import ImuReading, StringReading
+from hal.interfaces.devices import ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures

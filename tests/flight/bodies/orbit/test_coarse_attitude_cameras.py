@@ -10,7 +10,7 @@ from flight.bodies.orbit.coarse_attitude import CONTRADICTED, WideFeed
 from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.filter_steps import OrbitFilterSettings
-from hal.interfaces.readings import Frame, ImuReading
+from hal.interfaces.devices import Frame, ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures

@@ -7,7 +7,7 @@ import numpy as np
 from flight.bodies.orbit.control import SunAcquisitionBrake
 from flight.link.events import EventKind
 from flight.loop.fdir.facts import EventLog
-from hal.interfaces.readings import StringReading
+from hal.interfaces.devices import StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.detumble import WindowSchedule

@@ -11,7 +11,7 @@ import pytest
 from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, OrbitEnvironment
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
-from hal.interfaces.readings import GpsReading
+from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.geomagnetism import field

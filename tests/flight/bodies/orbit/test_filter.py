@@ -7,7 +7,7 @@ import pytest
 
 from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter
 from flight.bodies.orbit.filter_steps import DipoleHistory, OrbitFilterSettings
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import Pressures

@@ -17,7 +17,7 @@ import pytest
 from flight.loop.executive.jobs import JobResult, JobRunner, LockStepRunner, Worker, WorkerChange, WorkerNews
 from flight.loop.executive.worker_processes import BUDGET, STEADY_NS, Attempts, ProcessRunner
 from hal.buses.clock import SystemClock
-from hal.buses.real_time import worker_cores
+from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, function, hang
@@ -195,7 +195,7 @@ import sys, time
 from flight.loop.executive.jobs import Worker
 from flight.loop.executive.worker_processes import ProcessRunner
 from hal.buses.clock import SystemClock
-from hal.buses.real_time import worker_cores
+from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from tests.flight.loop.executive.odd_jobs import hang
 runner = ProcessRunner(SystemClock(), [Worker("hang", hang, 0, 10**12)])

@@ -13,8 +13,8 @@ from flight.loop.executive.jobs import JobResult
 from flight.loop.fdir import facts
 from flight.loop.services import Services
 from flight.loop.tasks.wide_imaging import WORKER, WideImaging, WideSettings
+from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
-from hal.interfaces.readings import Frame
 from hal.interfaces.wires import SECOND_NS
 from knightcube.vision.wide_job import Sighted, WideFound, WideJob
 

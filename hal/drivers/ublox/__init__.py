@@ -1,1 +1,0 @@
-"""A u-blox GPS receiver and its UBX protocol on a serial line."""
