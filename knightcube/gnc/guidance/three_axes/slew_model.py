@@ -34,14 +34,14 @@ _AXES = np.arange(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewCraft:
-    """What a slew's planner believes of the craft, in body axes.
+    """The satellite as modelled by the slew planner, in body axes.
 
     Attributes:
         inertia: (3, 3) kg m^2.
         limit: (3,) A m^2, of each coil.
         weights: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
-        residual: (3,) A m^2, the craft's own dipole.
-        torque, air, light: (3,) N m, sizes of the torques that the coils do not make.
+        residual: (3,) A m^2, the residual dipole of the satellite.
+        torque, air, light: (3,) N m, sizes of the disturbance torques: constant, by air, by sunlight.
     """
 
     inertia: FloatArray
@@ -53,15 +53,18 @@ class SlewCraft:
     light: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def facing(self, sizes: FloatArray) -> SlewCraft:
-        """Return the craft with torques of these sizes (9,) N m."""
+        """Return the satellite with disturbance torques of the given sizes (9,) N m."""
         return replace(self, torque=sizes[CONSTANT], air=sizes[AIR], light=sizes[LIGHT])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewEnvironment:
-    """What acts on the body at n times, ICRS axes: `field` (n, 3) T, `position` (n, 3) m, air and light.
+    """The environment of the body at n times, in ICRS axes.
 
-    Without `pressures` there is neither air nor light.
+    Attributes:
+        field: (n, 3) T.
+        position: (n, 3) m.
+        pressures: of air and sunlight; None for neither.
     """
 
     field: FloatArray
@@ -69,7 +72,7 @@ class SlewEnvironment:
     pressures: Pressures | None = None
 
     def part(self, which: IntArray) -> SlewEnvironment:
-        """Return what acts at some of the times."""
+        """Return the environment at the times of the index array `which`."""
         found = self.pressures
         pressed = None if found is None else Pressures(found.air[which], found.light[which])
         return SlewEnvironment(self.field[which], self.position[which], pressed)
@@ -81,11 +84,14 @@ class SlewEnvironment:
 
 
 EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
-"""Gives what acts at times (n,) s after the start of a slew."""
+"""Function from times (n,), s after the start of a slew, to the environment."""
 
 
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return A(q) v (n, 3), also off the unit sphere, where it grows with |q|^2."""
+    """Return the body components A(q) v (n, 3).
+
+    Off the unit sphere they grow with |q|^2.
+    """
     v, s = q[:, :3], q[:, 3:]
     inner = np.sum(v * vector, axis=1, keepdims=True)
     square = s * s - np.sum(v * v, axis=1, keepdims=True)
@@ -93,7 +99,7 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the second derivative (n, 4, 4) of pull . A(q) v by q: twice Davenport's matrix."""
+    """Return the second derivative (n, 4, 4) of pull . A(q) v by q, twice Davenport's matrix."""
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
     inner = np.sum(pull * vector, axis=1)
@@ -104,14 +110,14 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 class SlewDynamics:
-    """The motion of one craft at n times; times are counted in units of `scale` s, dipoles in `unit` A m^2.
+    """The motion of one satellite at n times, in units of `scale` s and of `unit` A m^2.
 
-    With z = (m + residual, b, e, w, q), b and e quadratic in q, all of x' but a constant is quadratic in z:
-    1/2 z . H z. So one product gives the derivatives of all times at once.
+    With z = (m + residual, b, e, w, q), where b and e are quadratic in q, all terms of x' except a constant
+    are quadratic in z: 1/2 z . H z. One product therefore gives the derivatives at all times at once.
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """`around` the craft at the n times; e is scaled with the gradient's strength."""
+        """Store the environment at the n times; e is scaled with the strength of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(
@@ -130,7 +136,7 @@ class SlewDynamics:
             self._parts[:, part, place] = np.eye(part.stop - part.start)
 
     def field(self, q: FloatArray) -> FloatArray:
-        """Return b (n, 3) at attitudes (n, 4): the field in the units of the motion, body axes."""
+        """Return the field b (n, 3) at attitudes (n, 4), in the units of the motion and body axes."""
         return np.asarray(0.5 * np.einsum("nijk,nj,nk->ni", self._forms[:, :3], q, q))
 
     def flow(self, x: FloatArray, m: FloatArray) -> FloatArray:
@@ -172,7 +178,10 @@ class SlewDynamics:
         return np.asarray((z @ self._quadratic.reshape(-1, _Z).T).reshape(-1, 7, _Z))
 
     def _by_unknowns(self, turned: FloatArray) -> FloatArray:
-        """Return the derivative (n, 16, 10) of z by state and dipole; the next call overwrites the array."""
+        """Return the derivative (n, 16, 10) of z by state and dipole.
+
+        The next call overwrites the array.
+        """
         self._parts[:, _BE, _ATTITUDE] = turned
         return self._parts
 
@@ -183,7 +192,7 @@ _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
-    """Return the second derivatives (n, 3, 4, 4) of the acceleration by air and light, by the attitude."""
+    """Return the second derivatives (n, 3, 4, 4) by the attitude of the accelerations by air and sunlight."""
     count = len(around.field)
     result = np.zeros((count, 3, 4, 4))
     if around.pressures is not None:
@@ -195,7 +204,7 @@ def _pushes(craft: SlewCraft, around: SlewEnvironment) -> FloatArray:
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:
-    """Return H (7, 16, 16), symmetric: 1/2 z . H z is the state's derivative but for the constant torque."""
+    """Return the symmetric H (7, 16, 16): x' is 1/2 z . H z plus the constant torque's acceleration."""
     result = np.zeros((7, _Z, _Z))
     crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is the part i of a x c
     result[:3, _Q, _W][:, :3] = 0.5 * crossed
@@ -209,7 +218,7 @@ def _quadratic(inertia: FloatArray) -> FloatArray:
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b (n, 3), in a fraction of the time of `np.cross`."""
+    """Return a x b (n, 3); several times as fast as `np.cross`."""
     return np.stack(
         [
             a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1],
@@ -222,9 +231,9 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HermiteCubic:
-    """A curve through `values` (n, k) with `slopes` (n, k) at rising `times` (n,), n > 1.
+    """A curve through `values` (n, k) with `slopes` (n, k) at increasing `times` (n,), n > 1.
 
-    Times outside continue the first or the last cubic.
+    Times outside extrapolate the first or the last cubic.
     """
 
     times: FloatArray
@@ -244,7 +253,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return share (m, 1) and length (m, 1) of the spans of `times`, their begins, steps and slopes."""
+        """Return per time: share of its span, length of the span, start value, step, and both slopes."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]
@@ -256,11 +265,14 @@ class HermiteCubic:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewPath:
-    """A path from 0 to its last time; between the times it is the cubic of the collocation.
+    """The path of a slew from time 0 to its last time; between the times it is the cubic of the collocation.
 
     Attributes:
-        times: (n,) s; quaternion: (n, 4) ICRS into body; rate: (n, 3) rad/s; acceleration: (n, 3) rad/s^2.
-        dipole: (n, 3) A m^2, straight lines between the times; all in body axes.
+        times: (n,) s.
+        quaternion: (n, 4) ICRS into body.
+        rate: (n, 3) rad/s, body axes.
+        acceleration: (n, 3) rad/s^2, body axes.
+        dipole: (n, 3) A m^2, body axes, linear between the times.
     """
 
     times: FloatArray
@@ -275,7 +287,10 @@ class SlewPath:
         return float(self.times[-1])
 
     def references(self, times: FloatArray) -> AttitudeReferences:
-        """Return the wanted motion at times (m,) s; outside the path that of its ends, at rest from there."""
+        """Return the commanded motion at times (m,) s.
+
+        Outside the path the attitude is that of the nearer end, and the body is at rest.
+        """
         inside = np.clip(times, 0.0, self.horizon)
         turning = HermiteCubic(self.times, self.rate, self.acceleration)
         spin = np.concatenate([self.rate, np.zeros((len(self.times), 1))], axis=1)

@@ -45,15 +45,16 @@ from knightcube.gnc.guidance.three_axes.slew_task import (
     EndLaw,
     SlewTask,
     along,
+    blocking_cone,
     check,
     cones,
-    in_the_way,
 )
 
 _STEPS = 4
-"""Runge-Kutta steps of an interval, an even number."""
+"""Runge-Kutta steps per interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
-"""At most; what is missed at a node when it is closed, and when it cannot be: rad, half an angle."""
+"""Largest number of corrections, and the errors at the nodes (rad, half an angle) below which a path is
+closed and above which it cannot be closed."""
 
 
 def closed(
@@ -61,34 +62,34 @@ def closed(
 ) -> Trajectory:
     """Return the trajectory near a solved `point` whose dipoles, integrated, lead through its states.
 
-    `unit` A m^2 is that of the dipoles, `along` gives the surroundings. Raises PlanningError where the
-    equations at the point are singular, or do not lead there.
+    `unit` A m^2 is the unit of the dipoles; `along` gives the environment. Raises PlanningError if the
+    equations at the point are singular or the corrections do not converge.
     """
     equations, at = program.equations, point.at
-    place, count, scale = equations.layout, equations.count, equations.scale
+    layout, count, scale = equations.layout, equations.count, equations.scale
     around = along(np.linspace(0.0, scale, 2 * _STEPS * count + 1))
     firsts = 2 * _STEPS * np.arange(count)
     motions = [SlewDynamics(craft, scale, unit, around.part(firsts + k)) for k in range(2 * _STEPS + 1)]
     factors = program.factors(point)
     middles, ends = _integrated(motions, at, 1.0 / count)
     for _ in range(_ROUNDS):
-        missed = np.zeros(place.size)
-        missed[place.equations[:, 7:]] = at.states[2::2] - ends
-        missed[place.start], missed[place.end] = equations.ends_missed(at)
+        missed = np.zeros(layout.size)
+        missed[layout.equations[:, 7:]] = at.states[2::2] - ends
+        missed[layout.start], missed[layout.end] = equations.ends_missed(at)
         if float(np.abs(missed).max()) < _CLOSED:
             break
         change = factors.solve(-missed)
-        at = Trajectory(at.states + change[place.states], at.dipoles + change[place.dipoles])
+        at = Trajectory(at.states + change[layout.states], at.dipoles + change[layout.dipoles])
         middles, ends = _integrated(motions, at, 1.0 / count)
     if not float(np.abs(missed).max()) < _LOST:
-        raise PlanningError("what the path misses grows as it is mended")
+        raise PlanningError("the corrections of the path do not converge")
     states = at.states.copy()
     states[1::2] = middles
     return Trajectory(states, at.dipoles)
 
 
 def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> tuple[FloatArray, FloatArray]:
-    """Return the states (k, 7) in the middle and at the end of each interval, integrated from its begin."""
+    """Return the states (k, 7) in the middle and at the end of each interval, integrated from its start."""
     x, h = at.states[:-1:2], length / _STEPS
     slope = (at.dipoles[1:] - at.dipoles[:-1]) / (2 * _STEPS)
     middle = x
@@ -105,21 +106,21 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 
 
 _DENSE = 16
-"""Places between two of a path's nodes and midpoints where cones are looked at."""
+"""Number of points between two of a path's nodes and midpoints where cones are checked."""
 _ROOM = math.radians(0.005)
-"""rad, that a path keeps off a cone at those places: between them it comes nearer by less."""
+"""Margin (rad) to a cone at those points; between them a path comes closer by less."""
 
 _OVER = 1.001
-"""Of the dipoles' limit, that the closing of a path may lead to."""
+"""Largest ratio of the flown dipoles to their limit."""
 _ASTRAY = 1.05
-"""By how much a path that no integrator leads along is eased."""
+"""Assumed ratio of dipole to limit for a path along which the integration fails."""
 
 _ENDS = 9
-"""Horizons of a refused slew, at whose ends cones are looked for."""
+"""Number of horizons of a failed slew at whose ends cones are checked, for the message."""
 
 
 class SlewStatus(StrEnum):
-    """Whether the asked horizon was kept."""
+    """Whether the requested horizon was kept."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -130,11 +131,13 @@ class SlewPlan:
     """A path and its properties.
 
     Attributes:
+        path: the path.
+        status: whether the requested horizon was kept.
         horizon_asked, horizon: s.
         energy: J, heat of the coils.
         peak: the largest dipole over its limit.
-        clearance: rad, least distance outside each cone, in the order of the task's.
-        steps: of Newton's method, over all guesses.
+        clearance: rad, least distance outside each cone, in the order of the task's cones.
+        steps: Newton steps over all guesses.
     """
 
     path: SlewPath
@@ -148,9 +151,9 @@ class SlewPlan:
 
 
 def plan_slew(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
-    """Return the best plan found. Raises PlanningError with the reason when there is none.
+    """Return the best plan found. Raises PlanningError with the reason if there is none.
 
-    `near` is the path of a task that is nearly the same, over the same horizon: the plan near it is taken.
+    `near` is the path of a similar task over the same horizon, from which the search is warm-started.
     """
     check(task)
     tried = 0
@@ -170,7 +173,7 @@ def plan_slew(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
 
 
 def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> SlewPlan | None:
-    """Return the plan of the first path that keeps limits and cones when flown, too; None without one."""
+    """Return the plan of the first path that keeps limits and cones when integrated, else None."""
     for path in paths:
         found: SolvedPath | None = path
         while found is not None:
@@ -189,22 +192,22 @@ def _first(task: SlewTask, search: SlewSearch, paths: Iterator[SolvedPath]) -> S
 
 
 def _refusal(task: SlewTask, tried: int) -> str:
-    """Return why a task is refused, and what may help."""
-    text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
+    """Return the reason why no path was found, and possible remedies."""
+    text = f"no slew within the dipole limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
     ends = np.linspace(task.horizon, task.longest, _ENDS)
-    found = [(end, cone) for end in ends.tolist() if (cone := in_the_way(task, end)) is not None]
+    found = [(end, cone) for end in ends.tolist() if (cone := blocking_cone(task, end)) is not None]
     if found:
         first, cone = found[0]
         share = "one" if len(found) == 1 else "all" if len(found) == _ENDS else "many"
-        text += f", and of these {share} from {first:.0f} s on end within the cone of the {cone.name}"
-    return f"{text}: a longer time or another begin may do"
+        text += f"; {share} of these, from {first:.0f} s on, end in the exclusion cone of the {cone.name}"
+    return f"{text}: allow a longer time or another start"
 
 
 def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | None:
-    """Return the plan that flies a path; None where an integrator does not lead along it."""
+    """Return the plan of a path; None if the integration along it fails."""
     equations, scale = found.equations, found.equations.scale
-    with np.errstate(over="ignore", invalid="ignore"):  # where an integrator is led astray
+    with np.errstate(over="ignore", invalid="ignore"):  # where the integration diverges
         try:
             at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
         except PlanningError:
@@ -231,16 +234,16 @@ def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | N
 
 
 def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return how far outside each cone (cones, n) rad a path is, `_DENSE` times between two points."""
+    """Return the clearance (cones, n) rad of a path from each cone, at `_DENSE` times between two points."""
     dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
     shown = path.references(dense).quaternion
     return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
 
 
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return how far from clear of each cone (cones, 2 nodes) rad a path is between each two points.
+    """Return the clearance (cones, 2 nodes) rad that a path lacks between each two points.
 
-    Clear is `_ROOM` off the cone, or as near as begin or end are to it.
+    The required clearance is `_ROOM`, or that of the start or the end if smaller.
     """
     clear = _clearances(task, path)
     room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
@@ -249,27 +252,31 @@ def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 LEAD = 2.0 * DIFFERENCE
-"""s of prediction that are needed before the first begin and after the last end: rates are differences."""
+"""Prediction (s) needed before the first start and after the last end, because rates are differences."""
 WINDOW_RANGE = (0.0, 2e4)
-"""s."""
+"""Range of a window, s."""
 _BEGINS = 12
-"""Parts of a window between which slews are begun."""
+"""Number of parts of a window between which slews are started."""
 _COARSE = 12
-"""Intervals of the slews that begins are compared by."""
+"""Intervals of the coarse slews by which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewOrder:
-    """What is ordered.
+    """A slew in orbit from one pointing target to another.
 
     Attributes:
-        axes: of pointing, which the targets are meant for; `camera` (3,) is the axis that keeps the cones.
-        start: the target that is held until the slew begins; a free roll of it is taken as zero.
-        goal: the target to end in; with a free roll only its direction counts.
-        horizon, longest: s, of the slew; it begins within `window` s.
-        time_price: W, as of `SlewTask`.
-        angles: rad, of the cones of `sun`, `earth` and `moon` that are kept.
+        craft: the model of the satellite.
+        axes: the pointing axes, to which the targets refer.
+        camera: (3,) the axis that keeps the exclusion cones.
+        start: the target that is held until the slew begins; a free roll is taken as zero.
+        goal: the target at the end; with a free roll only its direction counts.
+        horizon, longest: s, as in `SlewTask`.
+        window: s, within which the slew begins.
+        time_price: W, as in `SlewTask`.
+        angles: rad, of the exclusion cones of `sun`, `earth` and `moon`.
+        nodes: intervals of the collocation.
     """
 
     craft: SlewCraft
@@ -286,14 +293,14 @@ class SlewOrder:
 
     @property
     def held(self) -> PointingTarget:
-        """The start with its roll."""
+        """The start target with its roll."""
         is_free = self.start.goal is not Goal.INERTIAL and self.start.roll is None
         return replace(self.start, roll=0.0) if is_free else self.start
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrderedSlew:
-    """A task and its plan, which begins at `begin` s of the ephemeris; `compared` begins were planned."""
+    """A task and its plan, which begins at `begin` s of the ephemeris; `compared` starts were planned."""
 
     task: SlewTask
     plan: SlewPlan
@@ -302,14 +309,15 @@ class OrderedSlew:
 
 
 def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedSlew:
-    """Return the best slew that begins from `first` s of the ephemeris on, within the order's window.
+    """Return the best slew that begins within the order's window, from `first` s of the ephemeris on.
 
-    The ephemeris reaches from `LEAD` s before that to `LEAD` s after the longest slew from the window's end.
-    Raises PlanningError with the last reason where there is none, UsageError for a window out of range.
+    The ephemeris must reach from `LEAD` s before `first` to `LEAD` s after the longest slew from the end of
+    the window. Raises PlanningError with the last reason if there is none, UsageError for a window out of
+    range.
     """
     low, high = WINDOW_RANGE
     if not low <= order.window <= high:
-        raise UsageError(f"a window of {order.window:g} s: must be {low:g} to {high:g}")
+        raise UsageError(f"the window is {order.window:g} s: must be {low:g} to {high:g} s")
     begins = first + order.window * np.linspace(0.0, 1.0, _BEGINS + 1 if order.window else 1)
     coarse = replace(order, nodes=min(order.nodes, _COARSE))
     compared: list[tuple[tuple[float, float], float]] = []
@@ -321,7 +329,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
             failed = error
         else:
             compared.append((_value(plan, order.time_price), float(begin)))
-    # Without a window, or where no coarse slew was found, the first begin has the word.
+    # Without a window, or if no coarse slew was found, only the first start time is used.
     for begin in [begin for _, begin in sorted(compared)] or [first]:
         task = task_at(order, ephemeris, begin)
         try:
@@ -333,7 +341,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
 
 
 def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
-    """Return the task of a slew that begins at a time, s of the ephemeris."""
+    """Return the task of a slew that begins at `begin` s of the ephemeris."""
     quaternion, rate = _motion(law_of(order.held, order.axes, _NO_ROLL, ephemeris, begin), ephemeris, begin)
     return SlewTask(
         order.craft,
@@ -350,7 +358,7 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
 
 
 def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: float) -> EndLaw:
-    """Return where slews to a goal that begin at a time, s of the ephemeris, end after any duration."""
+    """Return the end of slews to a goal from `begin` s of the ephemeris, as a function of time."""
     axis = axes.pointing
     if goal.goal is not Goal.INERTIAL and goal.roll is None:
         direction, _ = directions_of(goal)
@@ -371,13 +379,13 @@ def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: f
 
 
 def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArray, FloatArray]:
-    """Return the attitude (4,) and the rate (3,) rad/s, body axes, of a law."""
+    """Return the attitude (4,) and the rate (3,) rad/s, body axes, of a law at a time, s."""
     found = references(law, ephemeris, np.array([time]))
     return found.quaternion[0], found.rate[0]
 
 
 def _value(plan: SlewPlan, price: float | None) -> tuple[float, float]:
-    """Return what slews are compared by: how much they are stretched, then what they cost."""
+    """Return the ordering key of slews: first the stretched horizon, then the cost."""
     if price is None:
         late = plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0
         return late, plan.energy

@@ -11,7 +11,7 @@ matrix. LAPACK is imported where it is used, because the control process names t
 
 The limits, as inequalities g >= 0, form one vector: the lower and upper limits of the dipoles (2, k + 1, 3),
 then the cones (cones, 2 k). The interior point method is that of Wachter and Biegler, Math. Program. 106
-(2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) in place of a count of eigenvalues,
+(2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) instead of a count of eigenvalues,
 and with second-order corrections. Without limits it is Newton's method. Far from a feasible point the
 curvature of the equations is omitted (Gauss-Newton), because it misleads the steps there.
 """
@@ -29,24 +29,27 @@ from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCra
 from knightcube.gnc.guidance.three_axes.slew_task import ConeConstraints, EndConditions, EndLaw
 
 STEP = 31
-"""Unknowns of an interval."""
+"""Unknowns of one interval."""
 WIDE = STEP + 10
-"""Unknowns that an interval's equations touch: its own, and the next node's."""
+"""Unknowns in the equations of one interval: its own, and those of the next node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
-"""Places of an interval's equations among its unknowns."""
+"""Indices of the equations of an interval among its unknowns."""
 _BAND = 33
 _ROWS = 3 * _BAND + 1  # LAPACK's, with room for the pivots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandLayout:
-    """Where each unknown stands among all of a slew.
+    """The indices of the unknowns of a slew in the band matrix.
 
     Attributes:
-        states: (2 k + 1, 7) at nodes and midpoints; dipoles: (k + 1, 3); equations: (k, 14); start: (7,);
-            end: (ends,).
+        states: (2 k + 1, 7) at nodes and midpoints.
+        dipoles: (k + 1, 3).
+        equations: (k, 14).
+        start: (7,).
+        end: (ends,).
         begins: (k + 1,) the first unknown of each interval, and of the last node.
-        places, entries: of the band, the places that intervals' blocks fill, and with which of their entries.
+        places, entries: indices of the band filled by the blocks of the intervals, and of the block entries.
     """
 
     states: IntArray
@@ -64,11 +67,11 @@ class BandLayout:
         return int(self.end[-1]) + 1
 
     def band(self, blocks: FloatArray, tail: FloatArray) -> FloatArray:
-        """Return the band of intervals' `blocks` (k, WIDE, WIDE), in part overwritten, and of the `tail`.
+        """Return the band of the `blocks` (k, WIDE, WIDE) of the intervals and of the `tail`; modifies both.
 
-        The tail holds the last node's state and dipole and the end's equations.
+        The tail holds the state and the dipole of the last node, and the equations of the end.
         """
-        # The corner that two intervals share belongs to the second.
+        # The block of the node shared by two intervals belongs to the second.
         blocks[1:, :10, :10] += blocks[:-1, STEP:, STEP:]
         tail[:10, :10] += blocks[-1, STEP:, STEP:]
         filled = np.zeros(self.size * _ROWS)
@@ -76,14 +79,14 @@ class BandLayout:
         band = filled.reshape(self.size, _ROWS)
         row, column = np.indices(tail.shape)
         band[int(self.begins[-1]) + column, 2 * _BAND + row - column] = tail
-        for k in range(7):  # the start's equations are the first state itself
+        for k in range(7):  # the equations of the start contain the first state only
             band[k, 2 * _BAND + 7] = band[k + 7, 2 * _BAND - 7] = 1.0
         return band.T
 
 
 @lru_cache(maxsize=16)
-def layout(count: int, ends: int) -> BandLayout:
-    """Return the layout of a slew in `count` intervals with `ends` equations at its end."""
+def band_layout(count: int, ends: int) -> BandLayout:
+    """Return the layout for `count` intervals and `ends` equations at the end."""
     begins = 7 + STEP * np.arange(count + 1)
     states = np.empty((2 * count + 1, 7), dtype=np.int64)
     states[::2] = begins[:, None] + np.arange(7)
@@ -104,23 +107,23 @@ def layout(count: int, ends: int) -> BandLayout:
 
 
 class Factors:
-    """The factors of a band, for as many right sides as are wanted."""
+    """The factors of a band matrix, for several right-hand sides."""
 
     def __init__(self, band: FloatArray) -> None:
-        """Factor a `band` in its place. Raises PlanningError where it is singular."""
+        """Factor a `band` in place. Raises PlanningError if it is singular."""
         from scipy.linalg.lapack import dgbtrf  # noqa: PLC0415 - see the top
 
         self._factors, self._pivots, info = dgbtrf(band, _BAND, _BAND, overwrite_ab=1)
         if info:
-            raise PlanningError("the equations of a slew are singular")
+            raise PlanningError("the equations of the slew are singular")
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the solution (size,) of a right side (size,). Raises PlanningError without any."""
+        """Return the solution (size,) of a right-hand side (size,). Raises PlanningError unless finite."""
         from scipy.linalg.lapack import dgbtrs  # noqa: PLC0415 - see the top
 
         found, _ = dgbtrs(self._factors, _BAND, _BAND, right[:, None], self._pivots)
         if not np.isfinite(found).all():
-            raise PlanningError("the equations of a slew are singular")
+            raise PlanningError("the equations of the slew are singular")
         return np.asarray(found[:, 0])
 
 
@@ -132,7 +135,7 @@ _AXIS = np.arange(3)
 class Trajectory:
     """States (2 k + 1, 7) at nodes and midpoints, and dipoles (k + 1, 3) at nodes.
 
-    Times are counted in horizons, dipoles in the unit of the slew's motion.
+    Times are in units of the horizon, dipoles in the unit of the motion.
     """
 
     states: FloatArray
@@ -148,11 +151,15 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisedEquations:
-    """The equations around a trajectory: what remains of them, and their derivatives.
+    """The equations linearised about a trajectory: their residuals and derivatives.
 
     Attributes:
-        between: (k, 14); jacobian: (k, 14, WIDE), by what they touch.
-        begun: (7,), ended: (ends,); ending: (ends, 7), by the last state.
+        at: the trajectory.
+        between: (k, 14) residuals of the intervals.
+        begun: (7,) residuals of the start.
+        ended: (ends,) residuals of the end.
+        jacobian: (k, 14, WIDE) derivatives of the intervals' equations.
+        ending: (ends, 7) derivatives of the end's equations by the last state.
     """
 
     at: Trajectory
@@ -164,9 +171,9 @@ class LinearisedEquations:
 
 
 class Transcription:
-    """The equations of a slew from a state (7,) over `scale` s, the unit of its times, on `count` intervals.
+    """The equations of a slew from a state (7,) over `scale` s, the unit of time, on `count` intervals.
 
-    `unit` A m^2 is that of the dipoles; `weights` (3,) are those of the dipoles' squares in the cost.
+    `unit` A m^2 is the unit of the dipoles; `weights` (3,) weight the squares of the dipoles in the cost.
     """
 
     def __init__(
@@ -186,17 +193,17 @@ class Transcription:
         self.times = np.linspace(0.0, scale, 2 * count + 1)
         self.around = along(self.times)
         self.motion = SlewDynamics(craft, scale, unit, self.around)
-        self.layout = layout(count, self._ending.count)
+        self.layout = band_layout(count, self._ending.count)
         self._step = 1.0 / count
 
     def cost(self, at: Trajectory) -> float:
-        """Return the integral of the weighted square of the dipole, exactly."""
+        """Return the exact integral of the weighted square of the dipole."""
         left, right = at.dipoles[:-1], at.dipoles[1:]
         squares = left * left + left * right + right * right
         return self._step / 3.0 * float(np.sum(squares @ self.weights))
 
     def remainders(self, at: Trajectory) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what remains of the intervals' equations (k, 14), the start's (7,) and the end's."""
+        """Return the residuals of the intervals (k, 14), of the start (7,) and of the end (ends,)."""
         x, h = at.states, self._step
         flow = self.motion.flow(x, at.all_dipoles())
         a, c, b = flow[:-1:2], flow[1::2], flow[2::2]
@@ -206,11 +213,11 @@ class Transcription:
         return np.concatenate([half, whole], axis=1), *self.ends_missed(at)
 
     def ends_missed(self, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Return what remains of the equations of the start (7,) and of the end."""
+        """Return the residuals of the start (7,) and of the end (ends,)."""
         return at.states[0] - self.start, self._ending.miss(at.states[-1])
 
     def linear(self, at: Trajectory) -> LinearisedEquations:
-        """Return the equations around a trajectory."""
+        """Return the equations linearised about a trajectory."""
         h = self._step
         slopes = self.motion.slopes(at.states, at.all_dipoles())
         by_state, by_dipole = slopes[:, :, :7], slopes[:, :, 7:]
@@ -230,38 +237,43 @@ class Transcription:
         ending = self._ending.slope(at.states[-1])
         return LinearisedEquations(at, *self.remainders(at), jacobian, ending)
 
-    def slope(self, linear: LinearisedEquations, price: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of cost plus `price` (size,) times the equations.
+    def slope(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
+        """Return the derivative (size,) of the Lagrangian, and the residuals at the equations' indices.
 
-        In the equations' places stands what remains of them; only there `price` counts.
+        The Lagrangian is the cost plus `multipliers` (size,) times the equations; only the multipliers at the
+        indices of the equations count.
         """
-        at, place = linear.at, self.layout
-        result = np.zeros(place.size)
-        pulled = (price[place.equations][:, None, :] @ linear.jacobian)[:, 0]
-        first = place.begins[:-1, None]
+        at, layout = linear.at, self.layout
+        result = np.zeros(layout.size)
+        pulled = (multipliers[layout.equations][:, None, :] @ linear.jacobian)[:, 0]
+        first = layout.begins[:-1, None]
         result[first + np.arange(STEP)] = pulled[:, :STEP]
         result[first + STEP + np.arange(10)] += pulled[:, STEP:]
-        result[place.states[0]] += price[place.start]
-        result[place.states[-1]] += price[place.end] @ linear.ending
+        result[layout.states[0]] += multipliers[layout.start]
+        result[layout.states[-1]] += multipliers[layout.end] @ linear.ending
         m = at.dipoles
         heat = np.zeros_like(m)
         heat[:-1] += 2.0 * m[:-1] + m[1:]
         heat[1:] += 2.0 * m[1:] + m[:-1]
-        result[place.dipoles] += self._step / 3.0 * heat * self.weights
-        result[place.equations] = linear.between
-        result[place.start], result[place.end] = linear.begun, linear.ended
+        result[layout.dipoles] += self._step / 3.0 * heat * self.weights
+        result[layout.equations] = linear.between
+        result[layout.start], result[layout.end] = linear.begun, linear.ended
         return result
 
     def band(
-        self, linear: LinearisedEquations, price: FloatArray, state_part: FloatArray, dipole_part: FloatArray
+        self,
+        linear: LinearisedEquations,
+        multipliers: FloatArray,
+        state_part: FloatArray,
+        dipole_part: FloatArray,
     ) -> FloatArray:
-        """Return the band of the derivatives of `slope`.
+        """Return the band matrix of the derivatives of `slope`.
 
         `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are added to the curvature by states and by
-        dipoles: the parts of barriers and of convexity.
+        dipoles: the parts of the barriers and of the convexification.
         """
         h = self._step
-        bend = self._bend(linear, price[self.layout.equations])
+        bend = self._bend(linear, multipliers[self.layout.equations])
         bend[:, :7, :7] += state_part
         nodes = bend[::2]
         heat = np.full(self.count + 1, 4.0 * h / 3.0)
@@ -279,14 +291,14 @@ class Transcription:
         block[:, :, EQUATIONS] += linear.jacobian.transpose(0, 2, 1)
         tail = np.zeros((10 + len(linear.ended),) * 2)
         tail[:10, :10] = nodes[-1]
-        tail[:4, :4] += self._ending.curvature(price[self.layout.end])
+        tail[:4, :4] += self._ending.curvature(multipliers[self.layout.end])
         tail[10:, :7], tail[:7, 10:] = linear.ending, linear.ending.T
         return self.layout.band(block, tail)
 
-    def _bend(self, linear: LinearisedEquations, price: FloatArray) -> FloatArray:
-        """Return the curvature (2 k + 1, 10, 10) of the equations times their `price` (k, 14)."""
+    def _bend(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
+        """Return the curvature (2 k + 1, 10, 10) of the equations weighted by `multipliers` (k, 14)."""
         at, h = linear.at, self._step
-        half, whole = price[:, :7], price[:, 7:]
+        half, whole = multipliers[:, :7], multipliers[:, 7:]
         y = np.zeros_like(at.states)
         y[:-1:2] += -h / 8.0 * half - h / 6.0 * whole
         y[2::2] += h / 8.0 * half - h / 6.0 * whole
@@ -296,14 +308,14 @@ class Transcription:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewLimits:
-    """The limits; `dipole` (3,) is in the unit of the motion, None for a slew without such a limit."""
+    """The limits; `dipole` (3,) is in the unit of the motion, None for a slew without a dipole limit."""
 
     equations: Transcription
     dipole: FloatArray | None
     cones: ConeConstraints
 
     def values(self, at: Trajectory) -> FloatArray:
-        """Return by how much every limit is kept."""
+        """Return the values g of all limits, which are negative where a limit is exceeded."""
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
             found += [(at.dipoles + self.dipole).ravel(), (self.dipole - at.dipoles).ravel()]
@@ -313,31 +325,31 @@ class SlewLimits:
 
     def pull(self, at: Trajectory, weights: FloatArray) -> FloatArray:
         """Return the derivative (size,) of `weights` times the limits."""
-        place = self.equations.layout
-        result = np.zeros(place.size)
+        layout = self.equations.layout
+        result = np.zeros(layout.size)
         dipoles, cones = self._parts(weights, at)
         if self.dipole is not None:
-            result[place.dipoles] = dipoles[0] - dipoles[1]
+            result[layout.dipoles] = dipoles[0] - dipoles[1]
         if self.cones.count:
             slopes = self.cones.slopes(at.states[1:, :4])
-            result[place.states[1:, :4]] = np.einsum("cn,cnj->nj", cones, slopes)
+            result[layout.states[1:, :4]] = np.einsum("cn,cnj->nj", cones, slopes)
         return result
 
     def along(self, at: Trajectory, change: FloatArray) -> FloatArray:
-        """Return the change of every limit's value along a step (size,), linearly."""
-        place = self.equations.layout
+        """Return the linear change of every limit for a step (size,)."""
+        layout = self.equations.layout
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
-            found += [change[place.dipoles].ravel(), -change[place.dipoles].ravel()]
+            found += [change[layout.dipoles].ravel(), -change[layout.dipoles].ravel()]
         if self.cones.count:
             slopes = self.cones.slopes(at.states[1:, :4])
-            found.append(np.einsum("cnj,nj->cn", slopes, change[place.states[1:, :4]]).ravel())
+            found.append(np.einsum("cnj,nj->cn", slopes, change[layout.states[1:, :4]]).ravel())
         return np.concatenate(found)
 
     def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the limits add to the curvature by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
+        """Return the curvature added by the limits, by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
 
-        `stiff` are the squares' weights, `bent` those of the limits' own curvature.
+        `stiff` weights the squares of the derivatives, `bent` the curvature of the limits.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -350,7 +362,7 @@ class SlewLimits:
         return states, heavy
 
     def _parts(self, values: FloatArray, at: Trajectory) -> tuple[FloatArray, FloatArray]:
-        """Split values of all limits into those of the dipoles and of the cones."""
+        """Split values of all limits into those of the dipoles and those of the cones."""
         nodes = 0 if self.dipole is None else 2 * at.dipoles.size
         dipoles = values[:nodes].reshape(2, -1, 3) if nodes else values[:0]
         return dipoles, values[nodes:].reshape(self.cones.count, len(at.states) - 1)
@@ -360,30 +372,30 @@ _TOLERANCE = 1e-6
 _TO_BOUNDARY = 0.995
 _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
-"""The first halvings are corrected, so often each."""
+"""Number of halvings that are corrected, and corrections of each."""
 _HEAVIER = 1.2
-"""The merit's weight of the equations over their largest multiplier."""
+"""Weight of the equations in the merit, as a multiple of the largest multiplier."""
 _FAR = 0.03
-"""Sum of all equations' violations beyond which their curvature is left out."""
+"""Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
-"""Of that sum up to one, the convexity that such a step has at least: without it the step is too long."""
+"""Least convexification per constraint violation (up to one): without it such a step is too long."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Iterate:
-    """An iterate.
+    """An iterate of the interior point method.
 
     Attributes:
-        linear: the equations around its trajectory.
-        price: (size,) the equations' multipliers, in their places.
+        linear: the equations linearised about its trajectory.
+        multipliers: (size,) of the equations, at their indices.
         slack, dual: of every limit.
-        slope: (size,) of the Lagrangian without the limits' part, equations in their places.
+        slope: (size,) of the Lagrangian without the part of the limits, with the residuals of the equations.
     """
 
     linear: LinearisedEquations
-    price: FloatArray
+    multipliers: FloatArray
     slack: FloatArray
     dual: FloatArray
     slope: FloatArray
@@ -396,9 +408,9 @@ class Iterate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewtonStep:
-    """A Newton step: of all unknowns (size,) and of the limits' duals; `off` is what the slacks lack.
+    """A Newton step: `change` of all unknowns (size,), and `dual` of the limits.
 
-    `factors` are those of its equations.
+    `off` are the residuals of the slacks, `factors` those of the Newton matrix.
     """
 
     change: FloatArray
@@ -408,42 +420,43 @@ class NewtonStep:
 
 
 class SlewProgram:
-    """Least cost within limits."""
+    """The nonlinear program: the cost is minimised subject to equations and limits."""
 
     def __init__(self, equations: Transcription, limits: SlewLimits) -> None:
         self.equations, self._limits = equations, limits
-        place = equations.layout
-        self._equal = np.concatenate([place.equations.ravel(), place.start, place.end])
-        self._primal = np.concatenate([place.states.ravel(), place.dipoles.ravel()])
+        layout = equations.layout
+        self._equal = np.concatenate([layout.equations.ravel(), layout.start, layout.end])
+        self._primal = np.concatenate([layout.states.ravel(), layout.dipoles.ravel()])
         self.steps = 0
 
     def factors(self, point: Iterate) -> Factors:
-        """Return the factors that lead to the least change that mends equations. Raises PlanningError.
+        """Return the factors for the smallest change that reduces the residuals. Raises PlanningError.
 
-        With the curvature of the equations in them, the way to a flat optimum's other side would be one, too.
+        They omit the curvature of the equations: with it a step to the other side of a flat optimum would
+        also be small.
         """
         states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
         stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
-        return Factors(self.equations.band(point.linear, np.zeros_like(point.price), *stiff))
+        return Factors(self.equations.band(point.linear, np.zeros_like(point.multipliers), *stiff))
 
-    def begin(self, guess: Trajectory, price: FloatArray | None, barrier: float) -> Iterate:
-        """Return a guess as an iterate of Newton's method."""
+    def begin(self, guess: Trajectory, multipliers: FloatArray | None, barrier: float) -> Iterate:
+        """Return an initial guess as an iterate of the interior point method."""
         slack = np.maximum(self._limits.values(guess), min(1e-2, 10.0 * barrier))
-        price = np.zeros(self.equations.layout.size) if price is None else price
-        return self._point(guess, price, slack, barrier / slack)
+        multipliers = np.zeros(self.equations.layout.size) if multipliers is None else multipliers
+        return self._point(guess, multipliers, slack, barrier / slack)
 
     def lack(self, point: Iterate) -> tuple[float, float]:
-        """Return the sum of all equations' violations, and of what the limits' slacks are off."""
+        """Return the sum of the constraint violations, and that of the residuals of the slacks."""
         off = self._limits.values(point.at) - point.slack
         return float(np.abs(point.slope[self._equal]).sum()), float(np.abs(off).sum())
 
-    def _point(self, at: Trajectory, price: FloatArray, slack: FloatArray, dual: FloatArray) -> Iterate:
+    def _point(self, at: Trajectory, multipliers: FloatArray, slack: FloatArray, dual: FloatArray) -> Iterate:
         equations = self.equations
         linear = equations.linear(at)
-        return Iterate(linear, price, slack, dual, equations.slope(linear, price))
+        return Iterate(linear, multipliers, slack, dual, equations.slope(linear, multipliers))
 
     def error(self, point: Iterate, barrier: float) -> float:
-        """Return the largest remainder of the equations of optimality at a barrier."""
+        """Return the largest residual of the optimality conditions at a barrier parameter."""
         worst = float(np.abs(point.slope - self._limits.pull(point.at, point.dual)).max())
         if point.slack.size:
             worst = max(worst, float(np.abs(self._limits.values(point.at) - point.slack).max()))
@@ -453,18 +466,18 @@ class SlewProgram:
     def moved(
         self, point: Iterate, barrier: float, convex: float, error: float
     ) -> tuple[Iterate | None, float]:
-        """Return the next iterate, None without one, and the convexity that it took."""
+        """Return the next iterate and the convexification used; the iterate is None if no step is found."""
         lack = self.lack(point)[0]
         is_far = lack > _FAR
         least = _DAMPED * min(1.0, lack) if is_far else 0.0
         bent = np.zeros_like(point.dual) if is_far else point.dual
         stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
-        price = np.zeros_like(point.price) if is_far else point.price
+        multipliers = np.zeros_like(point.multipliers) if is_far else point.multipliers
         states, heavy = stiffness
         for _ in range(10):
             more = max(convex, least)
             stiff = states + more * _EYE7, heavy + more
-            step = self._newton(point, barrier, more, self.equations.band(point.linear, price, *stiff))
+            step = self._newton(point, barrier, more, self.equations.band(point.linear, multipliers, *stiff))
             if step is not None:
                 moved = self._searched(point, step, barrier, error)
                 if moved is not None:
@@ -475,11 +488,11 @@ class SlewProgram:
         return None, convex
 
     def _newton(self, point: Iterate, barrier: float, convex: float, band: FloatArray) -> NewtonStep | None:
-        """Return the Newton step of a `band` with `convex` added; None where the curvature stays concave."""
+        """Return the Newton step of a `band` with `convex` added; None if the curvature is not positive."""
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # The limits' duals after the step, were it to move nothing.
+        # The duals of the limits after a step of zero length.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
@@ -492,11 +505,11 @@ class SlewProgram:
         return NewtonStep(change, toward - stiff * limits.along(at, change) - point.dual, off, factors)
 
     def _searched(self, point: Iterate, step: NewtonStep, barrier: float, error: float) -> Iterate | None:
-        """Return the point along a step that lowers the error, or the merit; None without one."""
+        """Return the iterate along a step that lowers the error or the merit; None if there is none."""
         equal, missed = self._equal, point.slope[self._equal]
         size = _share(point.slack, self._limits.along(point.at, step.change) + step.off)
         dual = point.dual + _share(point.dual, step.dual) * step.dual
-        weight = _HEAVIER * float(np.abs(point.price[equal] + step.change[equal]).max())
+        weight = _HEAVIER * float(np.abs(point.multipliers[equal] + step.change[equal]).max())
         before = self._merit(point.at, point.slack, barrier, weight, missed)
         violation = float(np.abs(missed).sum() + np.abs(step.off).sum())
         left = missed
@@ -505,7 +518,7 @@ class SlewProgram:
             change = size * step.change
             for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
                 if correction:
-                    # What the curvature of the equations adds is taken back by the same factors.
+                    # Second-order correction: residuals by curvature are removed by the same factors.
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)
@@ -515,65 +528,68 @@ class SlewProgram:
                 left = self._violations(there)
                 lowered = self._merit(there, slack, barrier, weight, left) < lower
                 if lowered or (attempt == 0 and correction == _CORRECTIONS):
-                    price = point.price.copy()
-                    price[equal] += size * step.change[equal]
-                    moved = self._point(there, price, slack, dual)
+                    multipliers = point.multipliers.copy()
+                    multipliers[equal] += size * step.change[equal]
+                    moved = self._point(there, multipliers, slack, dual)
                     if lowered or self.error(moved, barrier) < 0.9 * error:
                         return moved
             size *= 0.5
         return None
 
     def _shifted(self, point: Iterate, change: FloatArray, off: FloatArray) -> tuple[Trajectory, FloatArray]:
-        """Return the trajectory and the slacks after a change (size,); the slacks mend `off`, too."""
-        at, place = point.at, self.equations.layout
-        there = Trajectory(at.states + change[place.states], at.dipoles + change[place.dipoles])
+        """Return trajectory and slacks after a change (size,); the slacks also remove the residuals `off`."""
+        at, layout = point.at, self.equations.layout
+        there = Trajectory(at.states + change[layout.states], at.dipoles + change[layout.dipoles])
         return there, point.slack + self._limits.along(at, change) + off
 
     def _violations(self, at: Trajectory) -> FloatArray:
-        """Return what remains of all equations."""
+        """Return the residuals of all equations."""
         return np.concatenate([part.ravel() for part in self.equations.remainders(at)])
 
     def _merit(
         self, at: Trajectory, slack: FloatArray, barrier: float, weight: float, missed: FloatArray
     ) -> float:
-        """Return cost and barriers plus `weight` times the violation of all equations."""
+        """Return the merit: cost and barriers plus `weight` times the constraint violation."""
         violation = float(np.abs(missed).sum() + np.abs(self._limits.values(at) - slack).sum())
         return self.equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
 
 
 class NewtonRun:
-    """Newton's method under way from a guess: it can be left and gone on with.
+    """An interior point iteration from an initial guess that can be interrupted and resumed.
 
     Attributes:
         point: the newest iterate.
-        is_over: there is an optimum, or no way on.
+        is_over: an optimum was found, or no further step exists.
     """
 
     def __init__(
         self,
         program: SlewProgram,
         guess: Trajectory,
-        price: FloatArray | None = None,
+        multipliers: FloatArray | None = None,
         first: float = FIRST_BARRIER,
         last: float = 1e-8,
     ) -> None:
-        """Costs should be about one. `price` (size,) multiplies the equations; barriers fall to `last`."""
+        """Start from `guess` with the `multipliers` (size,) of the equations, None for zero.
+
+        The cost should be of the order of one. The barrier parameter falls from `first` to `last`.
+        """
         self.program, self._first, self._last, self.is_over = program, first, last, False
-        self.point = program.begin(guess, price, first)
+        self.point = program.begin(guess, multipliers, first)
         self._barrier, self._convex = (first if self.point.slack.size else 0.0), 0.0
 
     @property
     def lack(self) -> float:
-        """The sum of all violations; zero from where the barriers have begun to fall."""
+        """Constraint violation; zero once the barrier parameter has begun to fall."""
         return 0.0 if 0.0 < self._barrier < self._first else self.missed
 
     @property
     def missed(self) -> float:
-        """The sum of all violations."""
+        """Constraint violation."""
         return sum(self.program.lack(self.point))
 
     def run(self, most: int) -> Iterate | None:
-        """Return the optimum found within `most` more steps, None when there is none."""
+        """Return the optimum found within `most` more steps; None if none was found."""
         if self.is_over:
             return None
         with np.errstate(over="ignore", invalid="ignore"):  # a step too long is shortened
@@ -602,7 +618,7 @@ class NewtonRun:
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:
-    """Return the largest share of a change, up to one, that leaves positive values positive."""
+    """Return the largest share of a change, at most one, that keeps positive values positive."""
     falling = change < 0.0
     if not falling.any():
         return 1.0

@@ -49,31 +49,31 @@ from knightcube.gnc.guidance.three_axes.slew_task import (
     ConeConstraints,
     End,
     SlewTask,
-    in_the_way,
+    blocking_cone,
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
-"""Of a path that others begin from, and of one that is flown."""
+"""Last barrier parameters: of a warm start, and of a path that is flown."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Sum of all violations below which a path that others begin from is one, though no optimum yet, and at last
-one that is flown: many come to their optimum slowly. What is missed is mended by the closing."""
+"""Constraint violations below which an iterate that is no optimum yet is accepted: as a warm start, and as a
+path to fly. Many runs converge slowly. The closing removes the residuals."""
 _STEPS_FREE = 25
-"""Newton steps of a path without the dipoles' limit."""
+"""Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
-"""Newton steps within limits, one after the other, and from which lack on a way is left after them: half of
-those that lead nowhere are after the first, one in twenty of the others is."""
+"""Newton steps within the limits, in stages, and the violation after each stage beyond which the run is
+abandoned. Half of the runs that fail exceed the first bound, one in twenty of the others does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedPath:
-    """A solved path."""
+    """A path that satisfies the equations."""
 
     program: SlewProgram
     point: Iterate
 
     @property
     def equations(self) -> Transcription:
-        """Its equations."""
+        """The equations of the path."""
         return self.program.equations
 
     @property
@@ -88,10 +88,10 @@ class SolvedPath:
 
 
 class SlewSolver:
-    """Solves for one task; `unit` A m^2 is that of its dipoles.
+    """Solves for paths of one task; `unit` A m^2 is the unit of its dipoles.
 
-    `extra` (cones, 2 nodes) rad is added to its cones at the points of the fine grid; `share` of the dipoles'
-    limit is used. `steps` are Newton's so far, `work` those times the intervals.
+    `extra` (cones, 2 nodes) rad widens the cones at the points of the fine grid. `share` is the part of the
+    dipole limit that is used. `steps` counts the Newton steps, `work` the steps times their intervals.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -114,7 +114,7 @@ class SlewSolver:
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
-        """Return whether a relaxed path keeps it."""
+        """Return whether a path found without the dipole limit keeps the limit and the cones."""
         kept = self.kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
@@ -125,47 +125,47 @@ class SlewSolver:
         return Transcription(task.craft, self.unit, task.along, start, task.end, count, scale, self._full)
 
     def free(self, equations: Transcription, guess: Trajectory) -> SolvedPath | None:
-        """Return the path that is flown, without the dipoles' limit, from a guess."""
+        """Return the path without the dipole limit from an initial guess, converged to be flown."""
         return self.found(self.descent(equations, guess, LAST_BARRIER), _STEPS_FREE)
 
     def descent(self, equations: Transcription, guess: Trajectory, last: float = WALK_BARRIER) -> NewtonRun:
-        """Return the way from a guess to a path that keeps the cones, without the dipoles' limit."""
+        """Return the iteration from a guess to a path that keeps the cones, without the dipole limit."""
         equations.weights = self._full / max(equations.cost(guess), 1e-9)
         return NewtonRun(
             SlewProgram(equations, SlewLimits(equations, None, self.kept(equations))), guess, last=last
         )
 
     def limited(self, start: SolvedPath, count: int, time: float, last: float) -> SolvedPath | None:
-        """Return the path within all limits on `count` intervals over `time` s, from one near it."""
+        """Return the path within all limits on `count` intervals over `time` s, warm-started from `start`."""
         equations = self.equations(time, count)
         at, before = transferred(start, equations), start.equations.weights
         equations.weights = self._full / max(equations.cost(at), 1e-9)
         same = count == start.equations.count
-        price = start.point.price * float(equations.weights[0] / before[0]) if same else None
+        multipliers = start.point.multipliers * float(equations.weights[0] / before[0]) if same else None
         limit = self.share * self._limit
         near = same and time == start.horizon and self.peak(start) < self.share
         if not near and (last == LAST_BARRIER or self.peak(start) > self.share):
             at = Trajectory(at.states, np.clip(at.dipoles, -0.98 * limit, 0.98 * limit))
-        return self._led(equations, at, price, (WALK_BARRIER if near else FIRST_BARRIER, last))
+        return self._converged(equations, at, multipliers, (WALK_BARRIER if near else FIRST_BARRIER, last))
 
     def again(self, path: SlewPath) -> SolvedPath | None:
-        """Return the path within all limits near one of a task that is nearly the same."""
+        """Return the path within all limits near the path of a similar task."""
         equations = self.equations(path.horizon, (len(path.times) - 1) // 2)
         states = np.concatenate([path.quaternion, path.horizon * path.rate], axis=1)
         at = Trajectory(states, path.dipole[::2] / self.unit)
         equations.weights = self._full / max(equations.cost(at), 1e-9)
-        return self._led(equations, at, None, (WALK_BARRIER, LAST_BARRIER))
+        return self._converged(equations, at, None, (WALK_BARRIER, LAST_BARRIER))
 
-    def _led(
+    def _converged(
         self,
         equations: Transcription,
         at: Trajectory,
-        price: FloatArray | None,
+        multipliers: FloatArray | None,
         barriers: tuple[float, float],
     ) -> SolvedPath | None:
-        """Return the path within all limits that a trajectory leads to; barriers fall from first to last."""
+        """Return the path within all limits from a trajectory; barriers fall from first to last."""
         limits = SlewLimits(equations, self.share * self._limit, self.kept(equations))
-        descent = NewtonRun(SlewProgram(equations, limits), at, price, *barriers)
+        descent = NewtonRun(SlewProgram(equations, limits), at, multipliers, *barriers)
         found = None
         for look, (steps, lack) in enumerate(_LOOKS):
             enough = _FLOWN_MET * (look == len(_LOOKS) - 1)
@@ -177,9 +177,9 @@ class SlewSolver:
         return found
 
     def found(self, descent: NewtonRun, most: int, enough: float = 0.0) -> SolvedPath | None:
-        """Return the path found within `most` more steps, None without one.
+        """Return the path found within `most` more steps; None if there is none.
 
-        It need not be an optimum where the violations sum to less than is `enough`.
+        An iterate whose constraint violation is less than `enough` is accepted although it is no optimum.
         """
         program, before = descent.program, descent.program.steps
         point = descent.run(most)
@@ -192,15 +192,15 @@ class SlewSolver:
         return SolvedPath(program, point)
 
     def kept(self, equations: Transcription) -> ConeConstraints:
-        """Return the cones at the points of equations but the first."""
+        """Return the cone constraints at all points of the equations except the first."""
         wider = self.extra if self.extra.shape[1] == 2 * equations.count else 0.0
         return ConeConstraints(self._task.cones, np.asarray(wider), equations.times[1:])
 
 
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
-    """Return a path on the grid and over the horizon of other equations.
+    """Return a path transferred to the grid and the horizon of other equations.
 
-    Slower by a ratio, the same way takes dipoles smaller by its square.
+    A path slower by a ratio takes dipoles smaller by the square of the ratio.
     """
     at, own = start.at, start.equations
     dipoles = at.dipoles * (own.scale / equations.scale) ** 2
@@ -214,23 +214,23 @@ def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
 
 
 _BEGINS, _SPREAD = 24, 0.4
-"""Random begins, and how large: of the torque of half a turn."""
+"""Number of random starts, and their standard deviation in torques of half a rotation."""
 _COSINES = 6
-"""Of the torque in time, each along three axes."""
+"""Number of cosines of the torque in time, for each of three axes."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights: of a radian that the end misses, of a cone's cosine, and of the torque of half a turn."""
+"""Weights of the end error (rad), of the cosine inside a cone, and of the torque of half a rotation."""
 _ROOM = 0.03
-"""Of a cone's cosine, that a guess keeps off."""
+"""Margin of a guess to a cone, as a cosine."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
-"""Torques of half a turn."""
+"""Longest step, in torques of half a rotation."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Modes of less heat, and directions of the momentum that are reached less, are left out."""
+"""Relative heat of modes, and relative gain of momentum directions, below which they are discarded."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
-"""rad off the target, and of a cone's cosine, from which a guess comes after those that miss by less."""
+"""End error (rad) and cosine inside a cone beyond which a guess is ordered after the others."""
 _SAME = 0.1
-"""Curves that differ by less of their size are one."""
+"""Relative difference below which two curves are the same."""
 
 
 def guesses(
@@ -242,9 +242,9 @@ def guesses(
     kept: ConeConstraints,
     scale: float,
 ) -> list[Trajectory]:
-    """Return guesses from a state (7,) to the end over `scale` s, the promising ones first.
+    """Return guesses from a state (7,) to the end over `scale` s, the most promising first.
 
-    `around` (2 k + 1) acts, the cones of `kept` are kept.
+    `around` is the environment at 2 k + 1 times; the cones of `kept` are kept.
     """
     curves = _curves(craft, around, start, end, scale)
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
@@ -256,7 +256,12 @@ def guesses(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MomentumCurves:
-    """Momenta at n times, kg m^2/s, ICRS: base (n, 3) and modes (d, n, 3), in torques of half a turn."""
+    """Momenta at n times, kg m^2/s, ICRS.
+
+    Attributes:
+        base: (n, 3), a curve that reaches the end.
+        modes: (d, n, 3), in torques of half a rotation.
+    """
 
     base: FloatArray
     modes: FloatArray
@@ -265,7 +270,7 @@ class _MomentumCurves:
 def _curves(
     craft: SlewCraft, around: SlewEnvironment, start: FloatArray, end: End, scale: float
 ) -> _MomentumCurves:
-    """Return the momenta from the start's to the end's, whose modes take heat independently."""
+    """Return the momenta from start to end, with modes whose heats are independent."""
     count = len(around.field)
     step, strength = scale / (count - 1), np.linalg.norm(around.field, axis=1)
     field = around.field / strength[:, None]
@@ -291,13 +296,13 @@ def _curves(
 
 
 def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return the momentum (3,) of an attitude (4,) at a rate (3,) rad/s, both vectors ICRS."""
+    """Return the momentum (3,) at an attitude (4,) and a rate (3,) rad/s, both vectors in ICRS axes."""
     turned = attitude_matrix(q)
     return np.asarray(turned.T @ craft.inertia @ turned @ rate)
 
 
 class _MomentumFit:
-    """Least squares, by Levenberg and Marquardt, of many sums of the modes at once."""
+    """Levenberg-Marquardt least squares of many sums of the modes at once."""
 
     def __init__(
         self,
@@ -312,10 +317,10 @@ class _MomentumFit:
         self._scale, self._lighter = scale, np.linalg.inv(craft.inertia)
 
     def found(self) -> list[FloatArray]:
-        """Return states (n, 7) of the guesses, the promising ones first, each once."""
+        """Return the states (n, 7) of the distinct guesses, the most promising first."""
         sums = self._fitted()
-        q, momentum = self._flown(sums)
-        missed, crossed = self._missed(q), self._crossed(q)
+        q, momentum = self._propagated(sums)
+        missed, crossed = self._end_errors(q), self._cone_violations(q)
         lost = np.linalg.norm(missed, axis=1) > _MISSED
         lost |= crossed.max(axis=1, initial=0.0) > _INSIDE_CONE + _ROOM
         taken: list[FloatArray] = []
@@ -328,42 +333,44 @@ class _MomentumFit:
         return states
 
     def _fitted(self) -> FloatArray:
-        """Return sums (m, d) that miss least."""
+        """Return the mode amplitudes (m, d) of the least-squares fits."""
         count = len(self._curves.modes)
         sums = _SPREAD * np.random.default_rng(16).normal(size=(_BEGINS, count))
-        left = self._left(sums)
+        left = self._residuals(sums)
         damped, small = np.full(_BEGINS, _DAMPED), 1e-4
         for _ in range(_ROUNDS):
             near = (sums[:, None] + small * np.eye(count)).reshape(-1, count)
-            slopes = (self._left(near).reshape(_BEGINS, count, -1) - left[:, None]) / small
+            slopes = (self._residuals(near).reshape(_BEGINS, count, -1) - left[:, None]) / small
             squares = slopes @ slopes.transpose(0, 2, 1) + damped[:, None, None] * np.eye(count)
             steps = -np.linalg.solve(squares, slopes @ left[:, :, None])[:, :, 0]
             size = np.linalg.norm(steps, axis=1, keepdims=True)
             there = sums + steps * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-9))
-            then = self._left(there)
+            then = self._residuals(there)
             better = np.sum(then**2, axis=1) < np.sum(left**2, axis=1)
             sums, left = np.where(better[:, None], there, sums), np.where(better[:, None], then, left)
             damped = np.where(better, 0.2 * damped, 5.0 * damped)
         return np.asarray(sums)
 
-    def _left(self, sums: FloatArray) -> FloatArray:
-        """Return what is to be least (m, n) of sums (m, d)."""
-        q, _ = self._flown(sums)
-        return np.concatenate([_END * self._missed(q), _CONE * self._crossed(q), _HEAT * sums], axis=1)
+    def _residuals(self, sums: FloatArray) -> FloatArray:
+        """Return the weighted residuals (m, n) for mode amplitudes (m, d)."""
+        q, _ = self._propagated(sums)
+        return np.concatenate(
+            [_END * self._end_errors(q), _CONE * self._cone_violations(q), _HEAT * sums], axis=1
+        )
 
-    def _missed(self, q: FloatArray) -> FloatArray:
-        """Return by what (m, 3) rad paths (m, n, 4) miss the end, of a boresight its sine."""
+    def _end_errors(self, q: FloatArray) -> FloatArray:
+        """Return the end-point errors (m, 3), rad, of paths (m, n, 4). For a boresight they are sines."""
         end, last = self._end, q[:, -1]
         if isinstance(end, BoresightEnd):
             return shown(last, np.broadcast_to(end.direction, (len(q), 3))) - end.axis
         return to_rotation_vector(multiply(np.broadcast_to(end.quaternion, last.shape), conjugate(last)))
 
-    def _crossed(self, q: FloatArray) -> FloatArray:
-        """Return how deep (m, cones n) paths lie within the cones, of the cosine."""
+    def _cone_violations(self, q: FloatArray) -> FloatArray:
+        """Return the depths (m, cones n) of paths inside the cones, as cosines."""
         return np.maximum(0.0, _ROOM - self._kept.values(q[:, None, 1:])).reshape(len(q), -1)
 
-    def _flown(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the attitudes (m, n, 4) and momenta (m, n, 3) of sums (m, d), by the midpoint rule."""
+    def _propagated(self, sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return attitudes (m, n, 4) and momenta (m, n, 3) for amplitudes (m, d), by the midpoint rule."""
         momentum = self._curves.base + np.tensordot(sums, self._curves.modes, 1)
         half = 0.5 * self._scale / (momentum.shape[1] - 1)
         middle = 0.5 * (momentum[:, 1:] + momentum[:, :-1])
@@ -387,7 +394,7 @@ def _unit(q: FloatArray) -> FloatArray:
 
 
 def _dipoles(motion: SlewDynamics, craft: SlewCraft, states: FloatArray) -> FloatArray:
-    """Return the least dipoles (n, 3) for the part of the states' torque that lies across the field."""
+    """Return the smallest dipoles (n, 3) for the component of the states' torque normal to the field."""
     still = motion.flow(states, np.zeros((len(states), 3)))
     wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
     field = motion.field(states[:, :4])
@@ -395,34 +402,35 @@ def _dipoles(motion: SlewDynamics, craft: SlewCraft, states: FloatArray) -> Floa
 
 
 ENOUGH = 3
-"""Relaxed paths of which the best is taken."""
+"""Number of relaxed paths from which the best is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
-"""Times a horizon that does not suffice."""
+"""Factors on a horizon that does not suffice."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratios of horizons on the walk to a shorter one, the first and the last: on the coarse grid, on the fine
-one, and there where a slew is only to be stretched."""
+"""Ratios of successive horizons in the continuation to a shorter one, the first and the last: on the coarse
+grid, on the fine grid, and on the fine grid if the slew is only to be stretched."""
 _CROSSED = 1.3
-"""Times the depth to which a path crosses a cone between the points, the cone is widened there."""
+"""Factor on the depth of a path inside a cone between the points, by which the cone is widened there."""
 _BEYOND = math.radians(0.02)
-"""rad, by which it is widened besides."""
+"""Additional widening of a cone, rad."""
 _BETWEEN = 16
-"""Intervals of a path from which the fine grid is reached where it is not from the coarse one."""
+"""Intervals of the intermediate grid, for paths that do not converge from the coarse to the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Of the limit, beyond which a path is lost when flown; and how much longer one beyond the limit takes."""
+"""Ratio of the flown dipole to its limit beyond which a path is abandoned, and the factor on the horizon of a
+path beyond the limit."""
 _PEAK = 0.9
-"""Of the limit: the dipole of the slew at which the walk begins."""
+"""Ratio of the dipole to its limit at which the continuation begins."""
 
 
 class HorizonContinuation:
-    """Walks of one task."""
+    """Continuation of the paths of one task over the horizon, the dipole limit and the cones."""
 
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
-        """After a `budget` of work no other step of a walk is begun."""
+        """Start no further continuation step after `budget` of work."""
         self._task, self._solver, self._budget = task, solver, budget
-        self._lost: set[tuple[float, float, float]] = set()  # coarse paths that led to no fine one
+        self._lost: set[tuple[float, float, float]] = set()  # coarse paths without a fine one
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return the path within the limits, on the fine grid, near a coarse one without."""
+        """Return the path within the limits on the fine grid, from a coarse path found without them."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
@@ -432,11 +440,11 @@ class HorizonContinuation:
         coarse = self._over(start, time)
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
-    def shortened(self, relaxed: list[SolvedPath], least: float, price: float) -> SolvedPath | None:
-        """Return the best path on walks to shorter horizons, as long as `price` W makes them cheaper.
+    def shortened(self, relaxed: list[SolvedPath], least: float, time_cost: float) -> SolvedPath | None:
+        """Return the best path found by shortening the horizon as long as `time_cost` W makes that cheaper.
 
-        A walk begins where a relaxed path just keeps the dipoles', with the path that needs the least
-        time for that.
+        Continuation starts where a relaxed path just keeps the dipole limit, with the path that needs the
+        least time for that.
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
@@ -447,15 +455,15 @@ class HorizonContinuation:
                 continue
             if self._task.cones:
                 begun = self._finer(begun, begun.horizon, WALK_BARRIER) or begun
-            ended = self._walked(begun, least, price, _COARSE_STEPS)
-            if best is None or self._value(ended, price) < self._value(best, price):
+            ended = self._walked(begun, least, time_cost, _COARSE_STEPS)
+            if best is None or self._value(ended, time_cost) < self._value(best, time_cost):
                 best = ended
             if best.horizon <= least or self._solver.work > self._budget:
                 break
-        return None if best is None else self._refined(best, least, price)
+        return None if best is None else self._refined(best, least, time_cost)
 
     def distinct(self, relaxed: list[SolvedPath]) -> list[SolvedPath]:
-        """Return relaxed paths, the cheapest first, each once."""
+        """Return the distinct relaxed paths, the cheapest first."""
         ordered = sorted(relaxed, key=self._solver.energy)
         costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
         return ordered[:1] + [
@@ -465,9 +473,10 @@ class HorizonContinuation:
         ]
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
-        """Return a path near one that crosses cones between the points, None without one.
+        """Return a path near one that crosses cones between the points; None if there is none.
 
-        `depths` (cones, 2 nodes) rad are those between each two points. The last point stays where it is.
+        `depths` (cones, 2 nodes) rad are the depths inside the cones between each two points. The last point
+        stays in place.
         """
         wider = np.where(depths > 0.0, _CROSSED * depths + _BEYOND, 0.0)
         both = wider.copy()
@@ -477,9 +486,10 @@ class HorizonContinuation:
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path near one whose dipoles take `peak` of their limit when flown, None without one.
+        """Return a path near one whose flown dipoles are `peak` times their limit; None if there is none.
 
-        It uses less of the limit, or takes longer where that leads to none or the horizon is not asked.
+        The path uses a smaller share of the limit. If no such path exists or the horizon is free, it takes
+        longer.
         """
         task, solver, time = self._task, self._solver, found.horizon
         if peak > _LOST:
@@ -490,23 +500,23 @@ class HorizonContinuation:
             if eased is not None:
                 return eased
         time *= _EASED_STEP * math.sqrt(peak)
-        if time > task.longest or in_the_way(task, time) is not None:
+        if time > task.longest or blocking_cone(task, time) is not None:
             return None
         return solver.limited(found, task.nodes, time, LAST_BARRIER)
 
-    def _refined(self, best: SolvedPath, least: float, price: float) -> SolvedPath | None:
-        """Return the best path on the fine grid, by a walk that begins with a coarse one."""
+    def _refined(self, best: SolvedPath, least: float, time_cost: float) -> SolvedPath | None:
+        """Return the best path on the fine grid, by continuation from a coarse one."""
         times = best.horizon * np.array([1.0, 1.02, 1.1])
         longer = (self._finer(best, float(time), WALK_BARRIER) for time in times)
         fine = next(filter(None, longer), None)
         if fine is None:
             return None
         ratios = _STRETCHED_STEPS if self._task.time_price is None else _FINE_STEPS
-        fine = self._walked(fine, least, price, ratios)
+        fine = self._walked(fine, least, time_cost, ratios)
         return self._solver.limited(fine, self._task.nodes, fine.horizon, LAST_BARRIER) or fine
 
     def _finer(self, coarse: SolvedPath, time: float, last: float) -> SolvedPath | None:
-        """Return a coarse path on the fine grid, over `time` s."""
+        """Return the path on the fine grid over `time` s from a coarse one; None if there is none."""
         nodes, solver = self._task.nodes, self._solver
         key = (coarse.horizon, solver.energy(coarse), time)
         if key in self._lost:
@@ -520,87 +530,89 @@ class HorizonContinuation:
         return fine
 
     def _walked(
-        self, best: SolvedPath, least: float, price: float, ratios: tuple[float, float]
+        self, best: SolvedPath, least: float, time_cost: float, ratios: tuple[float, float]
     ) -> SolvedPath:
-        """Return the best path on a walk to shorter horizons, to the last ratio of one without a better."""
+        """Return the best path in a continuation to shorter horizons, down to the last ratio."""
         (first, last), failed = ratios, 0.0
         while best.horizon > max(least, last * failed) and self._solver.work < self._budget:
             time = max(best.horizon / first, least, math.sqrt(best.horizon * failed))
             further = self._over(best, time)
-            if further is not None and self._value(further, price) < self._value(best, price):
+            if further is not None and self._value(further, time_cost) < self._value(best, time_cost):
                 best = further
             else:
                 failed = time
         return best
 
     def _fastest(self, found: SolvedPath) -> float:
-        """Return about which horizon a relaxed path takes for its dipoles to keep theirs, s."""
+        """Return the approximate horizon, s, over which a relaxed path would keep the dipole limit."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
     def _begins(self, start: SolvedPath, least: float) -> list[float]:
-        """Return horizons at which a walk may begin from a relaxed path, s, the shortest first."""
+        """Return the horizons, s, at which continuation from a relaxed path may begin, the shortest first."""
         time = max(self._fastest(start), least)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_price is None and start.horizon in times:
-            times.remove(start.horizon)  # it was tried
+            times.remove(start.horizon)  # already tried
         task = self._task
-        return [each for each in times if each <= task.longest and in_the_way(task, each) is None]
+        return [each for each in times if each <= task.longest and blocking_cone(task, each) is None]
 
-    def _value(self, found: SolvedPath, price: float) -> float:
-        """Return what a path costs, J; s where time alone counts."""
-        return found.horizon if math.isinf(price) else self._solver.energy(found) + price * found.horizon
+    def _value(self, found: SolvedPath, time_cost: float) -> float:
+        """Return the cost of a path, J, or its duration, s, if only time counts."""
+        return (
+            found.horizon if math.isinf(time_cost) else self._solver.energy(found) + time_cost * found.horizon
+        )
 
     def _over(self, start: SolvedPath, time: float) -> SolvedPath | None:
-        """Return the path of least energy within the limits over `time` s, from one over another horizon."""
+        """Return the minimum-energy path within the limits over `time` s, from one over another horizon."""
         return self._solver.limited(start, start.equations.count, time, WALK_BARRIER)
 
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
-"""Searches, one after the other: intervals, and the work, Newton steps times intervals, after which no other
-guess is begun with. A thousand take about a tenth of a second. On ten intervals, what goes round cones is far
-from what does on the fine grid."""
+"""Intervals and budget of the successive searches. The budget is the work, Newton steps times intervals,
+after which no further guess is tried. A thousand take about a tenth of a second. On ten intervals, paths
+around cones differ too much from those on the fine grid."""
 _WALKS = 1.8
-"""Times the work of a search, after which a walk ends with what it has."""
+"""Factor on the budget of a search, after which continuation ends with the best path so far."""
 _MOST_TRIED = 16
-"""Guesses over one horizon."""
+"""Largest number of guesses over one horizon."""
 _LOOK = 8
-"""Newton steps of every guess."""
+"""Newton steps of every guess before its violation is judged."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
-"""How many more it is given, one after the other, where its equations lack less in all; else it is put off.
-Four of five that lead to a path lack less than 1.5 after eight, three of four that do not lack more (320
-guesses, seed 41 of the bench `orbit_slews`)."""
+"""Further Newton steps of a guess, in stages, and the violation above which it is deferred instead. Four of
+five guesses that lead to a path have a violation below 1.5 after eight steps, three of four that do not have
+more (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _PATIENCE = 120
-"""Newton steps without a path, after which the other guesses over a horizon are put off."""
+"""Newton steps without a path after which the other guesses over a horizon are deferred."""
 _WIDENED = 4
-"""Times at most that cones are widened, and dipoles eased, for a path."""
+"""Largest number of times that cones are widened or dipoles reduced for one path."""
 
 
 class SlewSearch:
-    """The search of one task; `tried` guesses."""
+    """The search for the path of one task; `tried` counts the guesses."""
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
-        """Search on `coarse` intervals; after a `budget` of work nothing else is begun with."""
+        """Search on `coarse` intervals; after `budget` of work no further guess is tried."""
         self._task, self._budget = task, budget
         self.solver = SlewSolver(task)
         self._walker = HorizonContinuation(task, self.solver, _WALKS * budget)
         self._coarse = min(task.nodes, coarse)
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
-        self._known: list[float] = []  # heats, J, of relaxed paths that were looked at
+        self._known: list[float] = []  # heats, J, of the relaxed paths tried
         self.tried = 0
 
     def paths(self) -> Iterator[SolvedPath]:
         """Yield paths within all limits at the nodes, the best first."""
-        price = self._task.time_price
+        time_cost = self._task.time_price
         for batches in self._rungs():
             relaxed: list[SolvedPath] = []
             for batch in batches:
                 relaxed += batch
-                if price is None:
+                if time_cost is None:
                     yield from map(self._fresh, self._cheapest(batch))
-                elif (found := self._walker.shortened(batch, HORIZON_RANGE[0], price)) is not None:
+                elif (found := self._walker.shortened(batch, HORIZON_RANGE[0], time_cost)) is not None:
                     yield self._fresh(found)
-            if price is not None or not relaxed:
+            if time_cost is not None or not relaxed:
                 continue
             if (found := self._walker.shortened(relaxed, self._task.horizon, LEAST_TIME)) is not None:
                 yield self._fresh(found)
@@ -608,45 +620,45 @@ class SlewSearch:
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
         """Return a path near one that crosses cones by `depths` (cones, 2 nodes) rad between the points.
 
-        None without one.
+        None if there is none.
         """
         self._widened += 1
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None
 
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
-        """Return a path near one whose dipoles, flown, take `peak` of their limit; None without one."""
+        """Return a path near one whose flown dipoles are `peak` times their limit; None if there is none."""
         self._widened += 1
         return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
 
     def _fresh(self, found: SolvedPath) -> SolvedPath:
-        """Return a path whose cones are not widened, within the whole limit."""
+        """Reset widened cones and the share of the dipole limit, and return the path."""
         self._widened, self.solver.share = 0, 1.0
         self.solver.extra = np.zeros_like(self.solver.extra)
         return found
 
     def _rungs(self) -> Iterator[Iterator[list[SolvedPath]]]:
-        """Yield relaxed paths over the asked horizon, longer ones, and at last from what was put off.
+        """Yield relaxed paths over the requested horizon, over longer ones, and from deferred guesses.
 
-        The longer a slew, the more the field turns under way, and the nearer a guess is to a path.
+        The longer a slew, the more the field rotates during it, and the closer a guess is to a path.
         """
-        put_off: list[NewtonRun] = []
+        deferred: list[NewtonRun] = []
         for longer in LONGER:
             horizon = min(longer * self._task.horizon, self._task.longest)
-            if self.solver.work < self._budget and in_the_way(self._task, horizon) is None:
-                yield self._relaxed(horizon, put_off)
+            if self.solver.work < self._budget and blocking_cone(self._task, horizon) is None:
+                yield self._relaxed(horizon, deferred)
             if horizon == self._task.longest:
                 break
-        yield self._late(put_off)
+        yield self._late(deferred)
 
-    def _relaxed(self, horizon: float, put_off: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield relaxed paths over a horizon, a few at a time; add to what is put off."""
+    def _relaxed(self, horizon: float, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
+        """Yield batches of relaxed paths over a horizon; append other guesses to `deferred`."""
         batch: list[SolvedPath] = []
         solver, least = self.solver, self.solver.steps + _PATIENCE
         for guess in self._guesses(horizon)[:_MOST_TRIED]:
             self.tried += 1
             descent = solver.descent(solver.equations(horizon, self._coarse), guess)
             if solver.steps > least and not batch:
-                put_off.append(descent)
+                deferred.append(descent)
                 continue
             found = solver.found(descent, _LOOK)
             for steps, lack in self._further:
@@ -655,16 +667,16 @@ class SlewSearch:
             if found is not None:
                 batch.append(found)
             elif not descent.is_over:
-                put_off.append(descent)
+                deferred.append(descent)
             if len(batch) == ENOUGH:
                 yield batch
                 batch, least = [], solver.steps + _PATIENCE
         if batch:
             yield batch
 
-    def _late(self, put_off: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
-        """Yield relaxed paths from guesses that were put off, those that lack least first."""
-        for descent in sorted(put_off, key=lambda descent: descent.lack):
+    def _late(self, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
+        """Yield relaxed paths from deferred guesses, those with the smallest violation first."""
+        for descent in sorted(deferred, key=lambda descent: descent.lack):
             if self.solver.work > self._budget:
                 break
             found = self.solver.found(descent, self._further[-1][0], MET)
@@ -672,7 +684,7 @@ class SlewSearch:
                 yield [found]
 
     def _guesses(self, horizon: float) -> list[Trajectory]:
-        """Return guesses over a horizon, the promising ones first."""
+        """Return guesses over a horizon, the most promising first."""
         equations, craft = self.solver.equations(horizon, self._coarse), self._task.craft
         kept = self.solver.kept(equations)
         return guesses(
@@ -680,14 +692,14 @@ class SlewSearch:
         )
 
     def _cheapest(self, batch: list[SolvedPath]) -> list[SolvedPath]:
-        """Return paths within the limits over the asked horizon, the cheapest first."""
+        """Return paths within the limits over the requested horizon, the cheapest first."""
         kept: list[SolvedPath] = []
         energy = self.solver.energy
         for start in self._walker.distinct([start for start in batch if start.horizon <= self._task.horizon]):
             if (kept and energy(start) >= min(map(energy, kept))) or self.solver.work > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
-                continue  # it led nowhere before
+                continue  # already tried without success
             self._known.append(energy(start))
             found = self._walker.within(start)
             if found is not None:

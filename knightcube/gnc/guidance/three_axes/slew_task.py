@@ -38,11 +38,11 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cone:
-    """Body `axis` (3,) stays `angle` rad or more away from a direction.
+    """An exclusion cone: body `axis` (3,) stays at least `angle` rad away from a direction.
 
     Attributes:
         name: for messages.
-        direction: gives unit vectors (n, 3), ICRS, at times (n,) s after the start.
+        direction: function from times (n,), s after the start, to unit vectors (n, 3), ICRS.
     """
 
     name: str
@@ -51,19 +51,23 @@ class Cone:
     angle: float
 
     def clearance(self, q: FloatArray, times: FloatArray) -> FloatArray:
-        """Return how far outside (n,) rad the axis lies at attitudes (n, 4)."""
+        """Return the angles (n,) rad by which the axis lies outside the cone at attitudes (n, 4)."""
         cosine = shown(q, self.direction(times)) @ self.axis / np.sum(q * q, axis=1)
         return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) - self.angle)
 
 
 class ConeConstraints:
-    """Cones as inequalities g >= 0 at n times: the limit's cosine less that of axis and direction.
+    """Exclusion cones at n times as inequalities g >= 0.
 
-    That cosine is a quadratic form of the attitude.
+    g is the cosine of the limit minus the cosine of the angle between axis and direction, a quadratic form of
+    the attitude.
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
-        """`margin` rad, of all or (cones, n), is added for the way between the `times` (n,) s."""
+        """Add `margin` rad to the cones at `times` (n,) s, for the path between the times.
+
+        The margin is a scalar or (cones, n).
+        """
         angles = np.array([cone.angle for cone in cones]).reshape(-1, 1) + margin
         self._limits = np.cos(np.clip(angles, 0.0, np.pi))
         self.count, size = len(cones), len(times)
@@ -74,29 +78,29 @@ class ConeConstraints:
         """(cones, n, 4, 4), the second derivative by the attitude."""
 
     def values(self, q: FloatArray) -> FloatArray:
-        """Return g (cones, n) at attitudes (n, 4); of many paths (m, 1, n, 4) (m, cones, n)."""
+        """Return g (cones, n) at attitudes (n, 4), or g (m, cones, n) of m paths (m, 1, n, 4)."""
         return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=-1))
 
     def slopes(self, q: FloatArray) -> FloatArray:
-        """Return the derivative (cones, n, 4) by the attitude."""
+        """Return the derivatives (cones, n, 4) of g by the attitude."""
         return np.asarray((self.curvatures @ q[..., None])[..., 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeEnd:
-    """The attitude (4,) and the rate (3,) rad/s of the wanted frame, ICRS axes, at one time."""
+    """An end at a full attitude: quaternion (4,) ICRS into body, and rate (3,) rad/s in ICRS axes."""
 
     quaternion: FloatArray
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return True: an attitude that misses by nothing is the target."""
+        """Return True, because an attitude with zero error is the target."""
         return True
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return the linear (3, 4) and the quadratic part (3, 4, 4) of half the sines that q misses by.
+        """Return linear part (3, 4) and quadratic part (3, 4, 4) of the attitude error as a function of q.
 
-        They are the vector part of q times the target's inverse.
+        The error is the vector part of q times the inverse of the target, half the sine of the error angle.
         """
         v, s = self.quaternion[:3], self.quaternion[3]
         linear = np.concatenate([s * np.eye(3) + cross_matrices(v[None])[0], -v[:, None]], axis=1)
@@ -105,32 +109,35 @@ class AttitudeEnd:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoresightEnd:
-    """A body axis (3,) to a direction (3,), with a free roll; the `rate` (3,) rad/s is whole. Both ICRS."""
+    """An end at which body `axis` (3,) points to `direction` (3,), ICRS, with a free roll.
+
+    `rate` (3,) rad/s, ICRS axes, is the full body rate.
+    """
 
     axis: FloatArray
     direction: FloatArray
     rate: FloatArray
 
     def is_met(self, q: FloatArray) -> bool:
-        """Return whether an attitude (4,) that misses by nothing points to it, not away from it."""
+        """Return whether an attitude (4,) with zero error points to the direction and not opposite to it."""
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
     def misses(self) -> tuple[FloatArray, FloatArray]:
-        """Return the linear (2, 4) and the quadratic part (2, 4, 4) of the sines that q misses by."""
+        """Return linear part (2, 4) and quadratic part (2, 4, 4) of the error's sines as a function of q."""
         across = tangent_basis(self.axis)
         return np.zeros((2, 4)), shown_curvature(across, np.broadcast_to(self.direction, (2, 3)))
 
 
 End = AttitudeEnd | BoresightEnd
 EndLaw = Callable[[float], End]
-"""Gives the end of a slew that lasts so long, s."""
+"""Function from the duration of a slew, s, to its end."""
 
 
 class EndConditions:
-    """The equations of an end: by how much a state (7,) misses it, attitude, then rate (3,)."""
+    """The equations of an end: the error of a state (7,), attitude first, then rate (3,)."""
 
     def __init__(self, end: End, scale: float) -> None:
-        """Take the end, and the unit of times, s."""
+        """Set up the equations of `end` for times in units of `scale` s."""
         linear, forms = end.misses()
         self.count = len(linear) + 3
         self._linear = np.zeros((self.count, 7))
@@ -139,7 +146,7 @@ class EndConditions:
         self._forms = np.concatenate([forms, turning])
 
     def miss(self, x: FloatArray) -> FloatArray:
-        """Return by how much a state misses."""
+        """Return the errors (n,) of a state (7,)."""
         return np.asarray(self._linear @ x + 0.5 * (self._forms @ x[:4]) @ x[:4])
 
     def slope(self, x: FloatArray) -> FloatArray:
@@ -156,9 +163,9 @@ class EndConditions:
 def along(
     ephemeris: Ephemeris, begin: float, areas: FloatArray | None = None, path: SlewPath | None = None
 ) -> EnvironmentAt:
-    """Return field, position, air and light over the time of a slew.
+    """Return the environment of a slew that starts at `begin` s of the ephemeris.
 
-    Air and light press by the `areas` (3,) that a body on `path` shows to them.
+    With `areas` and `path`, air and sunlight act on the `areas` (3,) that a body on `path` exposes to them.
     """
 
     def around(times: FloatArray) -> SlewEnvironment:
@@ -172,7 +179,10 @@ def along(
 
 
 def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float) -> tuple[Cone, ...]:
-    """Return the cones that body `axis` (3,) keeps, rad: `sun` and `moon` from centre, `earth` from limb."""
+    """Return the exclusion cones of a body `axis` (3,), one for each of `angles`, rad.
+
+    The names are `sun` and `moon`, measured from the centre, and `earth`, measured from the limb.
+    """
     date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)
 
@@ -202,22 +212,23 @@ NODES = 24
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
-"""rad within a cone, and rad/s of a target at rest among the stars."""
+"""Depth (rad) inside a cone, and rate (rad/s) below which a target is at rest among the stars."""
 LEAST_TIME = math.inf
-"""A price of time at which only time counts."""
+"""Time cost at which only the duration counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewTask:
-    """What is asked for.
+    """The task of the slew planner.
 
     Attributes:
         craft, along: the model; `along` counts times from the start of the slew.
         quaternion, rate: the start, (4,) ICRS into body and (3,) rad/s, body axes.
-        end: the end of a slew of a given duration.
-        horizon, longest: s; the horizon is stretched up to `longest` where it does not suffice.
-        time_price: W; None keeps the horizon, LEAST_TIME wants the least one.
-        cones: kept all the way.
+        end: the end of a slew as a function of its duration.
+        horizon, longest: s; the horizon is stretched up to `longest` if no path over it is found.
+        time_price: cost of time, W; None keeps the horizon, LEAST_TIME minimises it.
+        cones: exclusion cones kept during the whole slew.
+        nodes: intervals of the collocation.
     """
 
     craft: SlewCraft
@@ -233,7 +244,7 @@ class SlewTask:
 
 
 def check(task: SlewTask) -> None:
-    """Raise PlanningError for a task that no path can fulfil."""
+    """Raise PlanningError if no path can fulfil the task."""
     craft = task.craft
     arrays = (
         craft.inertia,
@@ -247,32 +258,39 @@ def check(task: SlewTask) -> None:
         task.rate,
     )
     if not all(np.isfinite(part).all() for part in arrays):
-        raise PlanningError("a slew needs a craft and a start that are finite")
+        raise PlanningError("the values of the satellite and of the start must be finite")
     if abs(float(np.linalg.norm(task.quaternion)) - 1.0) > 1e-6:
-        raise PlanningError(f"the start {task.quaternion} is no attitude: its length must be 1")
+        raise PlanningError(f"the start quaternion {task.quaternion} must have length 1")
     if not (np.all(craft.limit > 0.0) and np.all(craft.weights > 0.0)):
         raise PlanningError("every coil needs a limit and a weight above zero")
     if np.linalg.eigvalsh(craft.inertia).min() <= 0.0:
         raise PlanningError("the inertia must be positive definite")
     low, high = HORIZON_RANGE
     if not low <= task.horizon <= task.longest <= high:
-        raise PlanningError(f"horizon {task.horizon:g} s, longest {task.longest:g} s: {low:g} to {high:g} s")
+        raise PlanningError(
+            f"horizon {task.horizon:g} s, longest {task.longest:g} s: must rise from {low:g} to {high:g} s"
+        )
     if not NODES_RANGE[0] <= task.nodes <= NODES_RANGE[1]:
-        raise PlanningError(f"{task.nodes} nodes: {NODES_RANGE[0]} to {NODES_RANGE[1]}")
+        raise PlanningError(f"nodes is {task.nodes}: must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
     if task.time_price is not None and not task.time_price > 0.0:
-        raise PlanningError(f"a price of time of {task.time_price} W: it must be positive")
+        raise PlanningError(f"the cost of time is {task.time_price} W: it must be positive")
     end = task.end(task.horizon)
     for cone in task.cones:
         inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
         if inside > 0.0:
-            raise PlanningError(f"the start lies within the cone of the {cone.name}, by {inside:.1f} deg")
-        # The cones move by some degrees over a slew: deep inside, no other horizon helps.
+            raise PlanningError(
+                f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
+            )
+        # The cones move by some degrees during a slew. For an end deep inside no other horizon helps.
         if isinstance(end, AttitudeEnd) and _is_deep_inside(end, cone, task.horizon):
-            raise PlanningError(f"the end lies within the cone of the {cone.name}")
+            raise PlanningError(f"the end lies inside the exclusion cone of the {cone.name}")
 
 
-def in_the_way(task: SlewTask, horizon: float) -> Cone | None:
-    """Return a cone within which a slew over `horizon` s would end, by its whole attitude; None without."""
+def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
+    """Return an exclusion cone that contains the end of a slew over `horizon` s; None if there is none.
+
+    Only ends at a full attitude are checked.
+    """
     end = task.end(horizon)
     if not isinstance(end, AttitudeEnd):
         return None
@@ -281,6 +299,6 @@ def in_the_way(task: SlewTask, horizon: float) -> Cone | None:
 
 
 def _is_deep_inside(end: AttitudeEnd, cone: Cone, time: float) -> bool:
-    """Return whether an end at rest lies far within a cone."""
+    """Return whether an end at rest among the stars lies deep inside a cone."""
     inside = float(cone.clearance(end.quaternion[None], np.array([time]))[0])
     return inside < -_DEEP and float(np.abs(end.rate).max()) < _STILL
