@@ -100,7 +100,7 @@ class PointingPaths:
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
         """Take the turn (3,) off the path and the rate (3,); return whether it is flown: not while astray."""
         self.off = float(np.linalg.norm(turn))
-        self.astray.see(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
+        self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
         return self.astray.since is None
 
     def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:

@@ -138,7 +138,7 @@ class PointingFlight:
         flight, found = self.flight, self._filter
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
-        self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
+        self._astray.update(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
         if self._wanted["law"] != "pd" and time >= COAST and self._is_due(time):
             self._plan(time)
         around = self._around(time)

@@ -30,7 +30,7 @@ from knightcube.gnc.control.three_axes.pointing_table import (
     PointingTable,
     PointingWeights,
     pointing_table,
-    prices,
+    step_costs,
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import (
     AttitudeReferences,
@@ -47,31 +47,32 @@ from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_slew
 from knightcube.gnc.guidance.three_axes.slew_task import SlewTask, along, cones
 
 RESERVE = 0.8
-"""Of the coils' limit that a slew is planned with; the rest is for the errors."""
+"""Fraction of the coils' limit that a slew is planned with; the rest corrects errors."""
 STIFFER = 5.0
-"""Times the dipole that costs as much as the turn that costs one, while slewing."""
+"""Factor on the dipole of unit cost during a slew."""
 LONGEST = 1_500.0
-"""s, of a slew: a table needs some of the law after it."""
+"""Longest slew, s; a table also needs some of the law after it."""
 FINE = 5
-"""Parts of a step of pointing: a slewing body turns farther in one."""
+"""Steps of a slew per step of pointing, because a slewing body rotates farther per step."""
 TAIL = 300.0
-"""s of the law after a slew that its gains look at."""
+"""Duration (s) of the law after a slew that is included in its gains."""
 END = 2_000.0
-"""s on the way, for which an error costs what it costs at a slew's end: torques are not known well before it,
-and what they have done meanwhile is to be gone by then."""
+"""Time (s) for which an error costs as much as at the end of a slew. The torques are not known well before
+the slew, and their effects should be gone by its end."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""A slew that turns too fast is planned over a time longer by the excess and this, so much, so often."""
+"""Factor beyond the excess of the rate on the time of a slew that rotates too fast, largest factor, and
+number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewRequest:
-    """How a slew is wanted.
+    """The parameters of slews into a pointing target.
 
     Attributes:
-        seconds: asked; longer where that does not suffice.
+        seconds: requested duration; longer if that does not suffice.
         heat: (3,) W/(A m^2)^2 of the coils.
-        residual: (3,) A m^2, the craft's own dipole.
-        camera, angles: body axis (3,) that keeps cones of `sun`, `earth` and `moon`, rad.
+        residual: (3,) A m^2, the residual dipole of the satellite.
+        camera, angles: body axis (3,) that keeps the exclusion cones of `sun`, `earth` and `moon`, rad.
     """
 
     seconds: float
@@ -83,10 +84,15 @@ class SlewRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewStart:
-    """Where a slew begins: attitude (4,) and rate (3,) rad/s at the first of `times` (m,) s, even, previewed.
+    """The state at the start of a slew.
 
-    `kept` steps of them are wanted. `inertia` kg m^2, `limit` A m^2 of each coil in the mean, `sizes` (9,)
-    N m of the torques.
+    Attributes:
+        quaternion, rate: (4,) and (3,) rad/s, at the first of `times`.
+        times: (m,) s, equally spaced, preview included.
+        kept: number of steps of the table.
+        inertia: (3, 3) kg m^2.
+        limit: A m^2 of each coil, mean.
+        sizes: (9,) N m of the torques.
     """
 
     quaternion: FloatArray
@@ -106,9 +112,9 @@ def slew(
     ahead: Ephemeris,
     fastest: float,
 ) -> SlewPath | None:
-    """Return the slew into a target's law that stays slower than `fastest` rad/s; None where there is none.
+    """Return the slew into a target's law that stays slower than `fastest` rad/s; None if there is none.
 
-    Cones are kept but where the body already is within one, or no slew keeps them.
+    Exclusion cones are kept unless the body already is inside one or no slew keeps them.
     """
     first = float(begin.times[0])
     craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
@@ -128,15 +134,15 @@ def slew(
         found = _slow_enough(task, fastest)
     if found is None or not begin.sizes.any():
         return found
-    # What presses on the body depends on the areas that it shows along the path.
+    # Air and sunlight act on areas that depend on the path.
     pressed = along(ahead, first, box_areas(begin.inertia), found)
     return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
 
 
 def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
-    """Return the path of a task, over a longer time where it would turn too fast; None without one.
+    """Return the path of a task, over a longer time if it would rotate too fast; None if there is none.
 
-    `near` is the path of a task that is nearly the same.
+    `near` is the path of a similar task.
     """
     for _ in range(_TRIALS):
         try:
@@ -163,10 +169,10 @@ def slew_table(
     expected: PointingPreview,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the table of a slew and of the law after it, in steps of a fifth of the begin's.
+    """Return the table of a slew and of the law after it, in steps of a fifth of the given times' step.
 
-    `residual` (3,) A m^2 is the craft's own dipole that the path was planned with. `expected` is what acts at
-    the begin's times; its motions are not looked at.
+    `residual` (3,) A m^2 is the residual dipole that the path was planned with. `expected` is the environment
+    at the times of `begin`; its motions are not used.
     """
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
@@ -194,7 +200,7 @@ def slew_table(
 
 
 def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
-    """Return a path at `times` (n,) s from the instant `count` on; those before are not looked at."""
+    """Return a path at `times` (n,) s from the instant `count` on; earlier instants are not used."""
     rest = [path.at(float(time)) for time in times[count:]]
     whole = [*[rest[0]] * count, *rest]
     return AttitudeReferences(
@@ -206,7 +212,7 @@ def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeR
 
 
 def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
-    """Return `then`, begun with `first`."""
+    """Return `then` with its first instants replaced by `first`."""
     count = len(first.times)
     return AttitudeReferences(
         then.times,
@@ -217,7 +223,7 @@ def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeRefe
 
 
 def _since(expected: PointingPreview, wanted: AttitudeReferences, count: int, kept: int) -> PointingPreview:
-    """Return what is expected from instant `count` on, where the body is in the law."""
+    """Return the preview from instant `count` on, when the body is in the law."""
     pressed = Pressures(expected.pressures.air[count:], expected.pressures.light[count:])
     after = wanted.since(count)
     begun = after.until(kept + 1 - count)
@@ -233,7 +239,7 @@ def _tracking(
     begin: SlewStart,
     weights: PointingWeights,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the gains (n, 3, 6) along the dipoles (n, 3), and dipoles by the torques (n, 3, sizes)."""
+    """Return the gains (n, 3, 6) along the dipoles (n, 3), and the dipoles per torque size (n, 3, sizes)."""
     count, steps = len(dipole), len(tracked.times) - 1
     times, step = tracked.times[:steps], float(tracked.times[1] - tracked.times[0])
     planned = np.concatenate([dipole, np.zeros((steps - count, 3))])
@@ -243,8 +249,8 @@ def _tracking(
     to_body = attitude_matrix(tracked.quaternion[:steps])
     shape = shapes(pressures(ahead, times).facing(box_areas(begin.inertia), to_body), to_body)
     affine = linear.by_torque @ shape
-    state, price = prices(replace(weights, roll=None), step)
-    control = np.full((steps, 3), price / STIFFER**2)
+    state, dipole_cost = step_costs(replace(weights, roll=None), step)
+    control = np.full((steps, 3), dipole_cost / STIFFER**2)
     nothing, states = np.zeros(affine.shape), np.repeat(state[None], steps, axis=0)
     states[count] *= END / step
     cost = SweepCost(states, control, nothing, nothing[:, :3])
@@ -254,7 +260,7 @@ def _tracking(
 
 @dataclass(frozen=True, slots=True)
 class TableSpan:
-    """How far is predicted, how much of the table is kept, and its step, s."""
+    """Durations of the prediction and of the stored table, and the step of the table, s."""
 
     preview: float
     kept: float
@@ -262,20 +268,22 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Spans of the goals that go on, and of an object that passes."""
+"""Spans of lasting goals, and of a passing object."""
 LEAD = 2.0
-"""s from the state to the begin of the table."""
+"""Time (s) from the state to the start of the table."""
 FAR = math.radians(15.0)
-"""rad off the law: from farther the way into it is a slew of least heat, where one is wished."""
+"""Angle (rad) from the law beyond which the way into it is a slew of minimum heat, if slews are
+configured."""
 WAY = 4.0
-"""Time scales of the law that a first guess of the way takes; the path found does not depend on it."""
+"""Duration of the initial guess of the way into the law, in time scales of the law; the path found does not
+depend on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectDirection:
-    """An object's `direction` (3,) at `since` s after a job's origin, ICRS.
+    """The direction (3,) of an object at `since` s after a job's origin, ICRS.
 
-    `velocity` (3,) 1/s: of its place relative to ours, over its distance; zero for a place to look at.
+    `velocity` (3,) 1/s is the relative velocity divided by the distance; zero for a fixed direction.
     """
 
     direction: FloatArray
@@ -284,16 +292,20 @@ class ObjectDirection:
 
     @property
     def span(self) -> TableSpan:
-        """The span of its tables."""
+        """The span of the object's tables."""
         return PASSING if self.velocity.any() else STEADY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingJob:
-    """A job: the orbit's state, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
+    """A job: the state of the orbit, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
 
-    `inertia` (3, 3) kg m^2, `sizes` (9,) N m of the torques, `limit` A m^2 of a coil in the mean. Without
-    `slew` the path is that of the weights alone. With a `sight` that is pointed to, whatever the target.
+    Attributes:
+        inertia: (3, 3) kg m^2.
+        sizes: (9,) N m of the torques.
+        limit: A m^2 of each coil, mean.
+        slew: parameters of slews; None for a path by the weights alone.
+        sight: the object to point to instead of the target; None for the target.
     """
 
     number: int
@@ -317,14 +329,14 @@ class PointingJob:
 
 
 def prepare() -> None:
-    """Import what plans slews; the worker does so before its first job."""
+    """Import the modules that plan slews; the worker does so before its first job."""
     from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
 
 
 def run(job: PointingJob) -> PointingTable:
-    """Return the table, its times in s after the origin; takes a second, two from far off.
+    """Return the table, its times in s after the origin; takes one second, or two from far off the law.
 
-    Raises FlightError where the field is not known, UsageError where the law has no attitude.
+    Raises FlightError if the field is not known, UsageError if the law has no attitude.
     """
     span = job.span
     ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
@@ -352,7 +364,7 @@ def run(job: PointingJob) -> PointingTable:
 
 
 def _law(job: PointingJob, quaternion: FloatArray, ahead: Ephemeris) -> Attitudes:
-    """Return the law of a job from an attitude (4,) on."""
+    """Return the law of a job that starts at an attitude (4,)."""
     sight, axis = job.sight, job.axes.pointing
     if sight is None:
         return law_of(job.target, job.axes, quaternion, ahead, LEAD)
@@ -360,7 +372,7 @@ def _law(job: PointingJob, quaternion: FloatArray, ahead: Ephemeris) -> Attitude
 
 
 def _seconds(job: PointingJob, field: FloatArray) -> float:
-    """Return how long a first guess of the way takes, s: WAY of the time scale that the weights give."""
+    """Return the duration, s, of the initial guess: WAY times the time scale given by the weights."""
     strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
     square = strength * job.weights.dipole / (inertia * job.weights.turn)
     return min(max(WAY / math.sqrt(square), 10.0 * job.span.step), job.span.kept)

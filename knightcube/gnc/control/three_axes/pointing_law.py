@@ -26,19 +26,19 @@ from knightcube.gnc.control.three_axes.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
 LARGEST_TURN = math.radians(20.0)
-"""rad: a larger error is cut to this, its direction kept; the law is linear in small turns."""
+"""Largest rotation error (rad); a larger one is shortened, because the law is linear in small rotations."""
 LARGEST_RATE = math.radians(1.0)
-"""rad/s, likewise."""
+"""Largest rate error (rad/s); a larger one is shortened."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingCommand:
-    """A command.
+    """A command of the pointing law.
 
     Attributes:
         dipole: (3,) A m^2, within the limit.
-        turn: (3,) rad, of the body against the reference.
-        rate: (3,) rad/s, likewise.
+        turn: (3,) rad, rotation error of the body relative to the reference.
+        rate: (3,) rad/s, rate error of the body relative to the reference.
     """
 
     dipole: FloatArray
@@ -47,25 +47,25 @@ class PointingCommand:
 
 
 class PointingLaw:
-    """Computes dipoles from a table; has no state but the table."""
+    """Computes dipoles from a table; stateless apart from the table."""
 
     def __init__(self, table: PointingTable, limit: float) -> None:
-        """`limit` A m^2 of each coil."""
+        """Use `table` with coils of `limit` A m^2 each."""
         self._table = table
         self._limit = limit
 
     @property
     def span(self) -> tuple[float, float]:
-        """The first and last time of the table, s; the last revolution's gains have less preview."""
+        """First and last time of the table, s; the gains of the last revolution have less preview."""
         times = self._table.path.times
         return float(times[0]), float(times[-1])
 
     def reference(self, time: float) -> AttitudeReference:
-        """Return the path at a time, s, within the table's; at its ends that of the end."""
+        """Return the path at a time, s, clamped to the times of the table."""
         return self._table.path.at(time)
 
     def wanted(self, time: float) -> AttitudeReference:
-        """Return the attitude law likewise."""
+        """Return the attitude law at a time, s, clamped to the times of the table."""
         return self._table.wanted.at(time)
 
     def command(
@@ -84,15 +84,15 @@ class PointingLaw:
         """
         wanted = self.reference(time)
         turn = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
-        # Both in the body's axes: at a large turn they differ from the reference's.
+        # Both rates in body axes: for a large rotation error they differ from the reference's axes.
         missed = rate - attitude_matrix(from_rotation_vector(turn)) @ wanted.rate
         cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
-        # The table's rate error is the difference of components: without the reference's turned by the error.
+        # The rate error of the table is the difference of components in the axes of each.
         error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
         k, table = self._table.path.place(time)[0], self._table
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
-        # What lies along the field makes no torque.
+        # A dipole along the field makes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
         return PointingCommand(_limited(dipole, self._limit), turn, missed)
 
@@ -103,49 +103,52 @@ def _cut(vector: FloatArray, longest: float) -> FloatArray:
 
 
 def _limited(dipole: FloatArray, limit: float) -> FloatArray:
-    """Return the dipole, scaled as a whole to the limit of the coils, which keeps its torque's direction."""
+    """Return the dipole, scaled to the limit of the coils so that the direction of its torque is kept."""
     largest = float(np.abs(dipole).max())
     return dipole if largest <= limit else dipole * (limit / largest)
 
 
 FAR = math.radians(15.0)
-"""rad off the path, from which on a body is held still."""
+"""Deviation (rad) from the path beyond which a body is damped."""
 LEAVING = math.radians(5.0)
-"""rad off the path, from which on a body that flies it is planned for again: torques are not as expected."""
+"""Deviation (rad) from the path beyond which a new path is planned, because the torques are not as
+predicted."""
 SLOW = math.radians(0.1)
-"""rad/s, below which a body is slow; an orbit's own is 0.06 deg/s."""
+"""Rate (rad/s) below which a body is slow; the orbital rate is 0.06 deg/s."""
 PATIENCE = 180.0
-"""s after which it is planned for though not slow: what lies along the field takes a quarter of an orbit."""
+"""Time (s) after which a path is planned although the body is not slow: the momentum along the field takes a
+quarter of an orbit."""
 DAMPING = 0.01
-"""rad/s, w."""
+"""Bandwidth w of the damping, rad/s."""
 
 
 class PathRecovery:
-    """Decides between path and damping; `since` is when damping began, s, None while the path is flown.
+    """Decides between path following and damping.
 
     Attributes:
-        ready: whether the body may be planned for.
-        leaving: whether it should be, though the path is flown.
+        since: start of the damping, s; None while the path is flown.
+        ready: whether a new path may be planned.
+        leaving: whether a new path should be planned although the path is still flown.
     """
 
     def __init__(self) -> None:
         self.since: float | None = None
         self.ready = self.leaving = False
 
-    def see(self, off: float, speed: float, now: float) -> None:
-        """Take the turn off the path, rad, and the rate, rad/s, at a time, s."""
+    def update(self, off: float, speed: float, now: float) -> None:
+        """Update with the deviation from the path, rad, and the rate, rad/s, at a time, s."""
         if self.since is None and off > FAR:
             self.since = now
         self.leaving = self.since is None and off > LEAVING
         self.ready = self.since is not None and (speed < SLOW or now - self.since > PATIENCE)
 
     def planned(self) -> None:
-        """Fly a path again."""
+        """Return to path following after a new plan."""
         self.since, self.ready, self.leaving = None, False, False
 
 
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
-    """Return the dipole (3,) A m^2 that takes a rate (3,) rad/s as the field (3,) T allows, body axes.
+    """Return the dipole (3,) A m^2 that damps a rate (3,) rad/s in a field (3,) T, body axes.
 
     `inertia` (3,) kg m^2 of the body axes.
     """

@@ -48,13 +48,13 @@ _EYE6: FloatArray = np.eye(6)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearErrorModel:
-    """The motion of the errors over n steps.
+    """The linear model of the errors over n steps.
 
     Attributes:
         transition: (n, 6, 6).
-        by_control: (n, 6, controls), of `linearised` by A m^2 of each coil.
-        by_torque: (n, 6, 3), by N m.
-        missing: (n, 3) N m, f: the torque that the motion takes besides gravity's.
+        by_control: (n, 6, controls); from `linearised` per A m^2 of each coil.
+        by_torque: (n, 6, 3), per N m.
+        missing: (n, 3) N m, f: the torque of the motion not provided by gravity.
         field: (n, 3) T in the motion's axes.
     """
 
@@ -83,7 +83,7 @@ class SweepCost:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CostToGo:
-    """The cost-to-go: `square` (6, 6) S and `slope` (6, columns) s."""
+    """The cost-to-go: its quadratic part `square` (6, 6) S and its linear part `slope` (6, columns) s."""
 
     square: FloatArray
     slope: FloatArray
@@ -97,11 +97,11 @@ def linearised(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> LinearErrorModel:
-    """Return the motion of the errors about references; `field` (n, 3) T, `position` (n, 3) m, ICRS.
+    """Return the linear model of the errors about references.
 
-    `dipole` (n, 3) A m^2 is held in body axes meanwhile: an error turns the field that it acts on. Likewise
-    of each `pressed`: a constant (3,) of the body, N m, and the direction (n, 3) ICRS, with which it makes a
-    torque.
+    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. `dipole` (n, 3) A m^2 is held in body axes, so
+    that an error rotates the field that acts on it. Each of `pressed` is a constant vector (3,) of the body,
+    N m, and a direction (n, 3) in ICRS axes with which it makes a torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -126,9 +126,10 @@ def acceleration_slopes(
     dipole: FloatArray | None = None,
     pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how the accelerations change with turn and rate (n, 3, 6), and field and place in body axes.
+    """Return derivatives (n, 3, 6) of the accelerations by rotation and rate, and field and position.
 
-    Of attitudes (n, 4) and rates (n, 3) rad/s; the rest as in `linearised`.
+    The motion has attitudes (n, 4) and rates (n, 3) rad/s; the other arguments are those of `linearised`.
+    Field and position (n, 3) are returned in body axes.
     """
     turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
     shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
@@ -147,10 +148,10 @@ def acceleration_slopes(
 def sweep(
     linear: LinearErrorModel, affine: FloatArray, cost: SweepCost, end: CostToGo
 ) -> tuple[FloatArray, FloatArray, CostToGo]:
-    """Return K (n, controls, 6), k (n, controls, columns) and the cost-to-go at the begin.
+    """Return K (n, controls, 6), k (n, controls, columns) and the cost-to-go at the start.
 
-    `affine` (n, 6, columns) is what the errors are moved by; `end` is the cost-to-go after the steps. Takes
-    0.1 ms a step.
+    `affine` (n, 6, columns) is the affine part of the error model; `end` is the cost-to-go after the steps.
+    Takes 0.1 ms per step.
     """
     (count, controls), columns = cost.control.shape, affine.shape[2]
     gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
@@ -171,7 +172,10 @@ def sweep(
 
 
 def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return gravity's torque (n, 3) and how it changes with the turn (n, 3, 3); `up` (n, 3) m, body axes."""
+    """Return gravity's torque (n, 3) and its derivative by the rotation (n, 3, 3).
+
+    `up` (n, 3) m is the position in body axes.
+    """
     radius = np.linalg.norm(up, axis=1)
     down = -up / radius[:, None]
     strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
@@ -182,7 +186,7 @@ def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return exp(F dt) (n, 6, 6) and its integral's rate columns (n, 6, 3), to the third order."""
+    """Return exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of its integral, to the third order."""
     first = flow * dt
     second = first @ first
     transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
@@ -191,28 +195,32 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Factors from price to price, tried in turn until a path settles: they lead to different optima."""
+"""Factors between successive costs of a torque along the field, tried in turn until a path settles. They lead
+to different optima."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Prices of a torque along the field as multiples of the same torque across it: the rise's end, the last."""
+"""Costs of a torque along the field as multiples of the same torque across it: the end of the rise, and the
+last one."""
 SETTLED = math.radians(20.0)
-"""rad off the law: within this the second half of a settled path stays."""
+"""Largest angle (rad) from the law in the second half of a settled path."""
 SWEEPS = 8
-"""Largest number of sweeps at a price; the best motion is flown, converged or not."""
+"""Largest number of sweeps at one cost of a torque along the field. The best motion is flown, converged or
+not."""
 SAVED = (0.05, 2e-3)
-"""Share of the cost: a sweep that saves less is the last one at its price; and at the last price."""
+"""Relative saving below which a sweep is the last one at its cost of a torque along the field, and at the
+last such cost."""
 NEAR = math.radians(10.0)
-"""rad off the law: a motion that stays within needs no such torque to begin with."""
+"""Largest angle (rad) from the law of a motion that needs no torque along the field to start with."""
 EXCESS = 3e-5
-"""rad/s beyond the largest rate that cost as much as the turn that costs one."""
+"""Excess (rad/s) over the largest rate that costs as much as the rotation that costs one."""
 SHARES = (1.0, 0.4, 0.15)
-"""Of what a sweep found, tried in turn."""
+"""Fractions of a sweep's change, tried in turn."""
 RUN_AWAY = 100.0
-"""rad/s: a motion this fast is not followed farther."""
+"""Rate (rad/s) beyond which a diverging motion is not propagated further."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathConditions:
-    """What is expected at the n + 1 instants of a path.
+    """The law and the predicted environment at the n + 1 instants of a path.
 
     Attributes:
         wanted: the law.
@@ -234,7 +242,7 @@ class PathConditions:
 
     @cached_property
     def around(self) -> FloatArray:
-        """(n + 1, 4, 3): rows field, position, air and light."""
+        """Field, position, air and light as rows (n + 1, 4, 3)."""
         around = np.empty((len(self.field), 4, 3))
         around[:, 0], around[:, 1] = self.field, self.position
         around[:, 2], around[:, 3] = self.pressures.air, self.pressures.light
@@ -242,18 +250,18 @@ class PathConditions:
 
     @cached_property
     def twice(self) -> FloatArray:
-        """(6, 6): the inertia twice, for place and rate at once."""
+        """Block-diagonal matrix (6, 6) of the inertia twice, for position and rate at once."""
         found: FloatArray = np.zeros((6, 6))
         found[:3, :3] = found[3:, 3:] = self.inertia
         return found
 
     def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
-        """Return what makes torques that change with the attitude, `linearised`, at the first instants."""
+        """Return the attitude-dependent torques at the first instants, as `linearised` takes them."""
         air, light = self.pressures.air[:count], self.pressures.light[:count]
         return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
 
     def until(self, count: int) -> PathConditions:
-        """Return what is expected at the first `count` instants."""
+        """Return the conditions at the first `count` instants."""
         field, position, pressures = self.field[:count], self.position[:count], self.pressures.until(count)
         return replace(
             self, wanted=self.wanted.until(count), field=field, position=position, pressures=pressures
@@ -267,7 +275,7 @@ class PathConditions:
     def acceleration(
         self, k: int, quaternion: FloatArray, rate: FloatArray, control: FloatArray
     ) -> FloatArray:
-        """Return the acceleration (3,) of an attitude (4,) after instant k under a control (4,)."""
+        """Return the acceleration (3,) at an attitude (4,) after instant k under a control (4,)."""
         seen = self.around[k] @ attitude_matrix(quaternion).T
         # Plain floats: several times as fast as arrays of three.
         (bx, by, bz), (px, py, pz), (ax, ay, az), (lx, ly, lz) = seen.tolist()
@@ -288,7 +296,7 @@ class PathConditions:
         return np.asarray(self.inverse @ np.array(torque))
 
     def accelerations(self, quaternion: FloatArray, rate: FloatArray, dipole: FloatArray) -> FloatArray:
-        """Return the accelerations (n, 3) of attitudes (n, 4) after the first n instants under dipoles."""
+        """Return accelerations (n, 3) at attitudes (n, 4) after the first instants under dipoles (n, 3)."""
         count = len(quaternion)
         shown = attitude_matrix(quaternion)
         field = np.einsum("nij,nj->ni", shown, self.field[:count])
@@ -301,15 +309,15 @@ class PathConditions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathCriterion:
-    """What a step costs.
+    """The cost of a step.
 
     Attributes:
-        state: (6, 6), of turn and rate against the law.
-        dipole: of an axis.
-        end: the law's cost-to-go after the path; its first column is of the law and the torques expected,
-            the others of each size of the torques.
+        state: (6, 6), of rotation and rate errors relative to the law.
+        dipole: of each axis.
+        end: the cost-to-go of the law after the path. Its first column belongs to the law and the expected
+            torques, the others to each size of the torques.
         shape: (n + 1, 3, sizes) of the torques in the law's axes.
-        fastest: rad/s; a rate beyond is dear, `EXCESS`.
+        fastest: rad/s; a faster rate has a high cost, `EXCESS`.
     """
 
     state: FloatArray
@@ -323,7 +331,7 @@ class PathCriterion:
 class PlannedMotion:
     """A motion: attitudes (n + 1, 4), rates (n + 1, 3) rad/s, and controls (n, 4) held over the steps.
 
-    A control is a dipole, A m^2, body axes, and a torque along the field, N m.
+    A control is a dipole (A m^2, body axes) and a torque along the field (N m).
     """
 
     quaternion: FloatArray
@@ -338,29 +346,32 @@ class PlannedMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGains:
-    """Gains K (n, 4, 6) about a motion, and k (n, 4, columns): what betters it, and by each size."""
+    """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
+
+    The first column of k improves the motion, the others belong to each size of the torques.
+    """
 
     gain: FloatArray
     steady: FloatArray
 
 
 def best_path(
-    expected: PathConditions, begun: AttitudeReferences, criterion: PathCriterion
+    expected: PathConditions, initial: AttitudeReferences, criterion: PathCriterion
 ) -> tuple[PlannedMotion, MotionGains]:
-    """Return the path from the begin of `begun` (n + 1,) and its gains; `begun` leads into the law.
+    """Return the path from the start of `initial` (n + 1,) and its gains; `initial` leads into the law.
 
-    Coils need not manage `begun`. Takes 0.3 ms an instant and sweep. Raises PlanningError where the body
-    turns by too much in a step to be followed.
+    `initial` need not be feasible with coils. Takes 0.3 ms per instant and sweep. Raises PlanningError if the
+    body rotates too far in a step to be propagated.
     """
-    rest = PlannedMotion(begun.quaternion, begun.rate, np.zeros((len(begun.times) - 1, 4)))
+    rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
     near = float(_counted(expected.wanted, first, criterion).max()) < NEAR
     best, least = first, math.inf
     for rise in RISES:
-        motion, price = first, PROHIBITIVE if near else 1.0
-        while price < DEAR:
-            motion, price = _bettered(expected, motion, criterion, price), price * rise
-        motion = _bettered(expected, motion, criterion, PROHIBITIVE)
+        motion, multiple = first, PROHIBITIVE if near else 1.0
+        while multiple < DEAR:
+            motion, multiple = _improved(expected, motion, criterion, multiple), multiple * rise
+        motion = _improved(expected, motion, criterion, PROHIBITIVE)
         cost = _cost(expected, motion, criterion, PROHIBITIVE)
         if cost < least:
             best, least = motion, cost
@@ -371,30 +382,31 @@ def best_path(
 
 
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
-    """Return the motion that the sweeps begin with: under gains, or without control where those drive it out.
+    """Return the motion that the sweeps start with.
 
-    The torque along the field has no limit, so that far from `rest` the gains may turn the body by several
-    revolutions in a step.
+    It is propagated with the given gains, or without control if it diverges under them: the torque along the
+    field has no limit, so that far from `rest` the gains may rotate the body by several revolutions in a
+    step.
     """
     nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
     for tried in (gains, nothing):
-        if (first := fly(expected, rest, tried, 1.0)) is not None:
+        if (first := propagate(expected, rest, tried, 1.0)) is not None:
             return first
     fastest = math.degrees(float(np.linalg.norm(rest.rate[0])))
-    raise PlanningError(f"no path: from {fastest:.1f} deg/s on the body turns by too much in a step")
+    raise PlanningError(f"no path: at {fastest:.1f} deg/s the body rotates too far in one step of the plan")
 
 
-def _bettered(
-    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, price: float
+def _improved(
+    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
 ) -> PlannedMotion:
-    """Return the best motion near a flown one at a price of torques along the field."""
-    cost = _cost(expected, motion, criterion, price)
-    enough = SAVED[price == PROHIBITIVE]
+    """Return the best motion near a feasible one for torques along the field at `multiple` cost."""
+    cost = _cost(expected, motion, criterion, multiple)
+    enough = SAVED[multiple == PROHIBITIVE]
     for _ in range(SWEEPS):
-        gains, before = _swept(expected, motion, criterion, price), cost
+        gains, before = _swept(expected, motion, criterion, multiple), cost
         for share in SHARES:
-            tried = fly(expected, motion, gains, share)
-            found = math.inf if tried is None else _cost(expected, tried, criterion, price)
+            tried = propagate(expected, motion, gains, share)
+            found = math.inf if tried is None else _cost(expected, tried, criterion, multiple)
             if tried is not None and found < cost:
                 motion, cost = tried, found
                 break
@@ -403,12 +415,12 @@ def _bettered(
     return motion
 
 
-def fly(
+def propagate(
     expected: PathConditions, motion: PlannedMotion, gains: MotionGains, share: float
 ) -> PlannedMotion | None:
-    """Return the motion from the same begin with a share of the change that was found, and feedback.
+    """Return the motion from the same start with a fraction `share` of the computed change, and feedback.
 
-    None where it runs away: far from `motion` the torques along the field, which have no limit, drive it out.
+    None if it diverges: far from `motion` the torques along the field, which have no limit, drive it away.
     """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
@@ -419,7 +431,7 @@ def fly(
         u = changed[k] - gains.gain[k] @ np.concatenate([turn, w - motion.rate[k]])
         u[:3] = np.clip(u[:3], -expected.limit, expected.limit)
         middle = w + 0.5 * step * expected.acceleration(k, q, w, u)
-        if not np.abs([w, middle]).max() < RUN_AWAY:  # nor is what is no number
+        if not np.abs([w, middle]).max() < RUN_AWAY:  # also true for NaN
             return None
         half = multiply(from_rotation_vector(0.5 * step * w), q)
         w = w + step * expected.acceleration(k, half, middle, u)
@@ -432,10 +444,13 @@ def _swept(
     expected: PathConditions,
     motion: PlannedMotion,
     criterion: PathCriterion,
-    price: float,
+    multiple: float,
     given: bool = False,
 ) -> MotionGains:
-    """Return the gains about a motion; one that is `given` takes torques that its controls do not make."""
+    """Return the gains about a motion.
+
+    A `given` motion takes torques that its controls do not make.
+    """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
     field = expected.field[:count]
@@ -445,8 +460,8 @@ def _swept(
     along = linear.by_torque @ (linear.field / strength[:, None])[:, :, None]
     linear = replace(linear, by_control=np.concatenate([linear.by_control, along], axis=2))
     control = np.full((count, 4), criterion.dipole)
-    control[:, 3] *= price / strength**2
-    astray, bent = off(expected.wanted, motion), bends(expected.wanted, motion)
+    control[:, 3] *= multiple / strength**2
+    deviation, bent = errors(expected.wanted, motion), error_jacobians(expected.wanted, motion)
     turned = np.swapaxes(bent, 1, 2)
     columns = end.slope.shape[1]
     affine, state_slope = np.zeros((2, count, 6, columns))
@@ -456,14 +471,14 @@ def _swept(
         missing = criterion.shape[:count] @ expected.sizes - linear.missing
         affine[:, :, 0] = np.einsum("nij,nj->ni", linear.by_torque, missing)
     else:
-        state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, astray[:-1])
+        state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, deviation[:-1])
         control_slope[:, :, 0] = control * motion.control
     states = turned[:-1] @ state @ bent[:-1]
     steep, curved = _haste(motion.rate, criterion.fastest, expected.step)
     state_slope[:, 3:, 0] += steep[:-1]
     states[:, 3:, 3:] += curved[:-1]
     slope, square = turned[-1] @ end.slope, turned[-1] @ end.square @ bent[-1]
-    slope[:, 0] += turned[-1] @ end.square @ astray[-1]
+    slope[:, 0] += turned[-1] @ end.square @ deviation[-1]
     slope[3:, 0] += steep[-1]
     square[3:, 3:] += curved[-1]
     last = CostToGo(square, slope)
@@ -472,46 +487,49 @@ def _swept(
     return MotionGains(gain, steady)
 
 
-def _cost(expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, price: float) -> float:
-    """Return what a motion costs, with the cost-to-go after it."""
-    astray, end = off(expected.wanted, motion), criterion.end
+def _cost(
+    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
+) -> float:
+    """Return the cost of a motion, including the cost-to-go after it."""
+    deviation, end = errors(expected.wanted, motion), criterion.end
     strength = np.linalg.norm(expected.field[:-1], axis=1)
-    squares = np.einsum("ni,ij,nj->", astray[:-1], criterion.state, astray[:-1])
+    squares = np.einsum("ni,ij,nj->", deviation[:-1], criterion.state, deviation[:-1])
     squares += criterion.dipole * np.sum(motion.control[:, :3] ** 2)
-    squares += criterion.dipole * price * np.sum((motion.control[:, 3] / strength) ** 2)
+    squares += criterion.dipole * multiple * np.sum((motion.control[:, 3] / strength) ** 2)
     excess = np.maximum(np.linalg.norm(motion.rate, axis=1) - criterion.fastest, 0.0)
     squares += expected.step * np.sum((excess / EXCESS) ** 2)
-    return float(0.5 * squares + astray[-1] @ (0.5 * end.square @ astray[-1] + end.slope[:, 0]))
+    return float(0.5 * squares + deviation[-1] @ (0.5 * end.square @ deviation[-1] + end.slope[:, 0]))
 
 
 def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return slope (n, 3) and curvature (n, 3, 3) of the price of rates (n, 3) beyond the largest."""
+    """Return slope (n, 3) and curvature (n, 3, 3) of the cost of rates (n, 3) beyond the largest."""
     speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
     along = rate / speed[:, None]
-    excess, price = np.maximum(speed - fastest, 0.0), step / EXCESS**2
+    excess, weight = np.maximum(speed - fastest, 0.0), step / EXCESS**2
     outer = along[:, :, None] * along[:, None, :]
     curved = (excess > 0.0)[:, None, None] * outer
     curved = curved + (excess / speed)[:, None, None] * (np.eye(3) - outer)
-    return price * excess[:, None] * along, price * curved
+    return weight * excess[:, None] * along, weight * curved
 
 
-def off(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return the turn and the rate (n + 1, 6) of a motion against the law."""
+def errors(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
+    """Return the rotation and rate errors (n + 1, 6) of a motion relative to the law."""
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     return np.concatenate([turn, motion.rate - wanted.rate], axis=1)
 
 
 def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
-    """Return the turn (n + 1,) rad against the law as it counts: one about a cheap axis by its price."""
-    turn, price = off(wanted, motion)[:, :3], criterion.state[:3, :3]
-    squares = np.einsum("ni,ij,nj->n", turn, price, turn)
-    return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(price)[-1]))
+    """Return the rotation error (n + 1,) rad relative to the law, weighted by its cost."""
+    turn, weights = errors(wanted, motion)[:, :3], criterion.state[:3, :3]
+    squares = np.einsum("ni,ij,nj->n", turn, weights, turn)
+    return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(weights)[-1]))
 
 
-def bends(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
-    """Return how the turn against the law changes with a small turn of the body, (n + 1, 6, 6).
+def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
+    """Return the derivatives (n + 1, 6, 6) of the errors relative to the law by a small motion of the body.
 
-    The inverse of the left Jacobian of the rotation group, with the signs of this house's quaternions.
+    The rotation block is the inverse of the left Jacobian of the rotation group, for scalar-last quaternions
+    that rotate inertial into body axes.
     """
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     angle = np.linalg.norm(turn, axis=1)

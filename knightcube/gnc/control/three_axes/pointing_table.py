@@ -6,7 +6,7 @@ Optimization, algorithm 18.3). Unlike the sweeps of `pointing_path`, the interme
 feasible: the state to which the equations of motion propagate each instant is compared with the next instant,
 and the next step removes the defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not
 grow along a revolution, in which a body that coils cannot hold about the field rotates far about its pointing
-axis. A step takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the derivative is
+axis. A step takes 0.07 ms per instant. It is propagated by the midpoint rule, and the derivative is
 that of the discrete step: the derivative of the continuous motion would lead a body that rotates by degrees
 in a step to motions that no step improves.
 
@@ -42,10 +42,10 @@ from knightcube.gnc.control.three_axes.pointing_path import (
     PlannedMotion,
     SweepCost,
     acceleration_slopes,
-    bends,
     best_path,
+    error_jacobians,
+    errors,
     linearised,
-    off,
     sweep,
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
@@ -55,23 +55,23 @@ _TURN, _RATE, _DIPOLE, _TORQUE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9,
 _EYE: FloatArray = np.eye(3)
 
 
-def carried(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
-    """Return the attitudes (n, 4) and rates (n, 3) rad/s to which the steps lead."""
+def midpoint_step(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArray, FloatArray]:
+    """Return the attitudes (n, 4) and rates (n, 3) rad/s at the end of the steps."""
     step, count = expected.step, len(motion.control)
     half, middle = _halfway(expected, motion)
     there = multiply(from_rotation_vector(step * middle), motion.quaternion[:count])
     return there, motion.rate[:count] + step * expected.accelerations(half, middle, motion.control)
 
 
-def missed(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
-    """Return by how much (n, 6) each instant's turn and rate are carried past those of the next instant."""
-    there, speed = carried(expected, motion)
+def defects(expected: PathConditions, motion: PlannedMotion) -> FloatArray:
+    """Return the defects (n, 6): rotation and rate at the end of each step relative to the next instant."""
+    there, speed = midpoint_step(expected, motion)
     turn = to_rotation_vector(multiply(there, conjugate(motion.quaternion[1:])))
     return np.concatenate([turn, speed - motion.rate[1:]], axis=1)
 
 
 def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorModel:
-    """Return how the state after each step changes with that before it, dipole and torque."""
+    """Return the derivatives of the state after each step by the state before it, dipole and torque."""
     step, count = expected.step, len(motion.control)
     q, w, dipole = motion.quaternion[:count], motion.rate[:count], motion.control
     half, middle = _halfway(expected, motion)
@@ -80,17 +80,17 @@ def derivative(expected: PathConditions, motion: PlannedMotion) -> LinearErrorMo
     first, shown, _ = acceleration_slopes(q, w, *around, dipole, pressed)
     second, seen, _ = acceleration_slopes(half, middle, *around, dipole, pressed)
 
-    begun = np.concatenate([first, _pushes(inverse, shown)], axis=2)
-    rate = 0.5 * step * begun
+    initial = np.concatenate([first, _pushes(inverse, shown)], axis=2)
+    rate = 0.5 * step * initial
     rate[:, :, _RATE] += _EYE
     turn = np.zeros((count, 3, 12))
     turn[:, :, _TURN] = attitude_matrix(from_rotation_vector(0.5 * step * w))
-    turn[:, :, _RATE] = 0.5 * step * _turned(0.5 * step * w)
+    turn[:, :, _RATE] = 0.5 * step * _rotation_jacobian(0.5 * step * w)
     change = np.empty((count, 6, 12))
     change[:, 3:] = step * (second[:, :, :3] @ turn + second[:, :, 3:] @ rate)
     change[:, 3:, 6:] += step * _pushes(inverse, seen)
     change[:, 3:, _RATE] += _EYE
-    change[:, :3] = step * _turned(step * middle) @ rate
+    change[:, :3] = step * _rotation_jacobian(step * middle) @ rate
     change[:, :3, _TURN] += attitude_matrix(from_rotation_vector(step * middle))
     return LinearErrorModel(
         change[:, :, :6], change[:, :, _DIPOLE], change[:, :, _TORQUE], np.zeros((count, 3)), shown
@@ -106,16 +106,17 @@ def _halfway(expected: PathConditions, motion: PlannedMotion) -> tuple[FloatArra
 
 
 def _pushes(inverse: FloatArray, shown: FloatArray) -> FloatArray:
-    """Return how accelerations change with dipole and torque (n, 3, 6) in a field (n, 3) of body axes."""
+    """Return the derivatives (n, 3, 6) of accelerations by dipole and torque in a field (n, 3), body axes."""
     return np.concatenate(
         [-inverse @ cross_matrices(shown), np.broadcast_to(inverse, (len(shown), 3, 3))], axis=2
     )
 
 
-def _turned(vector: FloatArray) -> FloatArray:
-    """Return how the turn by a rotation vector (n, 3) changes with the vector (n, 3, 3).
+def _rotation_jacobian(vector: FloatArray) -> FloatArray:
+    """Return the derivatives (n, 3, 3) of rotations by their rotation vectors (n, 3).
 
-    The left Jacobian of the rotation group, with the signs of this house's quaternions.
+    They are the left Jacobian of the rotation group, for scalar-last quaternions that rotate inertial into
+    body axes.
     """
     angle = np.linalg.norm(vector, axis=1)[:, None, None]
     safe = np.where(angle < 1e-2, 1.0, angle)
@@ -128,59 +129,67 @@ def _turned(vector: FloatArray) -> FloatArray:
 STEPS = 40
 """Largest number of steps."""
 FARTHEST = math.radians(30.0)
-"""rad that a step may turn the motion at any instant; a larger one is scaled as a whole."""
+"""Largest rotation (rad) by a step at any instant; a longer step is scaled as a whole."""
 HALVES = 6
-"""How often a step is halved until the motion is better by it."""
+"""Largest number of halvings of a step."""
 DEARER = 1.2
-"""What the equations not kept cost in the merit, by what they are worth to the cost."""
+"""Weight of the defects in the merit, as a multiple of the largest sensitivity of the cost to a defect."""
 DONE = math.radians(0.05)
-"""rad: a step that turns the motion by less is the last, and one that saves less than SAVED of the merit."""
+"""Rotation (rad) below which a step is the last one. A step that saves less than SAVED of the merit is the
+last one, too."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Of the cost: what a motion may lack of its equations, by its price. A cost of one is beneath notice."""
+"""Weighted defects of an acceptable motion, relative to its cost. A cost of one is negligible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ShootingStep:
-    """A whole step: the change (n + 1, 6) of turn and rate, that (n, 3) of the dipole, and how it was found.
+    """A full step of multiple shooting.
 
-    `turned` is how far it turns the motion at most, rad; `worth` (6,) is how much the cost changes at most
-    with what lacks at an instant.
+    Attributes:
+        change: (n + 1, 6) of rotation and rate.
+        control: (n, 3) change of the dipole.
+        gains: about the motion.
+        linear: the model about the motion.
+        rotated: the largest rotation by the step, rad.
+        sensitivity: (6,) the largest derivative of the cost by a defect at an instant.
     """
 
     change: FloatArray
     control: FloatArray
     gains: MotionGains
     linear: LinearErrorModel
-    turned: float
-    worth: FloatArray
+    rotated: float
+    sensitivity: FloatArray
 
 
 def best_course(
-    expected: PathConditions, begun: AttitudeReferences, state: FloatArray, dipole: float, fastest: float
+    expected: PathConditions, initial: AttitudeReferences, state: FloatArray, dipole: float, fastest: float
 ) -> tuple[PlannedMotion, MotionGains] | None:
-    """Return the best motion from the begin of `begun` over all that is expected, and the gains about it.
+    """Return the best motion over all instants of `expected` from the start of `initial`, and its gains.
 
-    `begun` (n + 1,) leads into the law and is what will be flown; `state` (6, 6) and `dipole` are what a step
-    costs (`pointing_table.prices`). None where no motion is found within `STEPS`, where it needs more dipole
-    than there is, or turns faster than `fastest` rad/s meanwhile.
+    `initial` (n + 1,) leads into the law and covers the part that will be flown; `state` (6, 6) and `dipole`
+    are the costs of a step (`step_costs`). None if no motion is found within `STEPS`, if it needs more dipole
+    than available, or if it rotates faster than `fastest` rad/s in the part that will be flown.
     """
-    count, first = len(expected.field) - 1, len(begun.times)
-    quaternion = np.concatenate([begun.quaternion, expected.wanted.quaternion[first:]])
-    rate = np.concatenate([begun.rate, expected.wanted.rate[first:]])
+    count, first = len(expected.field) - 1, len(initial.times)
+    quaternion = np.concatenate([initial.quaternion, expected.wanted.quaternion[first:]])
+    rate = np.concatenate([initial.rate, expected.wanted.rate[first:]])
     motion = PlannedMotion(quaternion, rate, np.zeros((count, 3)))
     criterion = _Merit(expected, state, dipole)
     for _ in range(STEPS):
         step = _direction(criterion, motion)
-        if not step.turned < math.inf:
+        if not step.rotated < math.inf:
             return None
-        criterion.dear = np.maximum(criterion.dear, DEARER * step.worth)
+        criterion.dear = np.maximum(criterion.dear, DEARER * step.sensitivity)
         before = sum(criterion.merit(motion))
         better = _better(criterion, motion, step, before)
         motion = motion if better is None else better
-        cost, lack = criterion.merit(motion)
-        kept = lack <= ENOUGH * (1.0 + cost)
-        if better is None or (kept and (step.turned < DONE or before - cost - lack < SAVED * (1.0 + before))):
+        cost, defect = criterion.merit(motion)
+        kept = defect <= ENOUGH * (1.0 + cost)
+        if better is None or (
+            kept and (step.rotated < DONE or before - cost - defect < SAVED * (1.0 + before))
+        ):
             break
     strongest = float(np.abs(motion.control).max())
     speed = float(np.linalg.norm(motion.rate[:first], axis=1).max())
@@ -189,7 +198,7 @@ def best_course(
 
 @dataclass(eq=False)
 class _Merit:
-    """What a motion costs: `state` (6, 6) and `dipole` a step, and `dear` (6,) for what it lacks."""
+    """The merit of a motion: `state` (6, 6) and `dipole` cost a step, `dear` (6,) weights the defects."""
 
     expected: PathConditions
     state: FloatArray
@@ -197,25 +206,25 @@ class _Merit:
     dear: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     def merit(self, motion: PlannedMotion) -> tuple[float, float]:
-        """Return the cost of a motion, and the price of what it lacks of the equations of motion."""
-        astray = off(self.expected.wanted, motion)
-        squares = float(np.einsum("ni,ij,nj->", astray, self.state, astray))
+        """Return the cost of a motion, and the weighted defects."""
+        deviation = errors(self.expected.wanted, motion)
+        squares = float(np.einsum("ni,ij,nj->", deviation, self.state, deviation))
         squares += self.dipole * float(np.sum(motion.control**2))
-        return 0.5 * squares, float(self.dear @ np.abs(missed(self.expected, motion)).sum(axis=0))
+        return 0.5 * squares, float(self.dear @ np.abs(defects(self.expected, motion)).sum(axis=0))
 
 
 def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
-    """Return the whole linear-quadratic step from a motion, and the gains about it."""
+    """Return the full linear-quadratic step from a motion, and the gains about it."""
     expected, state, dipole = criterion.expected, criterion.state, criterion.dipole
     count, wanted, sizes = len(motion.control), expected.wanted, expected.sizes
     shown = attitude_matrix(motion.quaternion[:count])
     linear = derivative(expected, motion)
     affine = np.zeros((count, 6, 1 + len(sizes)))
-    affine[:, :, 0] = missed(expected, motion)
+    affine[:, :, 0] = defects(expected, motion)
     affine[:, :, 1:] = linear.by_torque @ shapes(expected.pressures.until(count), shown)
-    turned, astray = bends(wanted, motion), off(wanted, motion)
-    back = np.swapaxes(turned, 1, 2)
-    states, slopes = back @ state @ turned, np.einsum("nij,nj->ni", back @ state, astray)
+    rotated, deviation = error_jacobians(wanted, motion), errors(wanted, motion)
+    back = np.swapaxes(rotated, 1, 2)
+    states, slopes = back @ state @ rotated, np.einsum("nij,nj->ni", back @ state, deviation)
     state_slope, control_slope = np.zeros(affine.shape), np.zeros((count, 3, affine.shape[2]))
     state_slope[:, :, 0], control_slope[:, :, 0] = slopes[:-1], dipole * motion.control
     end = np.zeros((6, affine.shape[2]))
@@ -228,18 +237,18 @@ def _direction(criterion: _Merit, motion: PlannedMotion) -> _ShootingStep:
         change[k + 1] = linear.transition[k] @ change[k] + linear.by_control[k] @ control[k] + affine[k, :, 0]
     turns = np.linalg.norm(change[:, :3], axis=1)
     own = np.einsum("nij,nj->ni", states, change) + slopes
-    worth, most = own[-1], np.abs(own[-1])
+    sensitivity, most = own[-1], np.abs(own[-1])
     for k in range(count - 1, 0, -1):
-        worth = linear.transition[k].T @ worth + own[k]
-        most = np.maximum(most, np.abs(worth))
+        sensitivity = linear.transition[k].T @ sensitivity + own[k]
+        most = np.maximum(most, np.abs(sensitivity))
     return _ShootingStep(change, control, MotionGains(gain, steady), linear, float(turns.max()), most)
 
 
 def _better(
     criterion: _Merit, motion: PlannedMotion, step: _ShootingStep, before: float
 ) -> PlannedMotion | None:
-    """Return the motion after as much of a step as betters the merit `before`; None where no part does."""
-    share = min(1.0, FARTHEST / max(step.turned, DONE))
+    """Return the motion after the largest fraction of a step that improves the merit; None if none does."""
+    share = min(1.0, FARTHEST / max(step.rotated, DONE))
     for _ in range(HALVES):
         moved = _moved(motion, share * step.change, share * step.control)
         if sum(criterion.merit(moved)) < before:
@@ -252,36 +261,37 @@ def _better(
 
 
 def _closed(expected: PathConditions, moved: PlannedMotion, step: _ShootingStep) -> PlannedMotion:
-    """Return a motion that lacks less of its equations, which a step has bent: a second-order correction."""
-    lack, gain = missed(expected, moved), step.gains.gain
+    """Return a motion with smaller defects: a second-order correction after a step."""
+    defect, gain = defects(expected, moved), step.gains.gain
     change, control = np.zeros((len(gain) + 1, 6)), np.empty((len(gain), 3))
     transition, push = step.linear.transition, step.linear.by_control
     for k in range(len(gain)):
         control[k] = -gain[k] @ change[k]
-        change[k + 1] = transition[k] @ change[k] + push[k] @ control[k] + lack[k]
+        change[k + 1] = transition[k] @ change[k] + push[k] @ control[k] + defect[k]
     return _moved(moved, change, control)
 
 
 def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> PlannedMotion:
-    """Return a motion with changes (n + 1, 6) of turn and rate and (n, 3) of its dipole."""
-    turned = multiply(from_rotation_vector(change[:, :3]), motion.quaternion)
-    return PlannedMotion(turned, motion.rate + change[:, 3:], motion.control + control)
+    """Return a motion changed by (n + 1, 6) in rotation and rate and by (n, 3) in its dipole."""
+    rotated = multiply(from_rotation_vector(change[:, :3]), motion.quaternion)
+    return PlannedMotion(rotated, motion.rate + change[:, 3:], motion.control + control)
 
 
 LEAST_PART = 1.0 / 3.0
-"""Of a table: a shorter part that the body can fly is not worth leaving the last table for."""
+"""Fraction of a table: the last table is kept rather than replaced by a shorter flyable part."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
-    """What errors cost: each attribute is the value that costs one.
+    """Weights of the errors: each attribute is the value that costs one.
 
     Attributes:
-        turn: rad, of an axis.
-        rate: rad/s, of an axis.
-        dipole: A m^2, of an axis.
-        fastest: rad/s, the rate of a body on its way; more is dear (`pointing_path.EXCESS`).
-        roll: rad about the unit vector `axis` (3,), where that is cheaper than another turn.
+        turn: rad, of each axis.
+        rate: rad/s, of each axis.
+        dipole: A m^2, of each axis.
+        fastest: rad/s, largest rate on the way into the law; a faster one has a high cost
+            (`pointing_path.EXCESS`).
+        roll: rad about the unit vector `axis` (3,), if that rotation costs less than others.
     """
 
     turn: float
@@ -294,16 +304,16 @@ class PointingWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingTable:
-    """A path and gains at even instants, n of them.
+    """A path and gains at n equally spaced instants.
 
     Attributes:
         path: the motion that is flown, n + 1 instants.
-        wanted: the law, likewise.
+        wanted: the law, n + 1 instants.
         dipole: (n, 3) A m^2 of the path, held until the next instant.
-        gain: (n, 3, 6), K: A m^2 by rad and by rad/s.
-        torque_part: (n, 3, sizes): A m^2 by each size of the disturbance beyond `sizes`.
-        sizes: (sizes,) N m, those that the path expects.
-        slew: the slew that the path begins with, where it does; its times count from the path's begin.
+        gain: (n, 3, 6), K: A m^2 per rad and per rad/s.
+        torque_part: (n, 3, sizes): A m^2 per size of the disturbance beyond `sizes`.
+        sizes: (sizes,) N m of the disturbance that the path was planned with.
+        slew: the slew that the path begins with, if any; its times count from the start of the path.
     """
 
     path: AttitudeReferences
@@ -320,9 +330,9 @@ class PointingTable:
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part before the body turns at `fastest` rad/s; None for one shorter than `LEAST_PART`.
+        """Return the part before the body reaches `fastest` rad/s; None if shorter than `LEAST_PART`.
 
-        A slew is flown whole or not at all.
+        A slew is flown as a whole or not at all.
         """
         over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
         if not len(over):
@@ -343,17 +353,19 @@ class PointingTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingPreview:
-    """What is expected along a law, at the instants of its `wanted` (m,): path and preview.
+    """The law and the predicted environment at the instants (m,) of `wanted`: path and preview.
 
     Attributes:
-        begun: a motion (n + 1,) from the body's attitude and rate into the law; the coils need not manage it.
+        wanted: the law.
+        initial: a motion (n + 1,) from the body's attitude and rate into the law; it need not be feasible
+            with coils.
         field, position: (m, 3) T and m, ICRS.
-        pressures: shapes of the torques, likewise.
+        pressures: (m,) shapes of the torques.
         sizes: (9,) N m, the torques estimated now.
     """
 
     wanted: AttitudeReferences
-    begun: AttitudeReferences
+    initial: AttitudeReferences
     field: FloatArray
     position: FloatArray
     pressures: Pressures
@@ -363,27 +375,29 @@ class PointingPreview:
 def pointing_table(
     ahead: PointingPreview, inertia: FloatArray, limit: float, weights: PointingWeights
 ) -> PointingTable:
-    """Return the table from the begin of `ahead.begun` to its end.
+    """Return the table from the start of `ahead.initial` to its end.
 
-    `inertia` (3, 3) kg m^2; `limit` A m^2 of each coil. The preview beyond should be of a revolution. Raises
-    UsageError for times that are not even.
+    `inertia` (3, 3) kg m^2; `limit` A m^2 of each coil. The preview should last a revolution. Raises
+    UsageError for times that are not equally spaced.
     """
     steps = np.diff(ahead.wanted.times)
-    count = len(ahead.begun.times) - 1
+    count = len(ahead.initial.times) - 1
     if count < 2 or len(steps) <= count or not np.allclose(steps, steps[0], rtol=1e-6):
-        raise UsageError("a pointing table needs even times, three or more, and a preview beyond them")
+        raise UsageError(
+            "a pointing table needs three or more equally spaced times and a preview beyond them"
+        )
     dt = float(steps[0])
-    state, dipole = prices(weights, dt)
+    state, dipole = step_costs(weights, dt)
     shape = shapes(ahead.pressures, attitude_matrix(ahead.wanted.quaternion))
     inverse = np.asarray(np.linalg.inv(inertia))
     whole = PathConditions(
         ahead.wanted, ahead.field, ahead.position, ahead.pressures, ahead.sizes, inertia, inverse, limit
     )
-    course = best_course(whole, ahead.begun, state, dipole, weights.fastest)
+    course = best_course(whole, ahead.initial, state, dipole, weights.fastest)
     if course is None:
         beyond = _beyond(ahead, count, inertia, state, dipole, shape)
         criterion = PathCriterion(state, dipole, beyond, shape, weights.fastest)
-        course = best_path(whole.until(count + 1), ahead.begun, criterion)
+        course = best_path(whole.until(count + 1), ahead.initial, criterion)
     motion, gains = course
     path = motion.references(ahead.wanted.times[: len(motion.rate)]).until(count + 1)
     wanted = ahead.wanted.until(count + 1)
@@ -398,13 +412,13 @@ def table_along(
     inertia: FloatArray,
     weights: PointingWeights,
 ) -> PointingTable:
-    """Return the table that holds a given motion (n + 1,), its torque known ahead; no other is expected.
+    """Return the table that holds a given motion (n + 1,) without other torques than the motion's own.
 
     `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
     have less preview.
     """
     count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
-    state, dipole = prices(weights, dt)
+    state, dipole = step_costs(weights, dt)
     linear = linearised(motion.until(count), inertia, field[:count], position[:count])
     affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
     nothing = np.zeros(affine.shape)
@@ -414,8 +428,8 @@ def table_along(
     return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
 
 
-def prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
-    """Return what a step of `dt` s costs: (6, 6) of turn and rate, and of an axis of the dipole."""
+def step_costs(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
+    """Return the costs of a step of `dt` s: (6, 6) of rotation and rate, and of each axis of the dipole."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
     if weights.roll is not None and weights.axis is not None:
         state[:3, :3] -= dt * (weights.turn**-2.0 - weights.roll**-2.0) * np.outer(weights.axis, weights.axis)
@@ -430,7 +444,7 @@ def _beyond(
     dipole: float,
     shape: FloatArray,
 ) -> CostToGo:
-    """Return the cost-to-go of the law from instant `begin` on; the first column has the expected torques."""
+    """Return the cost-to-go of the law from instant `begin` on; column 0 holds the expected torques."""
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]
     field, position = ahead.field[begin:], ahead.position[begin:]

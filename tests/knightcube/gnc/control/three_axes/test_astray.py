@@ -27,7 +27,7 @@ def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
 
 
 def seen(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[float | None, bool]:
-    astray.see(off, speed, now)
+    astray.update(off, speed, now)
     return astray.since, astray.ready
 
 
@@ -44,7 +44,7 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
 
 def test_a_spin_along_the_field_is_not_waited_for() -> None:
     astray = PathRecovery()
-    astray.see(2.0 * FAR, 5.0 * SLOW, 0.0)
+    astray.update(2.0 * FAR, 5.0 * SLOW, 0.0)
     assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE - 1.0)[1]
     assert seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE + 1.0)[1]
 
@@ -52,9 +52,9 @@ def test_a_spin_along_the_field_is_not_waited_for() -> None:
 def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:
     astray = PathRecovery()
     for off, leaving in ((0.9 * LEAVING, False), (1.1 * LEAVING, True), (1.1 * FAR, False)):
-        astray.see(off, SLOW, 0.0)
+        astray.update(off, SLOW, 0.0)
         assert astray.leaving == leaving
     astray.planned()
-    astray.see(1.1 * LEAVING, SLOW, 1.0)
+    astray.update(1.1 * LEAVING, SLOW, 1.0)
     astray.planned()
     assert not astray.leaving

@@ -22,16 +22,16 @@ from knightcube.gnc.control.three_axes.pointing_path import (
     MotionGains,
     PathConditions,
     PlannedMotion,
-    fly,
     linearised,
+    propagate,
 )
 from knightcube.gnc.control.three_axes.pointing_table import (
     PointingWeights,
     best_course,
-    carried,
+    defects,
     derivative,
-    missed,
-    prices,
+    midpoint_step,
+    step_costs,
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
 from tests.knightcube.gnc.guidance.three_axes.orbits import circular
@@ -59,7 +59,7 @@ def expected(sizes: FloatArray = SIZES, limit: float = LIMIT) -> PathConditions:
 
 
 def course(of: PathConditions, weights: PointingWeights, fastest: float = 0.01) -> PlannedMotion | None:
-    found = best_course(of, of.wanted.until(KEPT + 1), *prices(weights, STEP), fastest)
+    found = best_course(of, of.wanted.until(KEPT + 1), *step_costs(weights, STEP), fastest)
     return None if found is None else found[0]
 
 
@@ -113,7 +113,7 @@ def test_no_other_motion_near_it_costs_less(rolling: PlannedMotion) -> None:
         pressures=pressures(ORBIT, whole.wanted.times[later:]),
     )
     begun = rolling.references(whole.wanted.times).since(later).until(KEPT + 1)
-    found = best_course(rest, begun, *prices(CHEAP, STEP), 0.01)
+    found = best_course(rest, begun, *step_costs(CHEAP, STEP), 0.01)
     assert found is not None
     again = found[0].quaternion[: count - later]
     assert np.degrees(angle_between(again, rolling.quaternion[later:])).max() < 0.5
@@ -162,7 +162,7 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
     q = multiply(from_rotation_vector(np.radians([6.0, -4.0, 5.0])), ahead.wanted.quaternion[0])
     begun = ahead.wanted.until(KEPT + 1)
     begun = replace(begun, quaternion=np.concatenate([q[None], begun.quaternion[1:]]))
-    found = best_course(ahead, begun, *prices(CHEAP, STEP), 0.01)
+    found = best_course(ahead, begun, *step_costs(CHEAP, STEP), 0.01)
     assert found is not None
     np.testing.assert_allclose(to_rotation_vector(found[0].quaternion[0]), to_rotation_vector(q), atol=1e-12)
     assert off_axis(found[0])[KEPT:].max() < 3.0
@@ -175,10 +175,10 @@ def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: 
     q = multiply(from_rotation_vector(np.radians([1.0, -1.0, roll])), ahead.wanted.quaternion[0])
     begun = ahead.wanted.until(KEPT + 1)
     begun = replace(begun, quaternion=np.concatenate([q[None], begun.quaternion[1:]]))
-    found = best_course(ahead, begun, *prices(CHEAP, STEP), 0.01)
+    found = best_course(ahead, begun, *step_costs(CHEAP, STEP), 0.01)
     assert found is not None
     assert off_axis(found[0]).max() < 25.0
-    lack = np.abs(missed(ahead, found[0])).sum(axis=0)
+    lack = np.abs(defects(ahead, found[0])).sum(axis=0)
     assert lack[:3].max() < np.radians(0.1)
     assert lack[3:].max() < 1e-5
 
@@ -191,7 +191,7 @@ def test_the_derivative_of_a_step_is_exact(rolling: PlannedMotion) -> None:
     for axis in range(9):
         turn, rate, dipole = size * np.eye(9)[axis].reshape(3, 3)
         ends = [
-            carried(
+            midpoint_step(
                 ahead,
                 PlannedMotion(
                     multiply(from_rotation_vector(np.tile(way * turn, (len(spun.rate), 1))), spun.quaternion),
@@ -215,16 +215,16 @@ def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
     rest = PlannedMotion(ahead.wanted.quaternion, ahead.wanted.rate, np.zeros((60, 4)))
     gain = np.zeros((60, 4, 6))
     nothing = MotionGains(gain, np.zeros((60, 4, 1)))
-    still = fly(ahead, rest, nothing, 1.0)
+    still = propagate(ahead, rest, nothing, 1.0)
     assert still is not None
     assert np.abs(still.rate).max() < 0.01
     for push in (1e2, 1e6, 1e150, 1e300):
         steady = np.zeros((60, 4, 1))
         steady[:, 3] = push * 1e-3
         with np.errstate(all="raise"):
-            assert fly(ahead, rest, MotionGains(gain, steady), 1.0) is None
+            assert propagate(ahead, rest, MotionGains(gain, steady), 1.0) is None
     steady = np.zeros((60, 4, 1))
     steady[0, 3] = 1e-4
-    fast = fly(ahead, rest, MotionGains(gain, steady), 1.0)
+    fast = propagate(ahead, rest, MotionGains(gain, steady), 1.0)
     assert fast is not None, "a motion of several revolutions a step is followed"
     assert 2.0 * np.pi < 10.0 * np.abs(fast.rate).max() < 10.0 * RUN_AWAY

@@ -116,7 +116,7 @@ def test_a_refusal_says_what_the_ends_lie_in() -> None:
     axis = np.array([1.0, 0.0, 0.0])
     there = matrix(task.end(20.0).quaternion)[0]  # type: ignore[union-attr]
     cone = Cone("Moon", axis, lambda times: np.tile(there, (len(times), 1)), 0.05)
-    with pytest.raises(PlanningError, match="all of these, from 20 s on, end in .* cone of the Moon"):
+    with pytest.raises(PlanningError, match=r"all of these, from 20 s on, end in .* cone of the Moon"):
         plan_slew(replace(task, cones=(cone,)))
 
 
