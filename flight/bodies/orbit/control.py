@@ -111,7 +111,7 @@ class SunAcquisitionBrake:
         found = coarse_sun(reading.currents, self._strings)
         self._reason = found.reason
         if found.direction is not None:
-            self._seeker.see(reading.time_ns, found.direction)
+            self._seeker.update_sun(reading.time_ns, found.direction)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""

@@ -43,7 +43,7 @@ from knightcube.gnc.control.detumble import (
     Detumbler,
     DetumblerSettings,
     WindowSchedule,
-    share_in_turning_field,
+    share_in_rotating_field,
 )
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import Estimate
@@ -284,7 +284,7 @@ def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:
     )
     schedule = WindowSchedule(settle_ns, measure_ns, act_ns)
     turning = section.field_turn > 0.0
-    share = share_in_turning_field(section.field_turn, schedule) if turning else section.share
+    share = share_in_rotating_field(section.field_turn, schedule) if turning else section.share
     dipole = dipole_per_ampere(config)
     braking = DetumblerSettings(plant.inertia, dipole, plant.current_limit, share)
     return BdotBrake(Detumbler(schedule, braking), dipole)

@@ -17,17 +17,17 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
 
 WEAKEST = 0.15
-"""Torque directions that the available coils reach with less than this fraction of their strongest are left
-out: they would take all the current, and scaling would remove the rest."""
+"""Relative strength below which a torque direction is discarded: it would take all the current, and scaling
+would remove the other directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Allocation:
-    """Currents and the torque they make.
+    """Currents and their torque.
 
     Attributes:
         currents: (3,) A, zero on axes that are not available.
-        torque: (3,) N m, made by these currents.
+        torque: (3,) N m of these currents.
         share: fraction of the requested torque that is made in its direction, 0 .. 1.
     """
 
@@ -46,8 +46,9 @@ def allocate(
 ) -> Allocation:
     """Return currents for a torque (3,) N m in a magnetic field (3,) T, body axes.
 
-    `limits` (3,) A; `available` (3,) bool, the coils that may be used; `free` (3,) bool, the axes about which
-    the body can turn: a thread carries torque about the others. Raises FlightError for an input not finite.
+    `limits` (3,) A. `available` (3,) bool, the coils that may be used. `free` (3,) bool, the axes about which
+    the body can rotate; a thread carries torque about the others. Raises FlightError for an input that is not
+    finite.
     """
     wanted = np.asarray(torque, dtype=np.float64)
     if not (np.isfinite(wanted).all() and np.isfinite(field).all()):

@@ -3,11 +3,11 @@
 The coils' own field swamps the magnetometer, so time is divided into windows: the coils are off and settle,
 the field is averaged, then the coils act on the means of two windows in a row. In body axes a constant field
 changes by B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment
-m = (k / B^2) w_p x B brakes that rate: its torque m x B is -k w_p for any direction of the field, with no
+m = (k / B^2) w_p x B reduces that rate: its torque m x B is -k w_p for any direction of the field, with no
 component along it (B-dot: Wertz 1978, 18.3; Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The
 gain follows from the window: while the coils act, k w_p removes `share` of J w_p, J the smallest moment of
-inertia. Between windows the field is propagated with the last rate, so that a fast body is braked, not
-accelerated. The rate is right while the body turns by less than half a turn from window to window.
+inertia. Between windows the field is propagated with the last rate, so that a fast body is not
+accelerated. The rate is unambiguous if the body rotates by less than half a revolution per window.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from knightcube.gnc.estimation.field_rate import rate_across
 MOST_SHARE = 0.5
 _SECOND = 1e-9
 _REACHED_NS = 50_000_000
-"""Two control cycles: so late a command may reach the coils."""
+"""Two control cycles, the largest delay (ns) of a command to the coils."""
 _NO_CURRENT: FloatArray = np.zeros(3)
 
 
@@ -48,9 +48,9 @@ class WindowSchedule:
         return self.settle_ns + self.measure_ns + self.act_ns
 
     def calm(self, begin_ns: int, length_ns: int) -> int:
-        """Return when, from `begin_ns` on, the coils leave so long a time without a step.
+        """Return the first time from `begin_ns` on at which the coils do not switch for `length_ns`.
 
-        Windows are counted from time zero. It is `begin_ns` where neither pause nor action is long enough.
+        Windows are counted from time zero. Returns `begin_ns` if neither pause nor action is long enough.
         """
         phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
         later_ns = self.period_ns + pause_ns
@@ -64,7 +64,7 @@ class WindowSchedule:
 
 @dataclass(frozen=True, slots=True)
 class DetumblerSettings:
-    """The law's constants.
+    """Settings of the detumbler.
 
     Attributes:
         inertia: smallest principal moment, kg m^2.
@@ -79,7 +79,7 @@ class DetumblerSettings:
     share: float
 
     def __post_init__(self) -> None:
-        """Raise UsageError for constants that do not brake."""
+        """Raise UsageError for settings out of range."""
         for name in ("inertia", "dipole_per_ampere", "current_limit", "share"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -90,12 +90,12 @@ class DetumblerSettings:
             )
 
 
-def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
-    """Return the best `share` for a body free in three axes in a field that turns by `turn` rad/s.
+def share_in_rotating_field(turn: float, schedule: WindowSchedule) -> float:
+    """Return the best `share` for a body free in three axes in a field that rotates at `turn` rad/s.
 
-    The rate along the field can be braked only as the field turns; with more gain than k = 2 Omega J the spin
-    aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field turns about twice
-    per revolution.
+    The rate along the field can be removed only as the field rotates; with more gain than k = 2 Omega J the
+    spin aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field rotates about
+    twice per revolution.
     """
     return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
 
@@ -103,9 +103,9 @@ def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
 def braking_current(
     braking: DetumblerSettings, rate: FloatArray, field: FloatArray, act_time: float
 ) -> FloatArray:
-    """Return currents (3,) A that brake `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
+    """Return currents (3,) A that reduce `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
 
-    All three are scaled by one factor when a coil would exceed its limit, to preserve the direction.
+    All three are scaled by one factor if a coil would exceed its limit, to preserve the direction.
     """
     square = float(field @ field)
     if square == 0.0:
@@ -130,7 +130,7 @@ class Detumbler:
         self._rate: FloatArray | None = None
 
     def begin(self, now_ns: int) -> None:
-        """Begin the first window with no knowledge of the field."""
+        """Begin the first window without knowledge of the field."""
         self._begun_ns = now_ns
         self._samples.clear()
         self._window = self._closed = -1

@@ -100,7 +100,7 @@ class SafeFlight:
         currents = self._light.currents(truth.position, place, body, self._draws)
         found = coarse_sun(currents, self._strings)
         if found.direction is not None:
-            self.law.see(flight.time_ns, found.direction)
+            self.law.update_sun(flight.time_ns, found.direction)
         to_sun = place - truth.position
         cosine = float(AXIS @ body @ to_sun) / float(np.linalg.norm(to_sun))
         lit = float(sunlit_share(truth.position, place))

@@ -8,7 +8,7 @@ rotated at its present speed. Unlike B-dot, the law cannot get stuck with the sp
 holds the momentum along the field until the field has rotated. A single sample starts nothing. The coils stay
 off until `TRUSTED` samples in a row agree with the prediction of the filter and the standard deviation of the
 rate across the field is below `BOUNDED`; until then no pause is needed. They wait again if no sample was
-accepted for `UNHEARD` periods, because a restarted sensor may deliver fields of which none is usable.
+accepted for `SILENT_PERIODS` periods, because a restarted sensor may deliver fields of which none is usable.
 
 The momentum plan stops the body in the least time with the predicted field. In inertial axes the angular
 momentum obeys h' = m x B, without the body's inertia and attitude. By Pontryagin's principle the dipole of
@@ -45,21 +45,24 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.4
-"""Mean reach of three coils over the limit of one, in a body that turns; were all saturated, 1.5."""
+"""Mean strength of three coils over the limit of one, in a rotating body; if all were saturated, 1.5."""
 STEEP = 12.0
-"""Times the mean of |B x y| at which a coil is at its limit: least time takes all at theirs, but noise in B
-would switch them where B x y is small."""
+"""Multiple of the mean of |B x y| at which a coil reaches its limit. The least time saturates all coils, but
+noise in B would switch them where B x y is small."""
 FLAT = 0.02
-"""Of the largest |B x y|, what the smaller ones count as: the weights stay finite."""
+"""Floor of |B x y| relative to its largest value, which keeps the weights finite."""
 FINENESS = 60
-"""The horizon is found within a sixtieth."""
+"""The horizon is found to within one part in this number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
-    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body is at rest.
+    """A momentum plan.
 
-    The dipole -B x costate has the coils' limit at a small part of its mean over the plan; zero at rest.
+    Attributes:
+        costate: (3,) A m^2/T, inertial axes; zero for a body at rest. The dipole -B x costate reaches the
+            coils' limit at a small multiple of its mean over the plan.
+        horizon: s, the time at which the body is at rest.
     """
 
     costate: FloatArray
@@ -69,12 +72,11 @@ class MomentumPlan:
 def momentum_plan(
     momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
 ) -> MomentumPlan:
-    """Return the plan that removes `momentum` (3,) N m s but for `rest` N m s in the least time.
+    """Return the plan that removes `momentum` (3,) N m s except `rest` N m s in the least time.
 
-    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the momentum's inertial axes;
-    `limit` A m^2 is of each coil. When all times do not suffice, the plan removes what it can and its
-    horizon is their span.
-    Raises UsageError for a field of fewer than three instants.
+    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
+    momentum; `limit` A m^2 is of each coil. If all times do not suffice, the plan removes as much as possible
+    and its horizon is their span. Raises UsageError for a field of fewer than three instants.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -99,14 +101,16 @@ def momentum_plan(
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
-    """Return the dipole (3,) A m^2 of a plan in a field (3,) T, both in body axes, each coil cut at `limit`.
+    """Return the dipole (3,) A m^2 of a plan in a field (3,) T, body axes, each coil clipped at `limit`.
 
-    Cutting each coil alone takes nothing from the others: each removes momentum by itself.
+    Clipping one coil does not affect the others, because each coil removes momentum by itself.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
 
 
-def without_gain(dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray) -> FloatArray:
+def without_speed_up(
+    dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray
+) -> FloatArray:
     """Return the dipole (3,) without the part whose torque makes a body faster.
 
     `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No coil gets more than the largest had.
@@ -120,10 +124,10 @@ def without_gain(dipole: FloatArray, field: FloatArray, rate: FloatArray, invers
     return left if largest <= before else left * (before / largest)
 
 
-def turning_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the field (n, 3) T at `times` (n,) s from now on, that turns as it does now.
+def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the predicted field (n, 3) T at `times` (n,) s from now on, rotating at its present rate.
 
-    `field` (3,) T and its `change` (3,) T/s with respect to the stars; its strength is kept.
+    `field` (3,) T and its derivative `change` (3,) T/s are inertial; the strength is kept.
     """
     strength = math.sqrt(float(field @ field))
     along = field / strength
@@ -135,16 +139,16 @@ def turning_field(field: FloatArray, change: FloatArray, times: FloatArray) -> F
     return np.asarray(strength * np.cos(angle) * along + np.sin(angle) * across / speed)
 
 
-def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
-    """Return `fields` (n, 3) turned by the least angle that brings the first to where `field` (3,) points.
+def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
+    """Return `fields` (n, 3) rotated by the smallest rotation that aligns the first with `field` (3,).
 
-    What is measured now is better known than what is predicted by a coarse attitude.
+    The measured field is more accurate than a field predicted with a coarse attitude.
     """
     first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
     wanted = field / math.sqrt(float(field @ field))
     middle = first + wanted
     square = float(middle @ middle)
-    if square < 1.0:  # by more than 120 deg: no such prediction is worth to be turned
+    if square < 1.0:  # more than 120 deg: such a prediction is not corrected
         return fields
     # Two reflections: across the middle, which swaps the two, and back across `wanted`.
     halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
@@ -154,7 +158,14 @@ def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FieldPreview:
-    """The field (n, 3) and its `effect` (n, 3, 3) on the momentum; the dipole's reach, and the rest."""
+    """The predicted field of a momentum plan.
+
+    Attributes:
+        field: (n, 3) T.
+        effect: (n, 3, 3) on the momentum.
+        reach: A m^2, strength of the dipole.
+        rest: N m s, momentum that may remain.
+    """
 
     field: FloatArray
     effect: FloatArray
@@ -162,19 +173,19 @@ class _FieldPreview:
     rest: float
 
     def across(self, y: FloatArray, count: int) -> FloatArray:
-        """Return |B x y| (count,), nowhere zero."""
+        """Return |B x y| (count,), bounded away from zero."""
         found = np.cross(self.field[:count], y)
         across = np.sqrt(np.einsum("ni,ni->n", found, found))
         strength = math.sqrt(float(self.field[0] @ self.field[0]))
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return A(y) (3, 3) of `count` instants and a unit vector."""
+        """Return A(y) (3, 3) for `count` instants and a unit vector y."""
         weight = self.reach / self.across(y, count)
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
-        """Return the unit vector (3,) whose momentum is the hardest to remove in `count` instants."""
+        """Return the unit vector (3,) whose momentum takes longest to remove, for `count` instants."""
         y = guess
         for _ in range(ITERATIONS):
             found = np.linalg.solve(self.matrix(y, count), momentum)
@@ -183,37 +194,37 @@ class _FieldPreview:
 
 
 TRUSTED = 4
-"""Samples in a row that agree, before the coils act."""
+"""Number of consecutive samples that must agree before the coils act."""
 BOUNDED = 0.02
-"""rad/s, largest standard deviation of the rate across the field with which the coils begin to act."""
-UNHEARD = 2
-"""Periods without an accepted sample, after which the coils wait for samples that agree."""
+"""Largest standard deviation (rad/s) of the rate across the field at which the coils begin to act."""
+SILENT_PERIODS = 2
+"""Number of periods without an accepted sample after which the coils wait again."""
 OLDEST_NS = 100_000_000
-"""Of a sample, behind the last command: the body's rate carries its field on to that."""
+"""Largest age (ns) of a sample relative to the last command; its field is propagated with the body's rate."""
 INSTANTS = 150
 DENSER = 1.5
-"""Power of the instants: of 1,500 s the first step is a second, the last 15."""
+"""Exponent of the spacing of the instants: of 1,500 s the first step is a second, the last 15."""
 LEFT = 0.7
-"""Of a slow body's momentum that a plan may leave."""
+"""Fraction of a slow body's momentum that a plan may leave."""
 FEW, SOON = 4.0, 5.0
-"""Times that, and s: so little, of which no more than that lies along the field, is braked in this time."""
+"""Momentum below FEW x LEFT, with at most LEFT along the field, is removed within SOON seconds."""
 KNOWN = 2e-3
-"""rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
+"""Standard deviation (rad/s) of the rate's worst axis below which the speed bound is set."""
 _SECOND = 1e-9
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldDetumblerSettings:
-    """The law's constants.
+    """Settings of the field detumbler.
 
     Attributes:
         limit: A m^2 of each coil.
-        horizon: s, how far the field is turned ahead; a quarter of an orbit.
+        horizon: s of field prediction; a quarter of an orbit.
         replan: s, between plans.
-        gentle: rad/s; a body braked from below is never made faster than it was when the braking began.
-        spin_up: times its first rate that a faster body may reach.
-        slow: rad/s; a body that turns by less is slow, and the braking over.
+        gentle: rad/s; a body slower than this at the start is never made faster than its initial rate.
+        spin_up: multiple of its initial rate that a faster body may reach.
+        slow: rad/s; a body slower than this is detumbled.
     """
 
     limit: float
@@ -224,7 +235,7 @@ class FieldDetumblerSettings:
     slow: float = 8.7e-3
 
     def __post_init__(self) -> None:
-        """Raise UsageError for constants that do not brake."""
+        """Raise UsageError for settings that are not finite and positive."""
         for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -232,12 +243,12 @@ class FieldDetumblerSettings:
 
     @property
     def instants(self) -> FloatArray:
-        """The times (n,) s from a plan on at which it needs the field: denser at the begin."""
+        """Times (n,) s after a plan at which the field is needed; denser at the start."""
         return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
 
 
 class FieldDetumbler:
-    """Runs the pauses: takes each magnetometer sample and returns the dipole each cycle, in order of time."""
+    """Runs the pauses: takes magnetometer samples and returns the dipole of each cycle, in order of time."""
 
     def __init__(
         self,
@@ -246,35 +257,35 @@ class FieldDetumbler:
         settings: FieldRateSettings,
         expected: Callable[[int], FloatArray | None] = lambda _: None,
     ) -> None:
-        """Take the law's constants, and `expected`, the field (n, 3) T at `braking.instants` after a time.
+        """Use the given settings; `expected` predicts the field (n, 3) T at `braking.instants` after a time.
 
-        It is in the body axes of that time; None while attitude or orbit are not known.
+        The prediction is in the body axes of that time, and None while attitude or orbit are unknown.
         """
         self._schedule = schedule
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        # What is left may lie along any axis.
+        # The residual momentum may lie along any axis.
         moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
         self._rest = LEFT * braking.slow * moment
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin the first pause with no knowledge of the field."""
+        """Begin the first pause without knowledge of the field."""
         self._begun_ns = self._time_ns = self._commanded_ns = now_ns
         self._dipole = _NO_DIPOLE
         self._plan: MomentumPlan | None = None
         self._planned_ns = now_ns
-        self._planned_turn = _NO_DIPOLE
+        self._planned_rotation = _NO_DIPOLE
         self._agreed = 0
         self._bounded = False
         self._driven_ns = now_ns  # until now another mode may have driven the coils
-        self._heard_ns = now_ns
+        self._accepted_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether the coils were off and settled at `time_ns`: in a pause, or until all is trusted."""
+        """Return whether a field of `time_ns` is usable: in a pause, or before the filter is trusted."""
         schedule = self._schedule
         if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
             return True
@@ -285,7 +296,7 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
 
-        `rate` (3,) rad/s is a gyro's of the same time. A command may have been given since.
+        `rate` (3,) rad/s is measured by a gyro at the same time. A command may have been given since.
         """
         age_ns = self._time_ns - time_ns
         if not self.listens(time_ns) or age_ns > OLDEST_NS:
@@ -295,7 +306,7 @@ class FieldDetumbler:
         starts = self._filter.restarts
         accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
         if accepted:
-            self._heard_ns = time_ns
+            self._accepted_ns = time_ns
         if accepted and self._filter.started:
             self._agreed += 1
             if rate is not None and self._agreed >= TRUSTED:
@@ -306,11 +317,11 @@ class FieldDetumbler:
             self._distrust()
 
     def dipole(self, now_ns: int) -> FloatArray:
-        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is not known."""
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
         if self._filter.started:  # before that, time passes from sample to sample
             self._advance(max(now_ns, self._time_ns))
-        if self.trusted and now_ns - self._heard_ns > UNHEARD * schedule.period_ns:
+        if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
@@ -319,24 +330,24 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Report a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
 
     @property
     def trusted(self) -> bool:
-        """Whether enough samples agreed, and the rate is bounded."""
+        """Whether enough samples agreed and the uncertainty of the rate is bounded."""
         return self._bounded
 
     @property
     def rate(self) -> FloatArray | None:
-        """The body's rate (3,) rad/s; None before it is known."""
+        """Body rate (3,), rad/s; None before it is known."""
         return self._filter.rate if self.trusted else None
 
     @property
     def field(self) -> FloatArray | None:
-        """The field (3,) T in body axes at the last time; None before it is known."""
+        """Field (3,) T in body axes at the last time; None before it is known."""
         return self._filter.field if self.trusted else None
 
     @property
@@ -348,11 +359,11 @@ class FieldDetumbler:
 
     @property
     def restarts(self) -> int:
-        """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
+        """Number of filter restarts after contradicting samples, as by a spin too fast for the sampling."""
         return self._filter.restarts
 
     def _distrust(self) -> None:
-        """Let the coils wait until samples agree."""
+        """Switch the coils off until samples agree."""
         self._agreed, self._bounded = 0, False
         self._plan = None
 
@@ -367,10 +378,12 @@ class FieldDetumbler:
         speed = math.sqrt(float(rate @ rate))
         if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
             self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
-        return without_gain(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
+        return (
+            without_speed_up(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
+        )
 
     def _costate(self, now_ns: int) -> FloatArray:
-        """Return the costate (3,) A m^2/T to brake by now, in body axes."""
+        """Return the present costate (3,) A m^2/T, in body axes."""
         found = self._filter
         field, momentum = found.field, found.momentum
         square, along = float(field @ field), float(momentum @ field)
@@ -378,25 +391,25 @@ class FieldDetumbler:
         if little and along * along <= square * self._rest**2:
             return np.asarray(momentum / (square * SOON))
         if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
-            self._plan, self._planned_ns, self._planned_turn = self._planned(now_ns), now_ns, found.turn
-        # The plan is fixed among the stars: into the body's axes of now.
-        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
+            self._plan, self._planned_ns, self._planned_rotation = self._planned(now_ns), now_ns, found.turn
+        # The plan is inertially fixed: rotate it into the present body axes.
+        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_rotation)))
         return np.asarray(since @ self._plan.costate)
 
     def _planned(self, now_ns: int) -> MomentumPlan:
-        """Return a plan in the body's axes of now."""
+        """Return a momentum plan in the present body axes."""
         found, times = self._filter, self._braking.instants
         expected = self._expected(now_ns)
         if expected is None:
-            ahead = turning_field(found.field, found.change, times)
+            ahead = rotating_field(found.field, found.change, times)
         else:
-            ahead = turned_to(expected, found.field)
+            ahead = aligned_to(expected, found.field)
         share = self._schedule.act_ns / self._schedule.period_ns
         return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
 
 
 def _sigma_across(found: FieldRate) -> float:
-    """Return the standard deviation of the rate across the field, in the worst direction, rad/s."""
+    """Return the standard deviation of the rate across the field in its worst direction, rad/s."""
     field = found.field
     across = np.eye(3) - np.outer(field, field) / float(field @ field)
     spread = across @ found.covariance[RATE, RATE] @ across

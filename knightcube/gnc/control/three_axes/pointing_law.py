@@ -89,7 +89,7 @@ class PointingLaw:
         cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
         # The rate error of the table is the difference of components in the axes of each.
         error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
-        k, table = self._table.path.place(time)[0], self._table
+        k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
         # A dipole along the field makes no torque.

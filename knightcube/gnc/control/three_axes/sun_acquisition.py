@@ -28,30 +28,32 @@ from knightcube.gnc.estimation.carried_sun import CarriedSun
 from knightcube.gnc.estimation.residual_dipole import ResidualDipole
 
 AGREES = 0.2
-"""Share of the field by which two pauses may differ, the turn between them taken out."""
+"""Largest relative difference of the fields of two pauses, after correction for the rotation between them."""
 ROLL = 150.0
-"""By how much a torque about the Sun is cheaper than another."""
+"""Ratio of the cost of other torques to that of a torque about the Sun."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""rad/s in all, and across the Sun: a faster body is only held still; less than what the mode brakes."""
+"""Total rate, and rate across the Sun (rad/s), above which the body is only damped; lower than the rates at
+which the flight mode detumbles."""
 FASTEST_ROLL = 0.0105
-"""rad/s about the Sun, from which on it is not cheaper."""
+"""Rate (rad/s) about the Sun above which a torque about the Sun is no longer preferred."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
-"""w, rad/s, and z of the law; a radian off the Sun takes `SHARE` of the coils' torque at most."""
+"""Bandwidth w (rad/s) and damping z of the law. At one radian from the Sun the law uses at most `SHARE` of
+the coils' torque."""
 RESIDUAL = 0.05
-"""Share of the coils' limit that a residual dipole may have."""
+"""Largest residual dipole, as a fraction of the coils' limit."""
 _FIELD = 3e-5
-"""T, in a low orbit."""
+"""Field strength in a low orbit, T."""
 _SECOND = 1e-9
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SunAcquisitionSettings:
-    """The law's constants.
+    """Settings of Sun acquisition.
 
     Attributes:
         inertia: (3,) kg m^2 of the body axes.
-        axis: (3,) body axis that turns to the Sun.
+        axis: (3,) body axis to align with the Sun.
         limit: A m^2 of each coil.
     """
 
@@ -61,14 +63,15 @@ class SunAcquisitionSettings:
 
     @property
     def speed(self) -> float:
-        """The law's w, rad/s."""
+        """Bandwidth w of the law, rad/s."""
         return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
 
 
 class SunAcquisition:
-    """Owns the knowledge of Sun and field.
+    """Estimates Sun and field and computes the dipole.
 
-    Takes each reading of the inertial unit and each Sun; returns the dipole each cycle, in order of time.
+    It takes each reading of the inertial unit and each direction of the Sun, and returns the dipole of each
+    cycle, in order of time.
     """
 
     def __init__(self, schedule: WindowSchedule, seeking: SunAcquisitionSettings) -> None:
@@ -78,7 +81,7 @@ class SunAcquisition:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin the first pause with no knowledge of the field."""
+        """Begin the first pause without knowledge of the field."""
         self._begun_ns = self._time_ns = now_ns
         self._field: FloatArray | None = None
         self._agrees = False
@@ -88,43 +91,43 @@ class SunAcquisition:
 
     @property
     def field(self) -> FloatArray | None:
-        """The field (3,) T in body axes at the last reading; None before it is known."""
+        """Field (3,) T in body axes at the last reading; None before it is known."""
         return self._field
 
     @property
     def sun(self) -> FloatArray | None:
-        """The Sun's direction (3,) in body axes at the last reading; None where it is not known."""
+        """Direction (3,) of the Sun in body axes at the last reading; None if unknown."""
         return self._carried.direction
 
-    def see(self, time_ns: int, sun: FloatArray) -> None:
-        """Accept the direction (3,) of the Sun, body axes, of a time just past."""
+    def update_sun(self, time_ns: int, sun: FloatArray) -> None:
+        """Accept a direction (3,) of the Sun, body axes, measured at `time_ns`."""
         self._carried.see(time_ns, sun)
 
     def acts(self, dipole: FloatArray) -> None:
-        """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Report a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
         self._acts = dipole
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T, of use in pauses alone, and a gyro's rate (3,) rad/s, both of `time_ns`."""
+        """Accept a field (3,) T and a gyro rate (3,) rad/s of `time_ns`; the field is used in pauses only."""
         if time_ns <= self._time_ns or not np.all(np.isfinite(np.concatenate([field, rate]))):
             return
         rate = rate - self._carried.bias
         seconds = (time_ns - self._time_ns) * _SECOND
-        turned = attitude_matrix(from_rotation_vector(seconds * rate))
+        rotated = attitude_matrix(from_rotation_vector(seconds * rate))
         self._time_ns, self._rate = time_ns, rate
-        self._carried.turn(time_ns, turned)
+        self._carried.turn(time_ns, rotated)
         if self._field is not None:
-            self._field = turned @ self._field
+            self._field = rotated @ self._field
             self._residual.follow(seconds, rate, self._field, self._acts)
         schedule = self._schedule
         phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
         if schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns:
-            self._samples = [*(turned @ sample for sample in self._samples), field]
+            self._samples = [*(rotated @ sample for sample in self._samples), field]
         elif self._samples:
-            self._close(turned)
+            self._close(rotated)
 
     def dipole(self, now_ns: int) -> FloatArray:
-        """Return the dipole (3,) A m^2 now: zero while the field is measured or not known."""
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or unknown."""
         schedule, seeking, field = self._schedule, self._seeking, self._field
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         if phase_ns < schedule.settle_ns + schedule.measure_ns or field is None or not self._agrees:
@@ -136,7 +139,7 @@ class SunAcquisition:
         return self._acts
 
     def _torque(self, field: FloatArray) -> FloatArray:
-        """Return the wanted torque (3,) N m in a field (3,) T, across it once the body turns to the Sun."""
+        """Return the commanded torque (3,) N m in a field (3,) T, normal to it while the Sun is tracked."""
         seeking, sun, rate = self._seeking, self._carried.direction, self._rate
         speed = seeking.speed
         torque: FloatArray = -2.0 * DAMPING * speed * seeking.inertia * rate
@@ -145,15 +148,15 @@ class SunAcquisition:
         square, roll = float(rate @ rate), float(rate @ sun)
         if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
             return torque
-        torque = torque + speed**2 * seeking.inertia * _turn(seeking.axis, sun)
-        # What the coils can not make along the field they make up about the Sun, where it does least.
+        torque = torque + speed**2 * seeking.inertia * _rotation_to_sun(seeking.axis, sun)
+        # Cancel the component along the field by a torque about the Sun, which disturbs the axis least.
         cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
         spread = field + (cheap - 1.0) * float(sun @ field) * sun
         return torque - spread * (float(field @ torque) / float(field @ spread))
 
-    def _close(self, turned: FloatArray) -> None:
-        """End a pause: the median of its samples is the field, whatever one of them says."""
-        found = np.median([turned @ sample for sample in self._samples], axis=0)
+    def _close(self, rotated: FloatArray) -> None:
+        """End a pause: the median of its samples is the field, which is robust to single outliers."""
+        found = np.median([rotated @ sample for sample in self._samples], axis=0)
         self._samples = []
         strength = math.sqrt(float(found @ found))
         if strength == 0.0:
@@ -164,8 +167,8 @@ class SunAcquisition:
         self._field = found
 
 
-def _turn(axis: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,), a radian at most, that turns an axis to the Sun, both unit vectors."""
+def _rotation_to_sun(axis: FloatArray, sun: FloatArray) -> FloatArray:
+    """Return the rotation vector (3,), at most one radian, from an axis to the Sun, both unit vectors."""
     across = cross_product(axis, sun)
     sine = math.sqrt(float(across @ across))
     cosine = float(axis @ sun)

@@ -38,16 +38,16 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 Direction = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Gives unit vectors (n, 3), ICRS, at times (n,) s of an ephemeris."""
+"""Function from an ephemeris and times (n,), s of the ephemeris, to unit vectors (n, 3), ICRS."""
 DIFFERENCE = 1.0
-"""s, of the central differences for rate and acceleration."""
+"""Step of the central differences for rate and acceleration, s."""
 LEAST_SINE = 1e-3
-"""Between the two directions: nearer to parallel they fix no attitude."""
+"""Smallest sine of the angle between the two directions; closer to parallel they determine no attitude."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeReference:
-    """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
+    """The commanded attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -56,9 +56,13 @@ class AttitudeReference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeReferences:
-    """The wanted motion at even `times` (n,) s: attitudes (n, 4), rates (n, 3), accelerations (n, 3).
+    """The commanded motion at equally spaced times.
 
-    Rates, rad/s, and accelerations, rad/s^2, are in the axes of the wanted attitude.
+    Attributes:
+        times: (n,) s.
+        quaternion: (n, 4) ICRS into body.
+        rate: (n, 3) rad/s, in the axes of the commanded attitude.
+        acceleration: (n, 3) rad/s^2, in the axes of the commanded attitude.
     """
 
     times: FloatArray
@@ -66,16 +70,16 @@ class AttitudeReferences:
     rate: FloatArray
     acceleration: FloatArray
 
-    def place(self, time: float) -> tuple[int, float]:
-        """Return the instant before a time, s, and the share of the step since; the ends stand still."""
+    def position(self, time: float) -> tuple[int, float]:
+        """Return the index of the instant before a time, s, and the fraction of the step since it."""
         begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
-        place = (time - begin) / step
-        k = min(max(math.floor(place), 0), len(self.times) - 2)
-        return k, min(max(place - k, 0.0), 1.0)
+        position = (time - begin) / step
+        k = min(max(math.floor(position), 0), len(self.times) - 2)
+        return k, min(max(position - k, 0.0), 1.0)
 
     def at(self, time: float) -> AttitudeReference:
-        """Return the wanted motion at a time, s, within the times; at the ends that of the end."""
-        k, share = self.place(time)
+        """Return the commanded motion at a time, s, clamped to the times."""
+        k, share = self.position(time)
         near = k + round(share)
         since = (share - round(share)) * float(self.times[1] - self.times[0])
         rate, acceleration = self.rate[near], self.acceleration[near]
@@ -90,9 +94,9 @@ class AttitudeReferences:
         """Return the first `count` instants."""
         return self._part(slice(count))
 
-    def since(self, place: int) -> AttitudeReferences:
-        """Return the instants from `place` on."""
-        return self._part(slice(place, None))
+    def since(self, position: int) -> AttitudeReferences:
+        """Return the instants from index `position` on."""
+        return self._part(slice(position, None))
 
     def _part(self, part: slice) -> AttitudeReferences:
         return AttitudeReferences(
@@ -102,7 +106,10 @@ class AttitudeReferences:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeLaw:
-    """Body `axis` (3,) to the direction `first`, body axis `across` (3,) as near as may be to `second`."""
+    """A law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
+
+    The second alignment is as close as the first allows.
+    """
 
     axis: FloatArray
     first: Direction
@@ -110,14 +117,15 @@ class AttitudeLaw:
     second: Direction
 
     def attitudes(self, ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-        """Return the wanted attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
+        """Return commanded attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
         wanted = _frames(self.first(ephemeris, times), self.second(ephemeris, times))
         body = _frames(self.axis[None], self.across[None])[0]
         return np.array([from_matrix(body.T @ frame) for frame in wanted])
 
 
 Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
-"""Gives wanted attitudes (n, 4) at times (n,) s of an ephemeris: of an `AttitudeLaw`, or an `approach`."""
+"""Function from an ephemeris and times (n,) s to commanded attitudes (n, 4): of an `AttitudeLaw` or an
+`approach`."""
 
 
 def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> AttitudeReferences:
@@ -134,7 +142,7 @@ def nadir(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
 
 
 def velocity(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return the directions (n, 3) of flight with respect to the stars."""
+    """Return the directions (n, 3) of the inertial velocity."""
     return _unit(ephemeris.velocity_at(times))
 
 
@@ -149,7 +157,7 @@ def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
 
 
 def inertial(vector: FloatArray) -> Direction:
-    """Return the law of a direction (3,) fixed among the stars."""
+    """Return the law of an inertially fixed direction (3,)."""
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -159,7 +167,7 @@ def inertial(vector: FloatArray) -> Direction:
 
 
 def orbital(vector: FloatArray) -> Direction:
-    """Return the law of a direction (3,) fixed in the orbit's axes: flight, against the normal, nadir."""
+    """Return the law of a direction (3,) fixed in the orbital axes: along-track, minus normal, nadir."""
     fixed = _unit(np.asarray(vector, dtype=float))
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -169,14 +177,20 @@ def orbital(vector: FloatArray) -> Direction:
 
 
 def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
-    """Return the law of a place on the ground: geodetic latitude and longitude, rad, height m over WGS 84."""
+    """Return the law of a point on the ground.
+
+    `latitude` and `longitude` are geodetic, rad; `height` is in m above WGS 84. Raises UsageError for values
+    out of range.
+    """
     if not (abs(latitude) <= 0.5 * np.pi and np.isfinite(longitude) and np.isfinite(height)):
-        raise UsageError(f"no place: latitude {latitude}, longitude {longitude} rad, height {height} m")
-    place = np.asarray(erfa.gd2gc(1, longitude, latitude, height))
+        raise UsageError(
+            f"latitude {latitude}, longitude {longitude} rad, height {height} m is not a point on the Earth"
+        )
+    station = np.asarray(erfa.gd2gc(1, longitude, latitude, height))
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
         to_ground = celestial_to_terrestrial(ephemeris.julian_date + np.asarray(times) / DAY)
-        return _unit(place @ to_ground - ephemeris.position_at(times))
+        return _unit(station @ to_ground - ephemeris.position_at(times))
 
     return at
 
@@ -184,16 +198,15 @@ def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
 def free_roll(
     axis: FloatArray, first: Direction, quaternion: FloatArray, ephemeris: Ephemeris, time: float
 ) -> AttitudeLaw:
-    """Return the law that turns `axis` (3,) to `first` with the roll that the attitude (4,) at `time` s has.
+    """Return the law that aligns `axis` (3,) with `first` at the roll of the attitude (4,) at `time` s.
 
-    The roll is held against the stars when the direction stands still among them, otherwise against the
-    orbit.
+    The roll is held inertially if the direction is inertially fixed, otherwise in the orbital axes.
     """
     across = _any_across(axis)
     shown = attitude_matrix(quaternion).T @ across
     when = np.array([time])
     wanted = first(ephemeris, when)[0]
-    # Shortest way: the second direction turns with the axis from where it points to where it shall point.
+    # Shortest rotation: the second direction rotates with the axis from the present to the final direction.
     shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
     moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
     if moved < 1e-4:
@@ -204,7 +217,7 @@ def free_roll(
 def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
     """Return the law of an object in `direction` (3,) at `since` s that moves on a straight line.
 
-    `velocity` (3,) 1/s is that of its place relative to ours, over its distance; zero: it stands still.
+    `velocity` (3,) 1/s is its relative velocity divided by its distance; zero for a fixed direction.
     """
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
@@ -216,9 +229,9 @@ def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direct
 def following(
     axis: FloatArray, direction: FloatArray, velocity: FloatArray, since: float, quaternion: FloatArray
 ) -> AttitudeLaw:
-    """Return the law that turns `axis` (3,) to a `passing` object, and turns nothing about `axis`.
+    """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    Its roll is that of the attitude (4,) after the shortest turn to `direction`.
+    Its roll is that of the attitude (4,) after the shortest rotation to `direction`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)
@@ -232,12 +245,13 @@ def following(
 def approach(
     attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
 ) -> Attitudes:
-    """Return the way from an attitude (4,) and a body rate (3,) rad/s at `begin` s into a law at `end` s.
+    """Return the transition from an attitude (4,) and a body rate (3,) rad/s to a law.
 
-    The turn that is left falls as a quintic that starts with the body's own rate and ends at rest in the law.
+    The transition lasts from `begin` to `end` s. The remaining rotation is a quintic that starts with the
+    body's own rate and ends at rest relative to the law. Raises UsageError unless `end` is after `begin`.
     """
     if not end > begin:
-        raise UsageError(f"an approach from {begin} to {end} s takes no time")
+        raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
         wanted = attitudes(ephemeris, times)
@@ -245,7 +259,7 @@ def approach(
         left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
         law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
         shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
-        # Before the begin the polynomial goes on: the differences at the begin need both sides.
+        # The polynomial also covers times before the start, because differences there need both sides.
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
@@ -256,9 +270,10 @@ def approach(
 
 
 def _before_turn(turn: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return the change (3,) of a rotation vector `turn` (3,) whose body turns at `rate` (3,), body axes.
+    """Return the derivative (3,) of a rotation vector `turn` (3,) for a body rate `rate` (3,), body axes.
 
-    The inverse of the left Jacobian of the rotation group, with the signs of this house's quaternions.
+    The inverse of the left Jacobian of the rotation group, for quaternions that rotate inertial into body
+    axes.
     """
     angle = float(np.linalg.norm(turn))
     second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
@@ -267,16 +282,16 @@ def _before_turn(turn: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 def _orbital_axes(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
-    """Return rows (n, 3, 3): along the flight, against the orbit's normal, nadir."""
+    """Return the orbital axes as rows (n, 3, 3): along-track, minus orbit normal, nadir."""
     down, right = nadir(ephemeris, times), -orbit_normal(ephemeris, times)
     return np.stack([np.cross(right, down), right, down], axis=1)
 
 
 def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return `vector` (3,) turned as the shortest rotation turns unit vector `start` into `end`."""
+    """Return `vector` (3,) rotated by the shortest rotation from unit vector `start` to `end`."""
     axis = np.cross(start, end)
     cosine = float(start @ end)
-    if cosine < -1.0 + 1e-9:  # opposite: any axis across turns it, this one leaves the vector
+    if cosine < -1.0 + 1e-9:  # opposite: any normal axis will do; this one leaves the vector unchanged
         return vector
     return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
 
@@ -292,7 +307,9 @@ def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
     normal = np.cross(first, second)
     sine = np.linalg.norm(normal, axis=1, keepdims=True)
     if float(np.min(sine)) < LEAST_SINE:
-        raise UsageError("an attitude law's two directions are parallel: they fix no roll")
+        raise UsageError(
+            "the two directions of the attitude law are parallel, so that the roll is undetermined"
+        )
     normal = normal / sine
     return np.stack([first, normal, np.cross(first, normal)], axis=1)
 
@@ -307,7 +324,7 @@ POLE = inertial(np.array([0.0, 0.0, 1.0]))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyAxes:
-    """The body axis (3,) that points, and the axis (3,) `across` to it that a given roll begins from."""
+    """The pointing axis (3,), and the axis (3,) `across` from which a given roll is measured."""
 
     pointing: FloatArray
     across: FloatArray
@@ -328,7 +345,7 @@ def law_of(
 
 
 def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
-    """Return a goal's direction, and the direction that a roll of zero is measured from. Not for INERTIAL."""
+    """Return the direction of a goal, and the direction of zero roll. INERTIAL goals have neither."""
     if target.goal is Goal.GROUND:
         return ground(*target.numbers), velocity
     return {

@@ -1,6 +1,6 @@
 """Pointing targets: the goals that a configuration or a command can give a satellite.
 
-A target is a plain value that configurations, packets and jobs carry; `target_law` makes its attitude law.
+A target is a plain value that configurations, packets and jobs carry; `attitude_law` makes its attitude law.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from enum import IntEnum
 from knightcube.errors import UsageError
 
 _LENGTH = 1e-3
-"""A commanded quaternion may miss the unit length by this."""
+"""Largest deviation of the length of a commanded quaternion from one."""
 
 
 class Goal(IntEnum):
-    """What to point at; the values are those of the command packet."""
+    """The kinds of pointing goals; the values are those of the command packet."""
 
     NADIR = 0
     VELOCITY = 1
@@ -27,25 +27,25 @@ class Goal(IntEnum):
 
     @property
     def label(self) -> str:
-        """The goal's name for people, configurations and commands."""
+        """Name of the goal in messages, configurations and commands."""
         return self.name.lower()
 
     @classmethod
     def named(cls, label: str) -> Goal:
-        """Return the goal of a label. Raises UsageError for a word that is none."""
+        """Return the goal of a label. Raises UsageError for an unknown label."""
         for goal in cls:
             if goal.label == label:
                 return goal
-        raise UsageError(f"{label!r} is no goal: {', '.join(goal.label for goal in cls)}")
+        raise UsageError(f"{label!r} is not a goal: choose one of {', '.join(goal.label for goal in cls)}")
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
-"""How many numbers a goal takes, where it takes any; the most last."""
+"""Permitted counts of numbers of a goal, the largest last; goals that are not listed take none."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
     Goal.OBJECT: "an object is followed with a free roll",
 }
-"""Why a goal takes no roll, where it takes none."""
+"""Reasons for goals that take no roll."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +53,11 @@ class PointingTarget:
     """A goal with its numbers.
 
     Attributes:
-        numbers: INERTIAL: the attitude (4,), ICRS into body; GROUND: latitude and longitude, rad; OBJECT:
-            right ascension and declination, rad, where it is looked for, empty where the camera looks
-            already; else empty.
-        roll: rad about the pointing axis; None leaves it free. Not every goal has one (`ROLLS`).
+        goal: what to point at.
+        numbers: INERTIAL: the attitude (4,), ICRS into body. GROUND: latitude and longitude, rad. OBJECT:
+            right ascension and declination, rad, of the field to search, or empty for the present field of
+            view. Otherwise empty.
+        roll: rad about the pointing axis; None leaves it free. Some goals take no roll (`ROLLS`).
     """
 
     goal: Goal
@@ -64,7 +65,7 @@ class PointingTarget:
     roll: float | None = None
 
     def __post_init__(self) -> None:
-        """Raise UsageError for values that no satellite can point by."""
+        """Raise UsageError for values that define no attitude."""
         wanted = NUMBERS.get(self.goal, (0,))
         if len(self.numbers) not in wanted:
             counts = " or ".join(map(str, wanted))
@@ -74,7 +75,7 @@ class PointingTarget:
         if self.goal is Goal.INERTIAL:
             length = math.hypot(*self.numbers)
             if abs(length - 1.0) > _LENGTH:
-                raise UsageError(f"a quaternion of length {length:.6g}: it must have length 1")
+                raise UsageError(f"the quaternion has length {length:.6g}: it must have length 1")
         if self.roll is not None and self.goal in ROLLS:
             raise UsageError(ROLLS[self.goal])
         if self.goal is Goal.GROUND and not abs(self.numbers[0]) <= 0.5 * math.pi:

@@ -16,7 +16,7 @@ from knightcube.gnc.control.detumble import (
     DetumblerSettings,
     WindowSchedule,
     braking_current,
-    share_in_turning_field,
+    share_in_rotating_field,
 )
 from knightcube.gnc.estimation.field_rate import rate_across
 
@@ -24,7 +24,7 @@ SCHEDULE = WindowSchedule(50_000_000, 50_000_000, 150_000_000)
 INERTIA = np.diag([1.05e-3, 1.2e-3, 1.4e-3])
 BRAKING = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, 0.3)
 TURN = np.array([0.05, 0.0, 0.0])
-IN_TURNING_FIELD = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, share_in_turning_field(0.05, SCHEDULE))
+IN_TURNING_FIELD = DetumblerSettings(1.05e-3, 80 * 0.0081, 0.148, share_in_rotating_field(0.05, SCHEDULE))
 CYCLE = 0.025
 NOISE = 1.0e-7
 """T: a VN-100's magnetometer at 40 Hz, 140 microgauss per sqrt(Hz), rounded up (its datasheet)."""
@@ -110,7 +110,7 @@ def test_an_uneven_body_loses_energy_monotonically_and_ends_below_the_limit() ->
 def test_in_a_field_that_turns_too_much_gain_locks_the_spin_to_the_field() -> None:
     """Avanzini and Giulietti 2012: the component along the field goes fastest at k = 2 Omega J."""
     left = {}
-    for share in (share_in_turning_field(0.05, SCHEDULE), 0.3):
+    for share in (share_in_rotating_field(0.05, SCHEDULE), 0.3):
         body = FreeBody(np.array([0.3, -0.25, 0.31]), 4.5e-4, TURN, 1.05e-3 * np.eye(3), 3)
         rates, _ = fly(body, 60.0, Detumbler(SCHEDULE, replace(BRAKING, share=share)))
         left[share] = rates[-1]

@@ -14,8 +14,8 @@ from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes.field_detumbler import (
     BOUNDED,
+    SILENT_PERIODS,
     TRUSTED,
-    UNHEARD,
     FieldDetumbler,
     FieldDetumblerSettings,
 )
@@ -131,7 +131,7 @@ def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
             acted |= bool(law.dipole(now_ns).any())
         return acted
 
-    quiet_ns = (2 + UNHEARD) * SCHEDULE.period_ns
+    quiet_ns = (2 + SILENT_PERIODS) * SCHEDULE.period_ns
     assert acts(0, 2 * SCHEDULE.period_ns, 1.0)
     assert acts(2 * SCHEDULE.period_ns, quiet_ns, math.nan), (
         "two pauses without a sample do not stop the brake"

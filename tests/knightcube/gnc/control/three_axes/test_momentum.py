@@ -9,16 +9,16 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from knightcube.gnc.control.three_axes.field_detumbler import (
     LIMIT_GAIN,
+    aligned_to,
     braking_dipole,
     momentum_plan,
-    turned_to,
-    turning_field,
-    without_gain,
+    rotating_field,
+    without_speed_up,
 )
 
 STEP, LIMIT, REST = 5.0, 0.1, 1e-5
 TIMES = np.arange(0.0, 400.0 * STEP, STEP)
-FIELD = turning_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
+FIELD = rotating_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
 """T: it turns by two turns in 95 min, as in a polar orbit."""
 
 
@@ -79,7 +79,7 @@ def test_the_field_ahead_begins_as_it_is_measured() -> None:
     for _ in range(20):
         ahead = rng.standard_normal((9, 3))
         field = ahead[0] + 0.5 * rng.standard_normal(3)
-        turned = turned_to(ahead, field)
+        turned = aligned_to(ahead, field)
         np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)  # a rotation
         assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
         if ahead[0] @ field > 0.0:
@@ -98,11 +98,11 @@ def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_lim
 
 def test_the_field_turned_ahead_keeps_its_strength_and_begins_with_its_change() -> None:
     field, change = np.array([1e-5, -2e-5, 3e-5]), np.array([3e-8, 2e-8, 5e-8])
-    ahead = turning_field(field, change, np.arange(50.0))
+    ahead = rotating_field(field, change, np.arange(50.0))
     np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), np.linalg.norm(field), rtol=1e-12)
     across = change - field * float(field @ change) / float(field @ field)
     np.testing.assert_allclose(ahead[1] - ahead[0], across, rtol=0.01, atol=1e-10)
-    np.testing.assert_array_equal(turning_field(field, np.zeros(3), np.arange(3.0)), np.tile(field, (3, 1)))
+    np.testing.assert_array_equal(rotating_field(field, np.zeros(3), np.arange(3.0)), np.tile(field, (3, 1)))
 
 
 def test_a_field_of_two_instants_is_refused_and_no_momentum_needs_no_dipole() -> None:
@@ -122,7 +122,7 @@ def test_without_gain_no_torque_makes_the_body_faster_and_what_brakes_it_stays()
             4e-5 * rng.standard_normal(3),
             rng.standard_normal(3),
         )
-        left = without_gain(dipole, field, rate, inverse)
+        left = without_speed_up(dipole, field, rate, inverse)
         before, after = (float(rate @ inverse @ np.cross(m, field)) for m in (dipole, left))
         assert after <= 1e-9 * abs(before) or before <= 0.0
         assert np.abs(left).max() <= np.abs(dipole).max() * (1.0 + 1e-12)

@@ -154,7 +154,7 @@ def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
     position, pressed = ORBIT.position_at(times), pressures(ORBIT, times)
     for begun in (wanted.until(3), wanted):
         ahead = PointingPreview(wanted, begun, field, position, pressed, SIZE)
-        with pytest.raises(UsageError, match="even"):
+        with pytest.raises(UsageError, match="equally spaced"):
             pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
 
 

@@ -35,7 +35,7 @@ def fly(sun: FloatArray | None, rate: FloatArray, seconds: float) -> tuple[Float
         inertial = attitude_matrix(from_rotation_vector(k * step * TURN)).T @ np.array([1.5e-5, 1e-5, 3e-5])
         field = turned @ inertial
         if sun is not None and k % 10 == 0:
-            law.see(now_ns, turned @ sun)
+            law.update_sun(now_ns, turned @ sun)
         if k % 100 == 0:
             off = 0.0 if sun is None else np.degrees(np.arccos(np.clip(Z @ turned @ sun, -1.0, 1.0)))
             notes.append((off, np.degrees(np.linalg.norm(rate))))
@@ -65,7 +65,7 @@ def test_without_a_sun_it_is_held_still() -> None:
 
 def test_a_sun_that_is_no_longer_seen_is_carried_on_by_the_gyro_and_then_forgotten() -> None:
     law, rate = seeker(), np.array([0.0, 0.002, 0.0])
-    law.see(0, Z)
+    law.update_sun(0, Z)
     for second in range(1, int(MEMORY) + 1):
         law.sample(second * 1_000_000_000, np.array([0.0, 0.0, 3e-5]), rate)
     carried = attitude_matrix(from_rotation_vector(MEMORY * rate)) @ Z
@@ -76,7 +76,7 @@ def test_a_sun_that_is_no_longer_seen_is_carried_on_by_the_gyro_and_then_forgott
 
 def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
     law = seeker()
-    law.see(0, np.array([1.0, 0.0, 0.0]))
+    law.update_sun(0, np.array([1.0, 0.0, 0.0]))
     acted = []
     for k in range(1, 400):
         now_ns = k * 25_000_000
@@ -91,7 +91,7 @@ def test_a_single_field_or_one_that_jumps_starts_no_coil() -> None:
 
 def test_no_dipole_in_the_pauses_and_a_reading_that_is_not_finite_is_left_out() -> None:
     law = seeker()
-    law.see(0, np.array([1.0, 0.0, 0.0]))
+    law.update_sun(0, np.array([1.0, 0.0, 0.0]))
     for k in range(1, 240):
         now_ns = k * 25_000_000
         law.sample(now_ns, np.array([0.0, 1e-5, 3e-5]) if k % 7 else np.full(3, np.nan), np.zeros(3))
