@@ -30,22 +30,23 @@ from knightcube.errors import FlightError
 _LONGEST_STEP = 10.0
 _SMOOTHING_ROUNDS = 3
 _STATE_STEPS = np.repeat([1.0, 1e-3], 3)
-"""Of differences: m, m/s."""
+"""Steps of the finite differences, m and m/s."""
 
 
 def smoothed(
     times: FloatArray, states: FloatArray, sigma: FloatArray, middle: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the orbit nearest to measured places: states (n, 6), and the covariance (6, 6) at one of them.
+    """Return the orbit that fits measured positions best: states (n, 6), and covariance (6, 6) at `middle`.
 
-    `sigma` (n,) m of an axis of each place. The velocities only begin the search.
+    `sigma` (n,) m is the standard deviation of each axis of each position. The velocities of `states` are
+    only the initial guess.
     """
     state = states[middle]
     covariance = np.eye(6)
     weights = np.repeat(1.0 / sigma, 3)
     for _ in range(_SMOOTHING_ROUNDS):
         shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STATE_STEPS), -np.diag(_STATE_STEPS)])
-        flown = around(state + shifts, times, middle)[..., :3]
+        flown = propagate_about(state + shifts, times, middle)[..., :3]
         off = (flown[:, 0] - states[:, :3]).ravel() * weights
         slope = (flown[:, 1:7] - flown[:, 7:]) / (2.0 * _STATE_STEPS[:, None])
         jacobian = np.swapaxes(slope, 1, 2).reshape(-1, 6) * weights[:, None]
@@ -53,74 +54,75 @@ def smoothed(
         size = np.linalg.norm(jacobian, axis=0)
         covariance = np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
         state = state - covariance @ (jacobian.T @ off)
-    return around(state[None], times, middle)[:, 0], covariance
+    return propagate_about(state[None], times, middle)[:, 0], covariance
 
 
-def around(start: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return states (n, k, 6) at rising times (n,) s of those (k, 6) at `times[middle]`."""
+def propagate_about(start: FloatArray, times: FloatArray, middle: int) -> FloatArray:
+    """Return states (n, k, 6) at increasing times (n,) s from the states (k, 6) at `times[middle]`."""
     ahead, behind = trajectories(start, times[middle:]), trajectories(start, times[middle::-1])
     return np.concatenate([behind[:0:-1], ahead])
 
 
 def trajectories(start: FloatArray, times: FloatArray) -> FloatArray:
-    """Return states (n, k, 6) at times (n,) s, rising or falling, of those (k, 6) at the first."""
+    """Return states (n, k, 6) at monotonic times (n,) s from the states (k, 6) at the first time."""
     found = [start]
     for before, after in itertools.pairwise(times):
         steps = max(1, math.ceil(abs(after - before) / _LONGEST_STEP))
         state, step = found[-1], (after - before) / steps
         for _ in range(steps):
-            a = _flow(state)
-            b = _flow(state + 0.5 * step * a)
-            c = _flow(state + 0.5 * step * b)
-            d = _flow(state + step * c)
+            a = _derivative(state)
+            b = _derivative(state + 0.5 * step * a)
+            c = _derivative(state + 0.5 * step * b)
+            d = _derivative(state + step * c)
             state = state + step / 6.0 * (a + 2.0 * (b + c) + d)
         found.append(state)
     return np.array(found)
 
 
-def _flow(state: FloatArray) -> FloatArray:
+def _derivative(state: FloatArray) -> FloatArray:
     """Return velocity and acceleration (k, 6)."""
-    place = state[:, :3]
-    # No orbit is deep in the Earth: a hypothesis that is must not be flung out.
-    square = np.maximum(np.sum(place**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
+    position = state[:, :3]
+    # Bound the acceleration of hypotheses deep inside the Earth.
+    square = np.maximum(np.sum(position**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
     flat = 1.5 * J2 * EARTH_RADIUS**2 / square
-    tilt = 5.0 * place[:, 2:] ** 2 / square
+    tilt = 5.0 * position[:, 2:] ** 2 / square
     scale = 1.0 + flat * (np.array([1.0, 1.0, 3.0]) - tilt)
-    return np.hstack([state[:, 3:], -GRAVITATIONAL_PARAMETER / square**1.5 * scale * place])
+    return np.hstack([state[:, 3:], -GRAVITATIONAL_PARAMETER / square**1.5 * scale * position])
 
 
 LEAST_SIGHTINGS = 6
 RATIO = 1.5
-"""Of the ends of the interval of distances: a wider one determines no orbit."""
+"""Largest ratio of the ends of the distance interval for which an orbit is returned."""
 GROUND_CLEARANCE = 80e3
-"""m: an orbit that comes nearer does not last."""
+"""Smallest perigee height (m) of a lasting orbit."""
 _NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
-"""m of the scan, and its distances, in even logarithms."""
+"""Nearest and farthest distance of the scan, m, and the number of its logarithmically spaced distances."""
 _DEGREES_95 = 3.841
-"""Chi-square of one degree that is exceeded by 5 %."""
+"""95 % bound of chi-square with one degree of freedom."""
 _STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
-"""Of the central differences: rad, rad, 1/s, 1/s, 1/s, logarithm."""
-_LONGEST = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
-"""Of a step, likewise: hypotheses that fit nothing must not run away."""
+"""Steps of the central differences: rad, rad, 1/s, 1/s, 1/s, logarithm."""
+_LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
+"""Longest Gauss-Newton steps of the same unknowns, so that poor hypotheses do not diverge."""
 _ROUNDS, _FINAL_ROUNDS = 6, 20
 _MISFIT = 1e-6
-"""Chance of a fit as bad by noise alone: worse is no free fall, or errors that are not as stated."""
+"""Probability of the chi-square below which the sightings are rejected as no free fall, or as having larger
+errors than stated."""
 
 
 class ArcError(FlightError):
-    """Sightings that determine no orbit; says why, with numbers."""
+    """Raised if sightings determine no orbit; the message gives the reason with numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bearings:
-    """Directions from a known orbit.
+    """Directions observed from a known orbit.
 
     Attributes:
-        times: (n,) s, rising.
+        times: (n,) s, increasing.
         directions: (n, 3) unit vectors, ICRS.
-        sigma: (n,) rad, along an axis.
+        sigma: (n,) rad, along each axis.
         observer: (n, 6) m and m/s, ICRS about the Earth's centre.
-        earth: (3,) m/s of the Earth about the Sun.
+        earth: (3,) m/s of the Earth relative to the Sun.
     """
 
     times: FloatArray
@@ -132,15 +134,18 @@ class Bearings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FirstOrbit:
-    """An orbit at `time` s.
+    """An orbit at one time.
 
     Attributes:
+        time: s.
         state: (6,) m and m/s, ICRS.
-        covariance: (6, 6), the observer's own error not included.
-        distance: m from the observer at that time, and the ends of the interval that holds it by 95 %.
-        lasts: whether it is bound to the Earth and clear of it. One that is not has others in the interval
-            that are.
+        covariance: (6, 6), without the observer's own error.
+        distance: m from the observer at that time.
+        interval: m, ends of the 95 % interval of the distance.
+        lasts: whether the orbit is bound to the Earth and clear of it. If not, the interval contains other
+            orbits that are.
         chi_square: of the sightings, with `degrees` of freedom.
+        degrees: degrees of freedom.
     """
 
     time: float
@@ -154,7 +159,7 @@ class FirstOrbit:
 
 
 def first_orbit(seen: Bearings) -> FirstOrbit:
-    """Return the orbit of an object. Raises ArcError where the sightings determine none."""
+    """Return the orbit of an object. Raises ArcError if the sightings determine none."""
     count = len(seen.times)
     if count < LEAST_SIGHTINGS:
         raise ArcError(f"{count} sightings: an orbit needs {LEAST_SIGHTINGS} or more")
@@ -174,10 +179,12 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
     least = float(fit.chi_square(unknowns[None])[0])
     degrees = 2 * count - 6
     if least > bound(_MISFIT, degrees):
-        raise ArcError(f"no free fall fits the sightings: chi-square {least:.0f} with {degrees} degrees")
+        raise ArcError(
+            f"no free fall fits the sightings: chi-square {least:.0f} with {degrees} degrees of freedom"
+        )
     if not possible.any():
         near, far = 1e-3 * np.exp([low, high])
-        raise ArcError(f"at {near:.4g} to {far:.4g} km no orbit is bound to the Earth and clear of it")
+        raise ArcError(f"no orbit at {near:.4g} to {far:.4g} km is bound to the Earth and clear of it")
     state = fit.states(unknowns[None])[0]
     jacobian = fit.state_jacobian(unknowns)
     spread = jacobian @ covariance @ jacobian.T
@@ -196,31 +203,37 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
 def _within(
     logarithms: FloatArray, chi_square: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return where chi-square is within `_DEGREES_95` of its least: the outermost tried, and the ends."""
+    """Return the interval in which chi-square is within `_DEGREES_95` of its minimum.
+
+    The first pair are the outermost scanned points inside, the second the interpolated ends.
+    """
     excess = chi_square - chi_square.min() - _DEGREES_95
-    first, last = (int(place) for place in np.flatnonzero(excess < 0.0)[[0, -1]])
+    first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])
     ends = []
-    for place, outer in ((first, first - 1), (last, last + 1)):
-        end = float(logarithms[place])
+    for position, outer in ((first, first - 1), (last, last + 1)):
+        end = float(logarithms[position])
         if 0 <= outer < len(logarithms):
-            share = excess[place] / (excess[place] - excess[outer])
-            end += float(share * (logarithms[outer] - logarithms[place]))
+            share = excess[position] / (excess[position] - excess[outer])
+            end += float(share * (logarithms[outer] - logarithms[position]))
         ends.append(end)
     return (float(logarithms[first]), float(logarithms[last])), (ends[0], ends[1])
 
 
 def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
-    """Return why an arc, s, does not suffice; `lasting`: logarithms of distances of lasting orbits."""
+    """Return the reason why an arc (s) does not suffice.
+
+    `lasting` holds the logarithms of the distances of lasting orbits.
+    """
     low, high = (1e-3 * math.exp(end) for end in interval)
-    text = f"the arc of {arc:.0f} s is too short: by 95 % the distance may be {low:.3g} to {high:.3g} km"
+    text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
     if len(lasting):
         low, high = (1e-3 * math.exp(end) for end in (lasting.min(), lasting.max()))
-        text += f", {low:.3g} to {high:.3g} of orbits that last"
-    return text + f"; an orbit is given where the ends are within a factor of {RATIO:g}"
+        text += f", {low:.3g} to {high:.3g} km for lasting orbits"
+    return text + f"; an orbit needs ends within a factor of {RATIO:g}"
 
 
 class _ArcFit:
-    """The least squares of some sightings; unknowns (k, 6) of k hypotheses at once."""
+    """The least-squares fit of the sightings; unknowns (k, 6) of k hypotheses at once."""
 
     def __init__(self, seen: Bearings) -> None:
         self._seen = seen
@@ -231,26 +244,26 @@ class _ArcFit:
         self._across = np.array([tangent_basis(direction) for direction in seen.directions])
 
     def states(self, unknowns: FloatArray) -> FloatArray:
-        """Return the states (k, 6) at the middle."""
-        place = self._axis + unknowns[:, :2] @ self._basis
-        place = place / np.linalg.norm(place, axis=1, keepdims=True)
+        """Return the states (k, 6) at the middle of the arc."""
+        position = self._axis + unknowns[:, :2] @ self._basis
+        position = position / np.linalg.norm(position, axis=1, keepdims=True)
         moved = unknowns[:, 2:4] @ self._basis + unknowns[:, 4:5] * self._axis
         return np.asarray(
             self._seen.observer[self._middle]
-            + np.exp(unknowns[:, 5:6]) * np.concatenate([place, moved], axis=1)
+            + np.exp(unknowns[:, 5:6]) * np.concatenate([position, moved], axis=1)
         )
 
     def residuals(self, unknowns: FloatArray) -> FloatArray:
-        """Return the residuals (k, 2 n) over their standard deviations."""
+        """Return the residuals (k, 2 n) divided by their standard deviations."""
         seen, middle = self._seen, self._middle
         start = self.states(unknowns)
-        states = around(start, seen.times, middle)
+        states = propagate_about(start, seen.times, middle)
         way = states[..., :3] - seen.observer[:, None, :3]
         distance = np.linalg.norm(way, axis=2, keepdims=True)
         way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
         way /= np.linalg.norm(way, axis=2, keepdims=True)
         off = np.einsum("nij,nkj->kni", self._across, way)
-        # Behind the camera the offset would be small again.
+        # Bound the cosine, because the offset would be small again for directions behind the camera.
         facing = np.einsum("nj,nkj->kn", seen.directions, way)
         off = off / np.maximum(facing, 1e-3)[:, :, None]
         return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
@@ -260,51 +273,51 @@ class _ArcFit:
         return np.asarray(np.sum(self.residuals(unknowns) ** 2, axis=1))
 
     def admissible(self, unknowns: FloatArray) -> BoolArray:
-        """Return which hypotheses (k,) are orbits that last."""
+        """Return which hypotheses (k,) are lasting orbits."""
         states = self.states(unknowns)
-        place, motion = states[:, :3], states[:, 3:]
-        radius = np.linalg.norm(place, axis=1)
+        position, motion = states[:, :3], states[:, 3:]
+        radius = np.linalg.norm(position, axis=1)
         energy = 0.5 * np.sum(motion**2, axis=1) - GRAVITATIONAL_PARAMETER / radius
-        turn = np.sum(np.cross(place, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
+        turn = np.sum(np.cross(position, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
         size = -0.5 * GRAVITATIONAL_PARAMETER / np.where(energy < 0.0, energy, -1.0)
         eccentricity = np.sqrt(np.maximum(1.0 - turn / size, 0.0))
         clear = size * (1.0 - eccentricity) > EARTH_RADIUS + GROUND_CLEARANCE
         return np.asarray((energy < 0.0) & clear)
 
     def scan(self, logarithms: FloatArray) -> FloatArray:
-        """Return the best unknowns (k, 6) at each logarithm (k,) of the distance."""
+        """Return the best unknowns (k, 6) for each logarithm (k,) of the distance."""
         unknowns = np.zeros((len(logarithms), 6))
         unknowns[:, 5] = logarithms
         times = self._seen.times - self.time
-        # Straight and even at first: the mean motion of the direction.
+        # Initial guess: the mean motion of the direction.
         weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
         unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
         for _ in range(_ROUNDS):
             residual, jacobian = self._linear(unknowns)
             step = _solved(residual, jacobian[:, :, :5])[0]
-            unknowns[:, :5] -= np.clip(step, -_LONGEST, _LONGEST)
+            unknowns[:, :5] -= np.clip(step, -_LONGEST_STEPS, _LONGEST_STEPS)
         return unknowns
 
     def refine(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the best unknowns (6,) near some, and their covariance (6, 6)."""
+        """Return the best unknowns (6,) near a guess, and their covariance (6, 6)."""
         covariance = np.eye(6)
         for _ in range(_FINAL_ROUNDS):
             residual, jacobian = self._linear(unknowns[None])
             (step,), (covariance,) = _solved(residual, jacobian)
-            # A logarithm that jumps is beyond what is linear.
+            # Shorten steps beyond the linear range of the logarithm.
             unknowns = unknowns - step * min(1.0, 0.3 / max(abs(float(step[5])), 1e-12))
             if abs(float(step[5])) < 1e-4 * math.sqrt(float(covariance[5, 5])):
                 break
         return unknowns, covariance
 
     def state_jacobian(self, unknowns: FloatArray) -> FloatArray:
-        """Return (6, 6), the state by the unknowns (6,)."""
+        """Return the derivatives (6, 6) of the state by the unknowns (6,)."""
         shifts = np.diag(_STEPS)
         ahead, behind = self.states(unknowns + shifts), self.states(unknowns - shifts)
         return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
 
     def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return residuals (k, m) and their derivatives (k, m, 6)."""
+        """Return the residuals (k, m) and their derivatives (k, m, 6)."""
         shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
         many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
         found = self.residuals(many).reshape(13, len(unknowns), -1)

@@ -11,7 +11,7 @@ Observer and object fall about the Earth. The gravity gradient at the observer's
 their relative acceleration to first order in the distance over the orbit's radius.
 
 Process noise: the tides of two low orbits, which rotate with the line, are modelled as white accelerations of
-density `wander`, and their residual after the gradient as density `left`. The range component also follows
+density `wander`, after subtraction of the gradient `residual_wander`. The range component also follows
 motions that are not straight lines, such as an object on a great circle at a constant rate, whose s would
 change by rate^2: a density of (`bend` rate^2)^2 / rate.
 
@@ -37,15 +37,16 @@ from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSightings:
-    """The n objects, or what may be one, of a frame at one instant.
+    """The n detected objects of a frame at one instant, false detections included.
 
     Attributes:
         time_ns: of mid-exposure.
-        directions: (n, 3) unit vectors, ICRS, free of the aberration of the stars.
-        covariance: (n, 3, 3) rad^2 of the places in the image, ICRS axes; without the attitude's.
-        magnitudes: (n,) by the frame's stars; NaN when unknown.
-        attitude: (3, 3) rad^2, of the small turn, ICRS axes, that is common to all directions of the frame.
-        observer: (3,) m from the Earth's centre, ICRS; None on the ground, or where it is not known.
+        directions: (n, 3) unit vectors, ICRS, corrected for stellar aberration.
+        covariance: (n, 3, 3) rad^2 of the positions in the image, ICRS axes, without that of the attitude.
+        magnitudes: (n,) calibrated by the frame's stars; NaN if unknown.
+        attitude: (3, 3) rad^2, of the small rotation, ICRS axes, that is common to all directions of the
+            frame.
+        observer: (3,) m from the Earth's centre, ICRS; None on the ground or if unknown.
     """
 
     time_ns: int
@@ -58,22 +59,22 @@ class FrameSightings:
 
 @dataclass(frozen=True, slots=True)
 class MotionModel:
-    """What is believed of the objects' motion.
+    """The prior and the process noise of the objects' motion.
 
     Attributes:
         rate: rad/s, standard deviation of each component before the second sighting.
-        closing: 1/s, the same of (range rate) / range.
-        wander: 1/s^3, density of scaled accelerations. Tides in low orbit reach 1.5 n^2 = 1.8e-6 1/s^2; the
-            density is the one whose errors of place and rate are as large as their covariance says in passes
-            of 0.05 to 0.6 deg/s at up to 5,000 km.
-        left: 1/s^3, the same where the gravity gradient is known, from the same passes.
-        bend: part of rate^2 by which the closing rate changes otherwise than on a straight line.
+        closing: 1/s, standard deviation of (range rate) / range before the second sighting.
+        wander: 1/s^3, density of scaled accelerations. Tides in low orbit reach 1.5 n^2 = 1.8e-6 1/s^2. With
+            this density the errors of position and rate agree with their covariance in passes of 0.05 to 0.6
+            deg/s at up to 5,000 km.
+        residual_wander: 1/s^3, the same density if the gravity gradient is known, from the same passes.
+        bend: fraction of rate^2 by which the closing rate changes other than on a straight line.
     """
 
     rate: float = 0.01
     closing: float = 0.01
     wander: float = 1.6e-12
-    left: float = 4e-13
+    residual_wander: float = 4e-13
     bend: float = 0.3
 
 
@@ -84,8 +85,9 @@ class LineOfSightState:
     Attributes:
         time_ns: of the state.
         direction: (3,) unit vector, ICRS.
-        velocity: (3,) 1/s, z: of its parts, across the line is the angular rate, along it the closing rate.
-        covariance: (6, 6) of direction and velocity; nothing along the direction.
+        velocity: (3,) 1/s, z: its component across the line is the angular rate, that along it the closing
+            rate.
+        covariance: (6, 6) of direction and velocity; zero along the direction.
     """
 
     time_ns: int
@@ -95,18 +97,18 @@ class LineOfSightState:
 
     @property
     def rate(self) -> FloatArray:
-        """How the direction changes (3,), rad/s, at right angles to it."""
+        """Derivative (3,) of the direction, rad/s, normal to it."""
         return self.velocity - (self.velocity @ self.direction) * self.direction
 
     @property
     def acceleration(self) -> FloatArray:
-        """How the rate changes (3,), rad/s^2, at right angles to the direction."""
+        """Derivative (3,) of the rate, rad/s^2, normal to the direction."""
         return -2.0 * float(self.velocity @ self.direction) * self.rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionInnovation:
-    """A direction against the predicted one: residual (2,) rad, its covariance and chi-square."""
+    """A measured direction relative to the predicted one: residual (2,) rad, covariance and chi-square."""
 
     residual: FloatArray
     covariance: FloatArray
@@ -127,9 +129,10 @@ def begin(
 
 
 def tides(observer: FloatArray) -> FloatArray:
-    """Return the gravity gradient (3, 3) 1/s^2 at an observer's place (3,) m from the Earth's centre, ICRS.
+    """Return the gravity gradient (3, 3) 1/s^2 at a position (3,) m from the Earth's centre, ICRS.
 
-    What falls beside the observer is accelerated against it by this times its place, to first order.
+    To first order, an object falling beside the observer has a relative acceleration of this matrix times its
+    relative position.
     """
     distance = float(np.linalg.norm(observer))
     up = observer / distance
@@ -139,12 +142,15 @@ def tides(observer: FloatArray) -> FloatArray:
 def predict(
     state: LineOfSightState, time_ns: int, motion: MotionModel, tide: FloatArray | None = None
 ) -> LineOfSightState:
-    """Return the line of sight at another time, not before its own; `tide` (3, 3) 1/s^2 where it is known."""
+    """Return the line of sight at another time, not before its own. Raises ValueError for an earlier time.
+
+    `tide` (3, 3) 1/s^2 is the gravity gradient, None if unknown.
+    """
     step = (time_ns - state.time_ns) * 1e-9
     if step == 0.0:
         return state
     if step < 0.0:
-        raise ValueError(f"time_ns = {time_ns}: give one from {state.time_ns} on")
+        raise ValueError(f"time_ns is {time_ns}: it must not be before {state.time_ns}")
     transition = np.eye(6)
     transition[:3, 3:] = step * np.eye(3)
     if tide is not None:
@@ -156,7 +162,7 @@ def predict(
 
 
 def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> DirectionInnovation:
-    """Return a direction (3,), of `covariance` (3, 3) rad^2, against the state at the same time."""
+    """Return a direction (3,) of `covariance` (3, 3) rad^2 relative to the state at the same time."""
     basis = tangent_basis(state.direction)
     residual = basis @ direction / max(float(direction @ state.direction), 1e-3)
     observation = np.hstack([basis, np.zeros((2, 3))])
@@ -167,7 +173,7 @@ def compare(state: LineOfSightState, direction: FloatArray, covariance: FloatArr
 
 
 def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArray) -> LineOfSightState:
-    """Return the state with a sighting (3,), of `covariance` (3, 3) rad^2, at the same time."""
+    """Return the state updated with a sighting (3,) of `covariance` (3, 3) rad^2 at the same time."""
     seen = compare(state, direction, covariance)
     gain = np.linalg.solve(seen.covariance, seen.observation @ state.covariance).T
     change = gain @ seen.residual
@@ -175,16 +181,16 @@ def update(state: LineOfSightState, direction: FloatArray, covariance: FloatArra
     basis = tangent_basis(state.direction)
     noise = basis @ covariance @ basis.T
     spread = kept @ state.covariance @ kept.T + gain @ noise @ gain.T
-    place, velocity = state.direction + change[:3], state.velocity + change[3:]
-    return _at_unit_range(state.time_ns, place, velocity, spread)
+    position, velocity = state.direction + change[:3], state.velocity + change[3:]
+    return _at_unit_range(state.time_ns, position, velocity, spread)
 
 
 def _at_unit_range(
-    time_ns: int, place: FloatArray, velocity: FloatArray, covariance: FloatArray
+    time_ns: int, position: FloatArray, velocity: FloatArray, covariance: FloatArray
 ) -> LineOfSightState:
-    """Return the state divided by its range, |place|."""
-    size = float(np.linalg.norm(place))
-    direction, scaled = place / size, velocity / size
+    """Return the state divided by its range, the length of `position`."""
+    size = float(np.linalg.norm(position))
+    direction, scaled = position / size, velocity / size
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = (np.eye(3) - np.outer(direction, direction)) / size
     jacobian[3:, :3] = -np.outer(scaled, direction) / size
@@ -194,10 +200,13 @@ def _at_unit_range(
 
 
 def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: bool) -> FloatArray:
-    """Return the covariance (6, 6) of white accelerations over `step` s; `known`: the gradient is."""
+    """Return the covariance (6, 6) of white accelerations over `step` s.
+
+    `known` is true if the gravity gradient is known.
+    """
     along = np.outer(state.direction, state.direction)
     rate = float(np.linalg.norm(state.rate))
-    wander = motion.left if known else motion.wander
+    wander = motion.residual_wander if known else motion.wander
     density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
     return np.block(
         [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
@@ -206,23 +215,23 @@ def _noise(state: LineOfSightState, step: float, motion: MotionModel, known: boo
 
 _UNSEEN = np.full(3, np.nan)
 _ALIKE = 2.0
-"""Standard deviations of the brightness, of a sighting of a tentative track at most. Where a confirmed one
-shows itself is known closely: there an object that flashes may differ by more."""
+"""Largest brightness difference of a sighting from a tentative track, in standard deviations. The position of
+a confirmed track is known closely, so that a flashing object may differ by more there."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackSettings:
-    """How tracks start, go on and end.
+    """Settings of the start, the confirmation and the end of tracks.
 
     Attributes:
-        motion: what is believed of the motion.
-        needed: sightings of a track before it is confirmed,
+        motion: the model of the motion.
+        needed: sightings needed to confirm a track,
         within: in this many frames.
-        missed: probability that the gate excludes the object's own sighting.
+        missed: probability that the gate rejects the object's own sighting.
         moving: standard deviations of the rate by which a confirmed track must differ from the stars.
-        least_rate: rad/s, below which nothing is told from a star that no catalogue has.
+        least_rate: rad/s, below which an object cannot be distinguished from an uncatalogued star.
         coast: s that a confirmed track lasts without a sighting.
-        most_tracks: tentative ones included.
+        most_tracks: largest number of tracks, tentative ones included.
         brightness: magnitudes, standard deviation between sightings of one object.
     """
 
@@ -239,19 +248,22 @@ class TrackSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """One track: `number` counts from 1 once it is confirmed, 0 before.
+    """One track.
 
     Attributes:
-        line: of sight, at the newest frame.
+        number: counts from 1 once the track is confirmed; 0 before.
+        line: line of sight at the newest frame.
         seen_ns: time of the last sighting.
-        sightings: how many; `frames` since the start.
-        magnitude: mean of the last sightings', NaN when unknown.
-        magnitude_sigma: of that mean, by their scatter; NaN before the second. The stars' colours, by which
-            the frames' magnitudes are off together, are not in it.
-        history: one bit a frame, the newest lowest: seen or not.
-        measured: (3,) direction of the newest frame's sighting, NaN where it has none.
-        measured_sigma: rad along an axis, of that, the attitude's share included.
-        chi_square: of the sightings against their predictions, two degrees of freedom each after the first.
+        sightings: number of sightings.
+        frames: number of frames since the start.
+        magnitude: mean of the last sightings, NaN if unknown.
+        magnitude_sigma: standard deviation of that mean by the scatter; NaN before the second sighting. It
+            excludes the common error of the frames' magnitudes by the colours of the stars.
+        history: one bit per frame, the newest lowest; set for a sighting.
+        measured: (3,) direction of the sighting in the newest frame, NaN without one.
+        measured_sigma: rad along each axis of that direction, including the attitude's share.
+        chi_square: of the sightings relative to their predictions, two degrees of freedom each after the
+            first.
     """
 
     number: int
@@ -268,17 +280,17 @@ class Track:
 
     @property
     def confirmed(self) -> bool:
-        """Whether it is an object."""
+        """Whether the track is confirmed as an object."""
         return self.number > 0
 
     @property
     def seen(self) -> bool:
-        """Whether the newest frame shows it."""
+        """Whether the newest frame has a sighting of the object."""
         return bool(self.history & 1)
 
 
 class ObjectTracker:
-    """Owns the tracks."""
+    """Tracks the objects in successive frames."""
 
     def __init__(self, settings: TrackSettings) -> None:
         self._settings = settings
@@ -292,20 +304,20 @@ class ObjectTracker:
         return tuple(sorted((t for t in self._tracks if t.confirmed), key=lambda track: track.number))
 
     def predicted(self, number: int, time_ns: int) -> LineOfSightState | None:
-        """Return the line of sight to the confirmed track of a number; None when it has ended."""
+        """Return the predicted line of sight of a confirmed track; None if it has ended."""
         for track in self._tracks:
             if track.number == number > 0 and time_ns >= track.line.time_ns:
                 return predict(track.line, time_ns, self._settings.motion)
         return None
 
     def clear(self) -> None:
-        """Forget all tracks."""
+        """Delete all tracks."""
         self._tracks = []
 
     def ingest(self, frame: FrameSightings) -> tuple[list[Track], list[Track]]:
-        """Accept a frame, not older than the last; return the tracks confirmed by it, and those it ended.
+        """Process a frame; return the tracks that it confirmed, and the confirmed tracks that it ended.
 
-        A frame older than the last raises ValueError.
+        Raises ValueError for a frame older than the last.
         """
         motion = self._settings.motion
         tide = None if frame.observer is None else tides(frame.observer)
@@ -322,16 +334,16 @@ class ObjectTracker:
             if number is None:
                 after.append(replace(track, history=history, measured=_UNSEEN, measured_sigma=math.nan))
             else:
-                after.append(self._seen(replace(track, history=history | 1), frame, number, spread))
-        alive = [track for track in after if self._lives(track, frame.time_ns)]
+                after.append(self._updated(replace(track, history=history | 1), frame, number, spread))
+        alive = [track for track in after if self._is_alive(track, frame.time_ns)]
         ended = [track for track in after if track.confirmed and track not in alive]
         alive, confirmed = self._confirm(alive)
-        alive += self._started(frame, spread, set(taken.values()), self._settings.most_tracks - len(alive))
+        alive += self._new_tracks(frame, spread, set(taken.values()), self._settings.most_tracks - len(alive))
         self._tracks = alive
         return confirmed, ended
 
     def _associated(self, tracks: list[Track], frame: FrameSightings, spread: FloatArray) -> dict[int, int]:
-        """Return the sighting of each track that has one."""
+        """Return the index of the sighting for each track that has one."""
         pairs = []
         for index, track in enumerate(tracks):
             near = frame.directions @ track.line.direction > 0.5
@@ -342,7 +354,7 @@ class ObjectTracker:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
                 if seen.chi_square + unlike <= self._gate:
-                    # A wide gate must not win by its width: the likelihood, with its normalisation.
+                    # Compare normalised likelihoods, as a large covariance widens the gate.
                     cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))
         taken: dict[int, int] = {}
@@ -353,7 +365,7 @@ class ObjectTracker:
                 used.add(chosen)
         return taken
 
-    def _seen(self, track: Track, frame: FrameSightings, number: int, spread: FloatArray) -> Track:
+    def _updated(self, track: Track, frame: FrameSightings, number: int, spread: FloatArray) -> Track:
         seen = compare(track.line, frame.directions[number], spread[number])
         count = track.sightings + 1
         mean, sigma = _brightness(track, float(frame.magnitudes[number]), min(count, self._settings.within))
@@ -369,15 +381,15 @@ class ObjectTracker:
             chi_square=track.chi_square + seen.chi_square,
         )
 
-    def _lives(self, track: Track, now_ns: int) -> bool:
+    def _is_alive(self, track: Track, now_ns: int) -> bool:
         settings = self._settings
         if track.confirmed:
             return now_ns - track.seen_ns <= round(settings.coast * 1e9)
-        left = settings.within - track.frames
-        return track.history.bit_count() + max(left, 0) >= settings.needed
+        remaining = settings.within - track.frames
+        return track.history.bit_count() + max(remaining, 0) >= settings.needed
 
     def _confirm(self, tracks: list[Track]) -> tuple[list[Track], list[Track]]:
-        """Return the tracks, and those of them that are confirmed by now."""
+        """Return all tracks, and the newly confirmed ones among them."""
         after, confirmed = [], []
         for track in tracks:
             if not track.confirmed and self._is_object(track):
@@ -390,7 +402,7 @@ class ObjectTracker:
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
-        # The first two sightings give place and rate, of which little was known: the others test them.
+        # The first two sightings give position and rate, and the others test them.
         tested = 2 * (track.sightings - 1)
         if track.chi_square > bound(self._settings.missed, tested):
             return False
@@ -399,8 +411,10 @@ class ObjectTracker:
         sigma = math.sqrt(max(float(along @ track.line.covariance[3:, 3:] @ along), 0.0))
         return rate > self._settings.least_rate and rate > self._settings.moving * sigma
 
-    def _started(self, frame: FrameSightings, spread: FloatArray, used: set[int], room: int) -> list[Track]:
-        """Return a tentative track for each sighting that no track took, the brightest if room is short."""
+    def _new_tracks(
+        self, frame: FrameSightings, spread: FloatArray, used: set[int], room: int
+    ) -> list[Track]:
+        """Return a tentative track for each unassigned sighting, the brightest if room is short."""
         free = [number for number in range(len(frame.directions)) if number not in used]
         free.sort(key=lambda number: float(np.nan_to_num(frame.magnitudes[number], nan=99.0)))
         return [
@@ -420,24 +434,24 @@ class ObjectTracker:
 
 
 def _brightness(track: Track, magnitude: float, count: int) -> tuple[float, float]:
-    """Return mean and its standard deviation with a sighting's magnitude, the newest of `count`."""
+    """Return mean and standard deviation of the magnitude after a new sighting, the newest of `count`."""
     if not math.isfinite(magnitude):
         return track.magnitude, track.magnitude_sigma
     if not math.isfinite(track.magnitude):
         return magnitude, math.nan
     before = 0.0 if math.isnan(track.magnitude_sigma) else track.magnitude_sigma
     change = magnitude - track.magnitude
-    # The variance of the mean of n is the scatter over n (n - 1): carried on as if the last n - 1 were all.
+    # The variance of the mean of n is the scatter over n (n - 1); older sightings beyond n - 1 are ignored.
     scatter = before**2 * (count - 1) * max(count - 2, 0) + change**2 * (count - 1) / count
     return track.magnitude + change / count, math.sqrt(scatter / (count * (count - 1)))
 
 
 def _sigma(covariance: FloatArray) -> float:
-    """Return the standard deviation along an axis, rad, of a direction with a covariance (3, 3)."""
+    """Return the standard deviation (rad) along each axis of a direction with a covariance (3, 3)."""
     return math.sqrt(0.5 * float(np.trace(covariance)))
 
 
 def _with_attitude(frame: FrameSightings) -> FloatArray:
-    """Return the covariance (n, 3, 3) of the directions with the attitude's share."""
+    """Return the covariance (n, 3, 3) of the directions, including that of the attitude."""
     cross = cross_matrices(frame.directions)
     return np.asarray(frame.covariance + cross @ frame.attitude @ cross.transpose(0, 2, 1))

@@ -3,7 +3,7 @@
 The tracker brings the body to rest. Long and short pulses then turn the body out and back (torque constant,
 delay), and further pulses displace it and release it with the coils at zero (stiffness, damping: the current
 of a coil that is off is known exactly). The same follows with the other sign. Between manoeuvres, and
-whenever the body would leave the bound even if braked at once, the tracker commands the coil; if the tracker
+whenever the body would leave the bound even if stopped at once, the tracker commands the coil; if the tracker
 cannot bring the body to rest, the current stays zero for good. The log holds the current, whichever commanded
 it.
 """

@@ -19,11 +19,11 @@ from knightcube.gnc.guidance.one_axis.vmc import Plan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
-"""Largest difference between a path's end and the target, in q2 and in rad/s."""
+"""Largest difference between the end of a path and the target, in q2 and in rad/s."""
 
 
 class GuidanceState(StrEnum):
-    """What `PathGuidance.sample` returns: a path under way, a held attitude, or nothing yet."""
+    """The result of `PathGuidance.sample`: a path under way, a held attitude, or none yet."""
 
     NONE = "none"
     FOLLOWING = "following"
@@ -32,11 +32,12 @@ class GuidanceState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AcceptanceRules:
-    """The limits that a plan must keep to be accepted.
+    """The conditions for the acceptance of a plan.
 
     Attributes:
         late_after: s from its origin to its arrival.
-        angle_tolerance: rad, rate_tolerance: rad/s, between its start and the estimate at its origin.
+        angle_tolerance: rad, between its start and the estimate at its origin.
+        rate_tolerance: rad/s, between its start and the estimate at its origin.
         q2_limit: bound of |q2|; an overshoot of 1e-3 of it is accepted.
         current_excess: largest relative excess over the plant's current limit anywhere on the path.
     """
@@ -57,19 +58,20 @@ class AcceptanceRules:
 
 @dataclass(frozen=True, slots=True)
 class PlanVerdict:
-    """Whether a plan was accepted; `reason` says why not and is empty otherwise."""
+    """Whether a plan was accepted; `reason` is the reason for a rejection and empty otherwise."""
 
     accepted: bool
     reason: str = ""
 
 
 class PathGuidance:
-    """Owns the path being followed and the current target."""
+    """Follows accepted paths towards the current target."""
 
     def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
-        """Plan for `plant` and its limits; `arrives` says that paths end at the target and hold it.
+        """Check plans for `plant` and its limits.
 
-        On a receding horizon (`arrives` false) a path that ends means that later plans are missing.
+        `arrives` states that paths end at the target and hold it. On a receding horizon (`arrives` false) a
+        path that ends means that later plans are missing.
         """
         self._plant = plant
         self._rules = rules
@@ -114,7 +116,7 @@ class PathGuidance:
         self._planned_ns = now_ns - 1
 
     def release(self) -> None:
-        """Drop the path; there is none until the next accepted plan or hold."""
+        """Drop the path; none is followed until the next accepted plan or hold."""
         self._path = None
         self._planned_ns = None
 
@@ -127,10 +129,10 @@ class PathGuidance:
         estimate_rate: float,
         disturbance: float = 0.0,
     ) -> PlanVerdict:
-        """Follow `plan` from `origin_ns` if it keeps the rules.
+        """Follow `plan` from `origin_ns` if it satisfies the acceptance rules.
 
-        The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance`
-        in rad/s^2.
+        The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance` in
+        rad/s^2.
         """
         reason = (
             self._untimely(origin_ns, now_ns)

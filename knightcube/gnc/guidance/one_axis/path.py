@@ -26,7 +26,7 @@ from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, acceleration_of, an
 
 @dataclass(frozen=True, slots=True)
 class LglRule:
-    """One set of nodes; the arrays are read-only because rules are shared.
+    """A set of nodes with its matrices; the arrays are read-only because rules are shared.
 
     Attributes:
         nodes: (n,) ascending, from -1 to 1.
@@ -103,7 +103,7 @@ class CubicPrey:
 
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""rad: the largest angle of a coast."""
+"""Largest angle of a coast, rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +116,12 @@ class PathSample:
 
     @property
     def quaternion(self) -> FloatArray:
-        """The attitude (4,) that the angle about body y is."""
+        """Attitude (4,) of the angle about body y."""
         return about_axis_y(self.angle)
 
     @property
     def body_rate(self) -> FloatArray:
-        """The rate (3,), rad/s, body axes."""
+        """Body rate (3,), rad/s."""
         return np.array([0.0, self.rate, 0.0])
 
 
@@ -161,7 +161,7 @@ class PolynomialPath:
 
     @classmethod
     def holding(cls, angle: float, origin_ns: int = 0) -> PolynomialPath:
-        """Return the path that holds `angle` rad without end."""
+        """Return the path that holds `angle` rad indefinitely."""
         return cls(origin_ns, 0.0, (), angle)
 
     def starting_at(self, origin_ns: int) -> PolynomialPath:

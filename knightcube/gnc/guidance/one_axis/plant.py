@@ -26,7 +26,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.coil_power import steady_heat, supply_power
 
 Q2_LIMIT = 0.68
-"""No path leads beyond: cos(theta) is 0.075 there; at 0.707 no current turns the body at all."""
+"""Largest |q2| of any path. cos(theta) is 0.075 there; at 0.707 no current rotates the body."""
 
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
@@ -56,7 +56,7 @@ class SingleAxisPlant:
     disturbance: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse constants that no body has; raises UsageError."""
+        """Raise UsageError for constants out of range."""
         for name in ("inertia", "torque_constant", "resistance", "current_limit"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -157,11 +157,11 @@ def current_and_slopes(
 
 
 _ROUNDED = 0.1
-"""Of Imax: while minimised, |I| is sqrt(I^2 + e^2) - e, whose slope is continuous."""
+"""Rounding e of |I| relative to Imax: the minimised |I| is sqrt(I^2 + e^2) - e, whose slope is continuous."""
 
 
 class PathCost(StrEnum):
-    """The power whose integral a path minimises: R I^2 (Sease 5.1), or V |I| from the supply."""
+    """The power whose integral is minimised along a path."""
 
     HEAT = "heat"
     SUPPLY = "supply"
@@ -173,7 +173,7 @@ class PathCost(StrEnum):
         return supply_power(current, plant.resistance * plant.current_limit)
 
     def smooth(self, plant: SingleAxisPlant, current: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the power as it is minimised, W, and its derivative, W/A, for mean currents (m,) in A."""
+        """Return the smoothed power, W, to minimise, and its derivative, W/A, for currents (m,) in A."""
         if self is PathCost.HEAT:
             pull = plant.resistance * current
             return pull * current, 2.0 * pull

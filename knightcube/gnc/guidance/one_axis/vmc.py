@@ -45,21 +45,21 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 
 ProgramAt = Callable[[float], PathProgram]
-"""Builds the program whose family is whitened around the prey over a horizon in s."""
+"""Function from a horizon, s, to the program whose family is whitened about the prey over that horizon."""
 
-PRICE_OF_HASTE = 7.0
-"""Price per second, in R Imax^2, to find the shortest horizon. An infinite price would give the family's
-shortest path, bang-bang, whose cost is up to 1 % above the true optimum at that horizon; this price ends
-about 0.3 % later, where the cost is within 0.25 %."""
+SHORTEST_COST = 7.0
+"""Cost per second, in R Imax^2, with which the shortest horizon is found. An infinite cost would give the
+shortest path of the family, bang-bang, whose energy is up to 1 % above the optimum at that horizon. With this
+cost the horizon is about 0.3 % longer and the energy within 0.25 %."""
 
-_HASTE_STRETCH = 1.015
-"""That price may stretch a horizon by as much although the asked one has a path."""
+_SHORTEST_STRETCH = 1.015
+"""Largest factor by which that cost may stretch a horizon although the requested one is feasible."""
 
 _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
 ALONG_LIMIT = 0.99
-"""Of a limit: from here on a path runs along it."""
+"""Ratio to a limit above which a path runs along the limit."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -71,7 +71,7 @@ _PRICED_CHANGE = 0.03
 
 @dataclass(slots=True)
 class HorizonSearch:
-    """One search for a path; counts the evaluations of the cost.
+    """A search for the horizon of a path; counts the evaluations of the cost.
 
     Attributes:
         program_at: builds programs.
@@ -84,7 +84,7 @@ class HorizonSearch:
     evaluations: int = field(default=0)
 
     def within(self, asked: float, longest: float) -> tuple[PathProgram, Trial | None]:
-        """Return the least-energy path over `asked` s, or over the shortest feasible time up to `longest` s.
+        """Return the minimum-energy path over `asked` s, or over the shortest feasible time up to `longest`.
 
         Current scales with 1/T^2 for a rest-to-rest slew, so solutions without limits lead to a horizon near
         the shortest feasible one, where the program with a free horizon starts. If the program fails, it is
@@ -95,7 +95,7 @@ class HorizonSearch:
             trial = self._resumed(program, self.warm, asked, longest)
             self.evaluations += program.evaluations
             if trial is not None:
-                return self._kept(program, trial, asked)
+                return self._at_requested(program, trial, asked)
         time = asked
         for _ in range(_ATTEMPTS):
             program = self.program_at(time)
@@ -106,7 +106,7 @@ class HorizonSearch:
                 if time == asked and max(current, q2) <= 1.0 + LIMIT_TOLERANCE:
                     trial = relaxed
                 elif current < _START_BELOW or time == longest:
-                    trial = self._hasty(program, relaxed, asked, longest)
+                    trial = self._shortest(program, relaxed, asked, longest)
                 else:
                     growth = math.sqrt(current / _GROW_TO)
             self.evaluations += program.evaluations
@@ -115,19 +115,20 @@ class HorizonSearch:
             time = min(longest, time * growth)
         if trial is None:
             return self._continued(program, asked, longest)
-        return self._kept(program, trial, asked)
+        return self._at_requested(program, trial, asked)
 
     def priced(
         self, guess: float, least: float, longest: float, price: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path of least energy plus `price` W times its horizon; `guess` s is the initial horizon.
+        """Return the path of minimum energy plus `price` W times its horizon, initially `guess` s.
 
-        The slope of the least energy over the horizon is the partial derivative at that optimum. A horizon is
-        a lower bound where lengthening it saves more energy than its price, else an upper bound; the next
-        horizon follows from E ~ 1/T^3 for a slew without limits. Only the last program imposes the limits.
+        The derivative of the minimum energy by the horizon is the partial derivative at that optimum. A
+        horizon is a lower bound if lengthening it saves more energy than it costs, else an upper bound. The
+        next horizon follows from E ~ 1/T^3 for a slew without limits. Only the last program imposes the
+        limits.
         """
         low, high, time = least, longest, min(max(guess, least), longest)
-        price = min(price, PRICE_OF_HASTE * self.program_at(time).bang_power)
+        price = min(price, SHORTEST_COST * self.program_at(time).bang_power)
         for _ in range(_PRICED_STEPS):
             program = self.program_at(time)
             relaxed = program.unlimited(program.prey(time))
@@ -153,12 +154,12 @@ class HorizonSearch:
             time = following
         return self.within(time, longest)
 
-    def _kept(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
-        """Return a path over `asked` s in place of a slightly longer one, where there is such a path.
+    def _at_requested(self, program: PathProgram, trial: Trial, asked: float) -> tuple[PathProgram, Trial]:
+        """Return a path over `asked` s instead of a slightly longer one, if there is such a path.
 
-        It starts from the longer path, in a program whitened around the asked horizon.
+        It starts from the longer path, in a program whitened about the requested horizon.
         """
-        if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _HASTE_STRETCH:
+        if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _SHORTEST_STRETCH:
             return program, trial
         at_asked, found = self.over(asked, program.from_prey(trial))
         return (program, trial) if found is None else (at_asked, found)
@@ -168,7 +169,7 @@ class HorizonSearch:
     ) -> tuple[PathProgram, Trial | None]:
         """Return a path over `asked` s, or longer, by continuation from horizons that can be solved.
 
-        Where a thread pulls harder than the coil, only some horizons have paths: those of the body's swings.
+        If a thread pulls harder than the coil, only some horizons are feasible: those of the body's swings.
         From a solved horizon, shorter ones first, the horizon changes in steps, each started from the last
         path.
         """
@@ -194,7 +195,7 @@ class HorizonSearch:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[PathProgram, Trial | None]:
-        """Return the program at `time` s and a path within the limits, from `apart` (N,) beside the prey."""
+        """Return the program at `time` s and a path within the limits, started `apart` (N,) from the prey."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
@@ -206,24 +207,24 @@ class HorizonSearch:
         return program, trial
 
     def _resumed(self, program: PathProgram, warm: FloatArray, asked: float, longest: float) -> Trial | None:
-        """Return the path found when starting from an earlier one; None when that fails.
+        """Return the path found by a warm start; None if that fails.
 
-        Where the earlier path ran along a limit, the limits are imposed at once.
+        If the earlier path ran along a limit, the limits are imposed at once.
         """
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
         if not worst < _START_BELOW:
             return None
         if worst > ALONG_LIMIT:
-            return self._hasty(program, start, asked, longest)
+            return self._shortest(program, start, asked, longest)
         trial = program.unlimited(start)
         if trial is None or float(np.abs(program.ratios(trial)).max()) > 1.0 + LIMIT_TOLERANCE:
             return None
         return trial
 
-    def _hasty(self, program: PathProgram, start: Trial, asked: float, longest: float) -> Trial | None:
-        """Return the shortest path of at least `asked` s; of least energy if its horizon is `asked`."""
-        price = PRICE_OF_HASTE * program.bang_power
+    def _shortest(self, program: PathProgram, start: Trial, asked: float, longest: float) -> Trial | None:
+        """Return the shortest path of at least `asked` s, with minimum energy if its horizon is `asked`."""
+        price = SHORTEST_COST * program.bang_power
         trial = program.limited(start, FreeHorizon(asked, longest, price))
         if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):
             return trial
@@ -231,13 +232,13 @@ class HorizonSearch:
 
 
 NODES = 24
-"""At 24 nodes the cost is within 1e-4 of the true optimum from 1.1 of the shortest horizon on, a stretched
-horizon within 1.5 % of the shortest; 16 nodes take half the time and leave 2.5 %."""
+"""Number of nodes. On 24 nodes the cost is within 1e-4 of the optimum from 1.1 of the shortest horizon on,
+and a stretched horizon within 1.5 % of the shortest; 16 nodes take half the time and reach 2.5 %."""
 FINE_NODES = 40
-"""For paths that run along the current's limit about the asked horizon: on 24 nodes they cost up to 0.3 %
-more than the optimum, on 40 up to 0.07 %."""
+"""Number of nodes for paths that run along the current limit near the requested horizon: on 24 nodes they
+cost up to 0.3 % more than the optimum, on 40 up to 0.07 %."""
 _NEARLY = 1.03
-"""Of the asked horizon: up to here, finer nodes may still find a path over the asked horizon."""
+"""Stretch up to which finer nodes may still find a path over the requested horizon."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0
@@ -248,7 +249,7 @@ LEAST_PRICED = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether the asked horizon was kept; plans with a price of time are always optimal."""
+    """Whether the requested horizon was kept; plans with a time cost are always optimal."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -260,14 +261,14 @@ class Plan:
 
     Attributes:
         path: its origin is zero until guidance starts it.
-        status: optimal at the asked horizon, or stretched to the shortest feasible one.
-        horizon_asked, horizon: s; equal with a price of time.
+        status: optimal at the requested horizon, or stretched to the shortest feasible one.
+        horizon_asked, horizon: s; equal with a time cost.
         energy: integral of R I^2, J.
         supplied: integral of V |I|, J.
         peak_current: largest |I| on a dense grid, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
-        nu: (N,) path control parameters against the prey over `horizon`.
+        nu: (N,) path control parameters relative to the prey over `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
     """
@@ -286,7 +287,7 @@ class Plan:
     node_q2: FloatArray
 
     def spent(self, cost: PathCost) -> float:
-        """Return the energy of one kind, J."""
+        """Return the energy of the given kind, J."""
         return self.energy if cost is PathCost.HEAT else self.supplied
 
 
@@ -306,18 +307,18 @@ def plan(
     last: PolynomialPath | None = None,
     cost: PathCost = PathCost.HEAT,
 ) -> Plan:
-    """Return the least-energy path between two states in `horizon` s, or in the shortest feasible time.
+    """Return the minimum-energy path between two states in `horizon` s, or in the shortest feasible time.
 
     Rates are body rates in rad/s. `reference` is q_r, beyond the range of q2 (5.10); `q2_limit` bounds |q2|;
-    the horizon is stretched to `max_stretch` times the asked one at most. A stretched horizon lies about
+    the horizon is stretched to at most `max_stretch` times the requested one. A stretched horizon lies about
     0.3 % above the shortest of the paths on `nodes` nodes, within 1.5 % of the bang-bang time.
 
-    With `time_price` in W the path minimises energy plus price times horizon, over horizons from LEAST_PRICED
-    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
-    now, its origin relative to the new start (so not positive); its remainder is the initial guess of the
-    path. `cost` says which energy is the least.
+    With `time_price` in W the path minimises energy plus time cost, over horizons from LEAST_PRICED s to
+    `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until now,
+    its origin relative to the new start (so not positive); its remainder is the initial guess of the path.
+    `cost` selects the energy that is minimised.
 
-    Raises PlanningError when an argument is not finite or outside its limits, or when no allowed horizon is
+    Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
@@ -389,7 +390,7 @@ def _assemble(
     evaluations: int,
     end_rate: float,
 ) -> Plan:
-    """Return the plan that flies `trial`; raises PlanningError when it is not finite."""
+    """Return the plan of `trial`. Raises PlanningError if it is not finite."""
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit
     node_q2 = program.family.nodes(trial.parameters, trial.horizon)

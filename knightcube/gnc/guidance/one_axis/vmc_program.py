@@ -38,7 +38,7 @@ DENSE_POINTS = 769
 
 @dataclass(frozen=True, slots=True)
 class SamplePoints:
-    """Points (m,) to evaluate paths at, and matrices (3, m, N) from nodes to q2, dq2/ds and d2q2/ds2."""
+    """Points (m,) to evaluate paths at, and matrices (3, m, N) from nodes to q2 and its s-derivatives."""
 
     points: FloatArray
     matrices: FloatArray
@@ -94,7 +94,7 @@ def discretisation(count: int) -> Discretisation:
 
 @dataclass(frozen=True, slots=True)
 class BoundaryStates:
-    """The states a path joins: q2 and q2' (1/s) at both ends."""
+    """The boundary states of a path: q2 and q2' (1/s) at both ends."""
 
     start: float
     start_slope: float
@@ -184,7 +184,8 @@ def time_scale(horizon: float) -> FloatArray:
 
 
 LIMIT_TOLERANCE = 3e-4
-"""Largest relative excess over a limit on the dense grid; leaves room under 1e-3 between its points."""
+"""Largest relative excess over a limit on the dense grid; it leaves a margin below 1e-3 between the
+points."""
 
 IMPOSED_MARGIN = 2e-4
 """Relative margin by which a limit is tightened where imposed, so that peaks between those points keep it
@@ -210,7 +211,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """A horizon to be optimised between `least` and `greatest` s, at `price` W per second."""
+    """A horizon to be optimised between `least` and `greatest` s, with a time cost of `price` W."""
 
     least: float
     greatest: float
@@ -219,7 +220,7 @@ class FreeHorizon:
 
 @dataclass(frozen=True, slots=True)
 class ImposedLimits:
-    """Imposed limits (m,): dense grid point, sign, and which limit, that of q2 or of the current."""
+    """The imposed limits (m,): index on the dense grid, sign, and whether q2 or the current is limited."""
 
     index: IntArray
     sign: FloatArray
@@ -233,10 +234,10 @@ class ImposedLimits:
 
 
 class PathProgram:
-    """One plant, one family of paths between two states, and their cost and limits.
+    """The program of one plant and one family of paths between two states, with cost and limits.
 
     Attributes:
-        family: whitened around the prey at the given horizon.
+        family: whitened about the prey at the given horizon.
         evaluations: of the cost, over all solutions.
     """
 
@@ -250,7 +251,7 @@ class PathProgram:
     ) -> None:
         self._plant = plant
         self._cost = cost
-        # The ends are given: one at the limit itself leaves no room for the margin.
+        # The ends are given, and an end at the limit leaves no margin.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
         # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
         # finite.
@@ -298,9 +299,9 @@ class PathProgram:
         return current, stacked
 
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
-        """Return the integral of the cost's power in J, its gradient (N - 4,), and d/dT.
+        """Return the integral of the power in J, its gradient (N - 4,), and its derivative by the horizon.
 
-        For heat that is 5.8 without the 1/2 of 5.1.
+        For heat the integral is that of 5.8 without the 1/2 of 5.1.
         """
         points, horizon = self._cost_points, trial.horizon
         trajectory = points.trajectory(trial.parameters, horizon)
@@ -436,13 +437,13 @@ class PathProgram:
 
 
 class _Variables:
-    """What the optimiser varies: the path's parameters and, where the horizon is free, its logarithm.
+    """The variables of the optimiser: the path's parameters and, if the horizon is free, its logarithm.
 
-    The logarithm log(T/T0) is scaled so that the price of time has, like the whitened energy, a curvature of
+    The logarithm log(T/T0) is scaled so that the time cost has, like the whitened energy, a curvature of
     about one.
 
     Attributes:
-        first: where the optimiser begins.
+        first: the initial values.
         root: the scale of the logarithm; zero for a fixed horizon.
     """
 

@@ -211,5 +211,5 @@ def test_a_frame_older_than_the_last_is_refused() -> None:
     tracker = ObjectTracker(TrackSettings())
     one = np.array([[0.0, 0.0, 1.0]])
     tracker.ingest(sightings(rng, 5.0, one, _SIGMA, _ATTITUDE))
-    with pytest.raises(ValueError, match="give one from"):
+    with pytest.raises(ValueError, match="must not be before"):
         tracker.ingest(sightings(rng, 4.0, one, _SIGMA, _ATTITUDE))
