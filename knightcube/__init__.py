@@ -17,14 +17,24 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant as SingleAxisPlant
+    from knightcube.gnc.guidance.planners import plan_slew as plan_slew
+    from knightcube.gnc.guidance.planners import plan_step as plan_step
+    from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
+    from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget as PointingTarget
     from knightcube.vision.star_tracker import MatchedStars as MatchedStars
     from knightcube.vision.star_tracker import StarSolution as StarSolution
     from knightcube.vision.star_tracker import StarTracker as StarTracker
 
 _MODULE_OF = {
+    "Goal": "knightcube.gnc.guidance.three_axes.pointing_target",
     "MatchedStars": "knightcube.vision.star_tracker",
+    "PointingTarget": "knightcube.gnc.guidance.three_axes.pointing_target",
+    "SingleAxisPlant": "knightcube.gnc.guidance.one_axis.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
+    "plan_slew": "knightcube.gnc.guidance.planners",
+    "plan_step": "knightcube.gnc.guidance.planners",
 }
 __all__ = list(_MODULE_OF)
 

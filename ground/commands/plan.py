@@ -15,9 +15,10 @@ from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from ground.commands import plan_orbit
 from ground.commands.options import finite, positive
+from knightcube import plan_step
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant
-from knightcube.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, StepPlan
 
 _DEFAULT_CONFIG = "step_demo"
 _ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")
@@ -86,22 +87,20 @@ def run(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     """Plan the testbed's path, print, draw."""
     start, end = _q2("--from", options.start), _q2("--to", options.end)
-    start_rate, end_rate = options.from_rate or 0.0, options.to_rate or 0.0
     _check(options)
     config = configuration.load_testbed(options.config or config_path(_DEFAULT_CONFIG))
     plant = plant_of(config)
-    horizon = config.guidance.horizon if options.horizon is None else options.horizon
     begun = time.perf_counter()
-    made = plan(
+    made = plan_step(
         plant,
-        start,
-        start_rate,
-        end,
-        end_rate,
-        horizon,
+        start_angle=angle_of(start),
+        start_rate=options.from_rate or 0.0,
+        end_angle=angle_of(end),
+        end_rate=options.to_rate or 0.0,
+        horizon=config.guidance.horizon if options.horizon is None else options.horizon,
         nodes=options.nodes or config.guidance.nodes or NODES,
-        time_price=options.time_price,
-        cost=PathCost(options.cost or config.guidance.cost),
+        time_cost=options.time_price,
+        minimise=options.cost or config.guidance.cost,
     )
     solved_s = time.perf_counter() - begun
     if options.json:
@@ -117,7 +116,7 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _facts(made: Plan, plant: SingleAxisPlant, solved_s: float) -> dict[str, object]:
+def _facts(made: StepPlan, plant: SingleAxisPlant, solved_s: float) -> dict[str, object]:
     angle, rate, acceleration = made.path.motion(np.minimum(made.node_times, made.horizon * (1 - 1e-12)))
     return {
         "status": made.status.value,
@@ -138,7 +137,7 @@ def _facts(made: Plan, plant: SingleAxisPlant, solved_s: float) -> dict[str, obj
     }
 
 
-def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
+def _text(made: StepPlan, plant: SingleAxisPlant, solved_s: float) -> str:
     stretched = f" (asked: {made.horizon_asked:g} s, too short)" if made.horizon > made.horizon_asked else ""
     return (
         f"status:        {made.status.value}\n"

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from datetime import UTC, datetime, timedelta
+from typing import Literal
 
 import numpy as np
 
@@ -15,22 +16,16 @@ from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive
+from knightcube import plan_slew
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.ephemeris import predict
-from knightcube.astro.earth.orbit_knowledge import TwoLineElements
-from knightcube.astro.earth.sun import DAY
 from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
+from knightcube.gnc.guidance.planners import STRETCH
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
-from knightcube.gnc.guidance.three_axes.slew_plan import LEAD, OrderedSlew, SlewOrder, SlewStatus, plan_order
+from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewStatus
 from knightcube.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES, BoresightEnd
 
-BODIES = ("sun", "earth", "moon")
-STRETCH = 3.0
-"""Times --within: the longest slew without --longest."""
-_UNIX_EPOCH = 2_440_587.5
+BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
 _OFF_UNIT = 0.1
 """A typed quaternion is scaled to length 1 when its length is within this of 1."""
 
@@ -78,66 +73,65 @@ def run(options: argparse.Namespace) -> int:
     if options.at is None or options.within is None:
         raise UsageError("--orbit needs --at UTC and --within S")
     config = as_orbit(configuration.load(options.orbit))
-    order, at = _order(options, config), _utc(options.at)
+    at = _utc(options.at)
     if config.elements is None:
         raise UsageError(f"{options.orbit}: `elements` is missing: without them the orbit is not known")
-    state = TwoLineElements(*config.elements).at(_UNIX_EPOCH + (at.timestamp() - LEAD) / DAY)
-    ephemeris = predict(state, order.window + order.longest + 3.0 * LEAD)
     begun = time.process_time()
-    made = plan_order(order, ephemeris, LEAD)
+    made = _planned(options, config, config.elements, at)
     solved_s = time.process_time() - begun
-    facts = _facts(made, order, at, solved_s)
+    facts = _facts(made, at, solved_s)
     sys.stdout.write(
         json.dumps(facts | _nodes(made), allow_nan=False) + "\n" if options.json else _text(facts)
     )
     if options.picture is not None:
-        _draw(made, order, options)
+        _draw(made, options)
     return 0
 
 
-def _draw(made: OrderedSlew, order: SlewOrder, options: argparse.Namespace) -> None:
+def _draw(made: OrderedSlew, options: argparse.Namespace) -> None:
     from ground.report import draw_slew  # noqa: PLC0415
 
-    draw_slew(made, order, options.picture)
+    draw_slew(made, made.order, options.picture)
     if not options.json:
         sys.stdout.write(f"picture:       {options.picture}\n")
 
 
-def _order(options: argparse.Namespace, config: OrbitConfig) -> SlewOrder:
-    """Return the order of the options. Raises UsageError."""
+def _planned(
+    options: argparse.Namespace, config: OrbitConfig, elements: tuple[str, str], at: datetime
+) -> OrderedSlew:
+    """Return the slew of the options. Raises UsageError."""
     if options.least_time and options.time_price is not None:
         raise UsageError("--least-time and --time-price: give one of them")
     longest = STRETCH * options.within if options.longest is None else options.longest
     low, high = HORIZON_RANGE
     if not low <= options.within <= longest <= high:
         raise UsageError(f"--within {options.within:g}, longest {longest:g}: must be {low:g} to {high:g}")
-    angles = {
+    cones: dict[Literal["sun", "earth", "moon"], float] = {
         name: math.radians(value)
         for name in BODIES
         if (value := getattr(options, f"{name}_cone")) is not None
     }
-    if angles and config.camera is None:
+    if cones and config.camera is None:
         raise UsageError(f"{options.orbit}: it has no `camera` that a cone could be kept for")
-    return SlewOrder(
-        _craft(config),
-        BodyAxes(np.array(config.pointing.axis), np.array(config.pointing.across)),
-        _boresight(config),
-        _target("--from", options.start),
-        _target("--to", options.end),
-        options.within,
-        longest,
-        options.window or 0.0,
-        LEAST_TIME if options.least_time else options.time_price,
-        angles,
-        options.nodes or NODES,
-    )
-
-
-def _craft(config: OrbitConfig) -> SlewCraft:
-    """Return the planner's model of a configured satellite."""
     per_ampere, coils = config.craft.dipole_per_ampere, config.coils
-    limit = np.full(3, coils.current_limit * per_ampere)
-    return SlewCraft(np.diag(config.craft.inertia), limit, np.array(coils.resistance) / per_ampere**2)
+    return plan_slew(
+        inertia=np.diag(config.craft.inertia),
+        dipole_limit=np.full(3, coils.current_limit * per_ampere),
+        heat=np.array(coils.resistance) / per_ampere**2,
+        elements=elements,
+        time=at,
+        start=_target("--from", options.start),
+        goal=_target("--to", options.end),
+        duration=options.within,
+        longest=longest,
+        window=options.window or 0.0,
+        time_cost=LEAST_TIME if options.least_time else options.time_price,
+        pointing_axis=config.pointing.axis,
+        across_axis=config.pointing.across,
+        camera_axis=_boresight(config),
+        cones=cones,
+        nodes=options.nodes or NODES,
+    )
 
 
 def _boresight(config: OrbitConfig) -> FloatArray:
@@ -177,15 +171,15 @@ def _utc(text: str) -> datetime:
     return found.replace(tzinfo=UTC) if found.tzinfo is None else found.astimezone(UTC)
 
 
-def _facts(made: OrderedSlew, order: SlewOrder, at: datetime, solved_s: float) -> dict[str, object]:
+def _facts(made: OrderedSlew, at: datetime, solved_s: float) -> dict[str, object]:
     plan, path, task = made.plan, made.plan.path, made.task
-    begin = at + timedelta(seconds=made.begin - LEAD)
+    begin = at + timedelta(seconds=made.begin)
     around = multiply(path.quaternion[-1], conjugate(path.quaternion[0]))
     speed = np.linalg.norm(path.rate, axis=1)
     return {
         "status": plan.status.value,
-        "from": order.held.text,
-        "to": order.goal.text,
+        "from": made.order.held.text,
+        "to": made.order.goal.text,
         "begin_utc": begin.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
         "begins_compared": made.compared,
         "horizon_asked_s": plan.horizon_asked,

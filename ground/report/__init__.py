@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ground.identification.fit import Fit
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from knightcube.gnc.guidance.one_axis.vmc import Plan
+    from knightcube.gnc.guidance.one_axis.vmc import StepPlan
     from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder
 
 __all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_report", "summarise"]
@@ -43,7 +43,7 @@ def draw_both(first: Run, second: Run, folder: Path) -> Path:
         return draw_comparison(first, second, folder)
 
 
-def draw_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
+def draw_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
     """Draw one planned path as a PNG.
 
     Raises UsageError when matplotlib is not installed or the file cannot be written.

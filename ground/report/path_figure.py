@@ -13,10 +13,10 @@ from ground.report.figures import DPI, OVERVIEW
 
 if TYPE_CHECKING:  # the planner brings the optimiser with it, which a picture does not need
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from knightcube.gnc.guidance.one_axis.vmc import Plan
+    from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 
-def path_figure(plan: Plan, plant: SingleAxisPlant) -> Figure:
+def path_figure(plan: StepPlan, plant: SingleAxisPlant) -> Figure:
     """Return the picture of a plan: q2, rate and current over its horizon, marked on its nodes."""
     last = plan.horizon * (1.0 - 1e-12)  # at the horizon itself the path already holds
     time, nodes = np.linspace(0.0, last, 401), np.minimum(plan.node_times, last)
@@ -45,6 +45,6 @@ def path_figure(plan: Plan, plant: SingleAxisPlant) -> Figure:
     return figure
 
 
-def save_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
+def save_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
     """Draw a plan into a file. Raises OSError."""
     path_figure(plan, plant).savefig(file, dpi=DPI, facecolor="white", format="png")

@@ -70,6 +70,20 @@ def test_the_star_tracker_solves_the_image_of_its_example(tmp_path: Path) -> Non
     assert "not solved: " in run([script, str(dark)], ROOT, status=1).stderr
 
 
+def test_the_step_of_its_example_is_optimal_within_its_horizon() -> None:
+    printed = run([str(EXAMPLES / "step.py")], ROOT).stdout.splitlines()
+    assert printed[0] == "status   optimal"
+    assert printed[1] == "horizon  15.00 s"
+    assert len(printed) == 8
+
+
+def test_the_slew_of_its_example_keeps_off_the_moon() -> None:
+    printed = run([str(EXAMPLES / "slew.py")], ROOT).stdout.splitlines()
+    assert printed[0] == "status        optimal"
+    assert "deg outside its cone" in printed[5]
+    assert float(printed[5].split()[1]) >= 0.0
+
+
 @pytest.mark.slow
 def test_a_new_command_is_obeyed_and_logged(tmp_path: Path) -> None:
     printed = run([str(EXAMPLES / "command.py")], patched("command", tmp_path / "tree")).stdout.splitlines()

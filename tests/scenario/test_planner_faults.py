@@ -18,7 +18,7 @@ from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis import job as plan_job
 from knightcube.gnc.guidance.one_axis.job import PlanJob
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
-from knightcube.gnc.guidance.one_axis.vmc import Plan
+from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
 from tests.scenario.flights import demo_config, event_names, fly, thesis_config
 
@@ -26,31 +26,31 @@ DURATION = 24.0
 GOOD_PLANS = 2
 """The second is made at 5 s and ends at 15 s."""
 
-Spoil = Callable[[PlanJob, Plan], Plan]
+Spoil = Callable[[PlanJob, StepPlan], StepPlan]
 
 
-def use_planner(monkeypatch: pytest.MonkeyPatch, plan: Callable[[PlanJob], Plan]) -> None:
+def use_planner(monkeypatch: pytest.MonkeyPatch, plan: Callable[[PlanJob], StepPlan]) -> None:
     """Give the testbed another planner."""
     monkeypatch.setattr(testbed, "TESTBED", replace(testbed.TESTBED, plan=plan))
 
 
-def fail(job: PlanJob, plan: Plan) -> Plan:
+def fail(job: PlanJob, plan: StepPlan) -> StepPlan:
     raise PlanningError("none today")
 
 
-def break_down(job: PlanJob, plan: Plan) -> Plan:
+def break_down(job: PlanJob, plan: StepPlan) -> StepPlan:
     raise ZeroDivisionError("a defect of the planner")
 
 
-def turn_to_nan(job: PlanJob, plan: Plan) -> Plan:
+def turn_to_nan(job: PlanJob, plan: StepPlan) -> StepPlan:
     return replace(plan, path=PolynomialPath.through(np.full(24, np.nan), plan.horizon))
 
 
-def go_beyond_the_limit(job: PlanJob, plan: Plan) -> Plan:
+def go_beyond_the_limit(job: PlanJob, plan: StepPlan) -> StepPlan:
     return replace(plan, path=PolynomialPath.through(plan.node_q2, 0.02 * plan.horizon))
 
 
-def start_elsewhere(job: PlanJob, plan: Plan) -> Plan:
+def start_elsewhere(job: PlanJob, plan: StepPlan) -> StepPlan:
     return make_plan(job.plant, job.start_q2 + 0.1, 0.0, job.end_q2, 0.0, 10.0)
 
 

@@ -28,7 +28,7 @@ from knightcube.gnc.guidance.one_axis.guidance import PathGuidance
 from knightcube.gnc.guidance.one_axis.job import PlanJob
 from knightcube.gnc.guidance.one_axis.path import FARTHEST
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of, q2_of
-from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
+from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 _AGAIN_NS = 1_000_000_000
@@ -223,7 +223,7 @@ class Planning:
             self._events.report(events.PLANNER_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._record(job, None, result.outcome, False, now_ns)
             return
-        plan: Plan = result.value
+        plan: StepPlan = result.value
         verdict = self._guidance.offer(
             plan,
             job.origin_ns,
@@ -250,7 +250,7 @@ class Planning:
                 self._events.report(events.PLAN_STRETCHED, now_ns, text)
         self._record(job, plan, reason or plan.status.value, not reason, now_ns)
 
-    def _record(self, job: PlanJob, plan: Plan | None, status: str, accepted: bool, now_ns: int) -> None:
+    def _record(self, job: PlanJob, plan: StepPlan | None, status: str, accepted: bool, now_ns: int) -> None:
         count = len(plan.node_q2) if plan else 0
         nodes = [float(q2) for q2 in plan.node_q2] if plan else []
         self._recorder.record(

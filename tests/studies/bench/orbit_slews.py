@@ -31,7 +31,7 @@ from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_job import RESERVE, PointingJob, SlewRequest, slew
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
 from knightcube.gnc.guidance.three_axes.slew_task import (
     LEAST_TIME,
     AttitudeEnd,
@@ -130,7 +130,7 @@ def _recorded() -> int:
         task = task_of(case, case["T"], time_price=LEAST_TIME if least else None)
         begin = time.process_time()
         try:
-            plan = plan_slew(task)
+            plan = plan_task(task)
         except PlanningError as error:
             sys.stdout.write(f"{case['name']:28} refused: {error}\n")
             continue
@@ -152,7 +152,7 @@ def _random(runs: int, seed: int, with_cones: bool) -> int:
     for name, task in slews(runs, seed, with_cones):
         begin = time.process_time()
         try:
-            found.append(plan_slew(task))
+            found.append(plan_task(task))
         except PlanningError as error:
             failed += 1
             sys.stdout.write(f"{name}: {error}\n")

@@ -20,7 +20,7 @@ import numpy as np
 
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
+from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan
 from tests.knightcube.gnc.guidance.oracle import solve
 from tests.knightcube.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems
 
@@ -64,7 +64,7 @@ def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
     }
 
 
-def largest_ratio(problem: Problem, found: Plan) -> float:
+def largest_ratio(problem: Problem, found: StepPlan) -> float:
     """Return the largest of |I| and |q2| over their limits along the path."""
     motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001))
     current = float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit

@@ -43,7 +43,7 @@ from knightcube.gnc.guidance.three_axes.attitude_law import (
 )
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath
-from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_slew
+from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
 from knightcube.gnc.guidance.three_axes.slew_task import SlewTask, along, cones
 
 RESERVE = 0.8
@@ -146,7 +146,7 @@ def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -
     """
     for _ in range(_TRIALS):
         try:
-            path = plan_slew(task, near).path
+            path = plan_task(task, near).path
         except PlanningError:
             return None
         speed = float(np.linalg.norm(path.rate, axis=1).max())

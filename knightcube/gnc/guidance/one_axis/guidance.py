@@ -15,7 +15,7 @@ import numpy as np
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.one_axis.path import PathSample, PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, q2_of
-from knightcube.gnc.guidance.one_axis.vmc import Plan
+from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
@@ -122,7 +122,7 @@ class PathGuidance:
 
     def offer(
         self,
-        plan: Plan,
+        plan: StepPlan,
         origin_ns: int,
         now_ns: int,
         estimate_angle: float,
@@ -192,7 +192,7 @@ class PathGuidance:
             return "out of order: the path being flown is not older"
         return ""
 
-    def _unwanted(self, plan: Plan) -> str:
+    def _unwanted(self, plan: StepPlan) -> str:
         if self._target_q2 is None:
             return "no target is wanted"
         if not (abs(plan.target_q2 - self._target_q2) <= _SAME and self._reaches_target(plan.path)):

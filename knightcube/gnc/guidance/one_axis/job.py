@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
-from knightcube.gnc.guidance.one_axis.vmc import NODES, Plan, plan
+from knightcube.gnc.guidance.one_axis.vmc import NODES, StepPlan, plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class PlanJob:
     cost: PathCost = PathCost.HEAT
 
 
-def run(job: PlanJob) -> Plan:
+def run(job: PlanJob) -> StepPlan:
     """Return the plan for `job` (module-level, so that a worker can import it); raises PlanningError."""
     return plan(
         job.plant,

@@ -256,7 +256,7 @@ class PlanStatus(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class StepPlan:
     """A path and its properties.
 
     Attributes:
@@ -306,7 +306,7 @@ def plan(
     time_price: float | None = None,
     last: PolynomialPath | None = None,
     cost: PathCost = PathCost.HEAT,
-) -> Plan:
+) -> StepPlan:
     """Return the minimum-energy path between two states in `horizon` s, or in the shortest feasible time.
 
     Rates are body rates in rad/s. `reference` is q_r, beyond the range of q2 (5.10); `q2_limit` bounds |q2|;
@@ -389,7 +389,7 @@ def _assemble(
     asked: float,
     evaluations: int,
     end_rate: float,
-) -> Plan:
+) -> StepPlan:
     """Return the plan of `trial`. Raises PlanningError if it is not finite."""
     energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit
@@ -399,7 +399,7 @@ def _assemble(
     times = 0.5 * trial.horizon * (program.family.grid.rule.nodes + 1.0)
     prey = boundary.prey(trial.horizon).q2(times)
     kept = trial.horizon <= asked * (1.0 + 1e-9)
-    return Plan(
+    return StepPlan(
         path=PolynomialPath.through(node_q2, trial.horizon, end_rate=end_rate),
         status=PlanStatus.OPTIMAL if kept else PlanStatus.STRETCHED,
         horizon_asked=asked,

@@ -16,7 +16,10 @@ _LENGTH = 1e-3
 
 
 class Goal(IntEnum):
-    """The kinds of pointing goals; the values are those of the command packet."""
+    """The goals of pointing; the values are those of the command packet.
+
+    NADIR, VELOCITY and SUN take no numbers, INERTIAL a quaternion, GROUND latitude and longitude.
+    """
 
     NADIR = 0
     VELOCITY = 1

@@ -150,7 +150,7 @@ class SlewPlan:
     steps: int
 
 
-def plan_slew(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
+def plan_task(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
     """Return the best plan found. Raises PlanningError with the reason if there is none.
 
     `near` is the path of a similar task over the same horizon, from which the search is warm-started.
@@ -300,8 +300,17 @@ class SlewOrder:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrderedSlew:
-    """A task and its plan, which begins at `begin` s of the ephemeris; `compared` starts were planned."""
+    """A planned slew in orbit.
 
+    Attributes:
+        order: the order.
+        task: the task of the chosen start.
+        plan: the plan of the task.
+        begin: start of the slew, s of the ephemeris; from `knightcube.plan_slew` s after its `time`.
+        compared: number of start times that were planned.
+    """
+
+    order: SlewOrder
     task: SlewTask
     plan: SlewPlan
     begin: float
@@ -324,7 +333,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
     failed: PlanningError | None = None
     for begin in begins if order.window else ():
         try:
-            plan = plan_slew(task_at(coarse, ephemeris, float(begin)))
+            plan = plan_task(task_at(coarse, ephemeris, float(begin)))
         except PlanningError as error:
             failed = error
         else:
@@ -333,7 +342,7 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
     for begin in [begin for _, begin in sorted(compared)] or [first]:
         task = task_at(order, ephemeris, begin)
         try:
-            return OrderedSlew(task, plan_slew(task), begin, len(begins))
+            return OrderedSlew(order, task, plan_task(task), begin, len(begins))
         except PlanningError as error:
             failed = error
     assert failed is not None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
-from knightcube.gnc.guidance.one_axis.vmc import Plan, plan
+from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
 from tests.knightcube.gnc.guidance.oracle import Slew
 from tests.knightcube.gnc.guidance.shortest import shortest_time
 
@@ -30,7 +30,7 @@ class Problem:
     end_rate: float
     horizon: float
 
-    def planned(self, **options: Any) -> Plan:
+    def planned(self, **options: Any) -> StepPlan:
         """Return the planner's answer."""
         states = self.start_q2, self.start_rate, self.end_q2, self.end_rate
         return plan(self.plant, *states, self.horizon, **options)

@@ -12,7 +12,7 @@ from knightcube.errors import UsageError
 from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, GuidanceState, PathGuidance
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
-from knightcube.gnc.guidance.one_axis.vmc import Plan, plan
+from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
 from tests.knightcube.gnc.guidance.problems import KNIGHTCUBE
 
 SECOND = 1_000_000_000
@@ -21,17 +21,17 @@ START, TARGET = angle_of(0.1), 0.2
 
 
 @pytest.fixture(scope="module")
-def good() -> Plan:
+def good() -> StepPlan:
     return plan(KNIGHTCUBE, 0.1, 0.0, TARGET, 0.0, 10.0)
 
 
 @pytest.fixture(scope="module")
-def newer() -> Plan:
+def newer() -> StepPlan:
     return plan(KNIGHTCUBE, 0.1, 0.004, TARGET, 0.0, 11.0)
 
 
 @pytest.fixture
-def guidance(good: Plan) -> PathGuidance:
+def guidance(good: StepPlan) -> PathGuidance:
     """Return guidance that flies `good` since 100 s."""
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
@@ -39,7 +39,7 @@ def guidance(good: Plan) -> PathGuidance:
     return guidance
 
 
-def test_before_any_plan_there_is_nothing_to_fly(good: Plan) -> None:
+def test_before_any_plan_there_is_nothing_to_fly(good: StepPlan) -> None:
     guidance = PathGuidance(KNIGHTCUBE, RULES)
     assert guidance.sample(0) is None
     assert guidance.state(0) == GuidanceState.NONE
@@ -47,7 +47,7 @@ def test_before_any_plan_there_is_nothing_to_fly(good: Plan) -> None:
 
 
 def test_a_good_plan_is_flown_from_its_origin_and_held_after_its_end(
-    guidance: PathGuidance, good: Plan
+    guidance: PathGuidance, good: StepPlan
 ) -> None:
     now = 104 * SECOND
     assert guidance.sample(now) == good.path.sample(4 * SECOND)
@@ -59,7 +59,7 @@ def test_a_good_plan_is_flown_from_its_origin_and_held_after_its_end(
     assert guidance.state(111 * SECOND) == GuidanceState.HOLDING
 
 
-def test_a_newer_plan_replaces_the_older(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_newer_plan_replaces_the_older(guidance: PathGuidance, newer: StepPlan) -> None:
     verdict = guidance.offer(newer, 101 * SECOND, 101 * SECOND + SECOND // 5, START, 0.004)
     assert verdict.accepted
     assert verdict.reason == ""
@@ -74,7 +74,7 @@ def spoilt(path: PolynomialPath, row: int, value: float) -> PolynomialPath:
 
 
 def refused(
-    guidance: PathGuidance, offered: Plan, origin: float, now: float, angle: float, rate: float
+    guidance: PathGuidance, offered: StepPlan, origin: float, now: float, angle: float, rate: float
 ) -> str:
     """Return why `offered` is refused; the path being flown must be the old one still."""
     before = guidance.path
@@ -84,7 +84,7 @@ def refused(
     return verdict.reason
 
 
-def test_a_path_with_nan_or_infinity_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_path_with_nan_or_infinity_is_never_flown(guidance: PathGuidance, newer: StepPlan) -> None:
     for value in (math.nan, math.inf):
         bad = replace(newer, path=spoilt(newer.path, 3, value))
         assert "not finite" in refused(guidance, bad, 101, 101, START, 0.004)
@@ -99,7 +99,7 @@ def test_a_path_beyond_the_current_limit_is_never_flown(guidance: PathGuidance) 
     assert "limit is 0.148 A" in refused(guidance, hasty, 101, 101, START, 0.0)
 
 
-def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: Plan) -> None:
+def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer: StepPlan) -> None:
     """A ripple of Chebyshev degree 40, too fine for 24 nodes: nothing at most of them, amperes between."""
     count = 41
     columns = np.zeros((count, 3))
@@ -109,7 +109,7 @@ def test_current_is_watched_between_the_nodes_too(guidance: PathGuidance, newer:
     assert "limit is 0.148 A" in refused(guidance, replace(newer, path=rippled), 101, 101, START, 0.004)
 
 
-def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: Plan) -> None:
+def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: StepPlan) -> None:
     narrow = PathGuidance(KNIGHTCUBE, replace(RULES, q2_limit=0.2))
     narrow.aim(TARGET)
     swing = plan(KNIGHTCUBE, 0.19, 0.03, TARGET, 0.0, 12.0)
@@ -118,18 +118,20 @@ def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: Plan) -> None:
     assert narrow.offer(newer, 0, 0, START, 0.004).accepted
 
 
-def test_a_late_plan_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_late_plan_is_never_flown(guidance: PathGuidance, newer: StepPlan) -> None:
     assert "late" in refused(guidance, newer, 101, 102.001, START, 0.004)
     assert guidance.offer(newer, 101 * SECOND, 102 * SECOND, START, 0.004).accepted
 
 
-def test_a_plan_from_the_future_or_out_of_order_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_plan_from_the_future_or_out_of_order_is_never_flown(
+    guidance: PathGuidance, newer: StepPlan
+) -> None:
     assert "future" in refused(guidance, newer, 101.5, 101, START, 0.004)
     assert "out of order" in refused(guidance, newer, 100, 100.5, START, 0.004)
     assert "out of order" in refused(guidance, newer, 99.9, 100.5, START, 0.004)
 
 
-def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: PathGuidance, newer: StepPlan) -> None:
     assert "rad, the body" in refused(guidance, newer, 101, 101, START + 0.051, 0.004)
     assert "rad/s, the body" in refused(guidance, newer, 101, 101, START, 0.025)
     assert "the body" in refused(guidance, newer, 101, 101, math.nan, 0.004)
@@ -138,7 +140,7 @@ def test_a_plan_that_starts_elsewhere_is_never_flown(guidance: PathGuidance, new
 
 
 def test_a_plan_for_an_old_target_is_never_flown_and_the_old_path_is_flown_on(
-    guidance: PathGuidance, good: Plan, newer: Plan
+    guidance: PathGuidance, good: StepPlan, newer: StepPlan
 ) -> None:
     guidance.aim(0.3)
     assert "wanted is 0.3" in refused(guidance, newer, 101, 101, START, 0.004)
@@ -147,7 +149,7 @@ def test_a_plan_for_an_old_target_is_never_flown_and_the_old_path_is_flown_on(
     assert guidance.offer(newer, 101 * SECOND, 101 * SECOND, START, 0.004).accepted
 
 
-def test_a_hold_overrules_the_path_and_plans_made_before_it(guidance: PathGuidance, newer: Plan) -> None:
+def test_a_hold_overrules_the_path_and_plans_made_before_it(guidance: PathGuidance, newer: StepPlan) -> None:
     guidance.hold(0.3, 102 * SECOND)
     sample = guidance.sample(103 * SECOND)
     assert sample is not None
@@ -171,7 +173,7 @@ def test_an_impossible_hold_or_rule_is_refused(guidance: PathGuidance) -> None:
         AcceptanceRules(late_after=math.nan)
 
 
-def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not_end(good: Plan) -> None:
+def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not_end(good: StepPlan) -> None:
     for arrives in (True, False):
         guidance = PathGuidance(KNIGHTCUBE, RULES, arrives=arrives)
         guidance.aim(TARGET)
@@ -187,7 +189,7 @@ def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(gu
 
 
 def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_target(
-    guidance: PathGuidance, good: Plan
+    guidance: PathGuidance, good: StepPlan
 ) -> None:
     assert guidance.remains(103 * SECOND) == good.path.starting_at(-3 * SECOND)
     assert guidance.remains(111 * SECOND) is None

@@ -14,7 +14,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.path import FARTHEST
 from knightcube.gnc.guidance.one_axis.plant import angle_of, q2_of
-from knightcube.gnc.guidance.one_axis.vmc import FINE_NODES, Plan, PlanStatus, plan
+from knightcube.gnc.guidance.one_axis.vmc import FINE_NODES, PlanStatus, StepPlan, plan
 from tests.knightcube.gnc.guidance.oracle import solve
 from tests.knightcube.gnc.guidance.problems import (
     KNIGHTCUBE,
@@ -94,7 +94,7 @@ def test_an_impossible_price_is_refused(price: float) -> None:
         THESIS.planned(time_price=price)
 
 
-def rest_of(problem: Problem, found: Plan, share: float) -> tuple[Problem, int]:
+def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
     """Return the remaining path after `share` of it, from a little off it, and the time elapsed in ns."""
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)

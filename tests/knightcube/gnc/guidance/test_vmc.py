@@ -13,7 +13,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, angle_of, q2_of
-from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus, plan
+from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan, plan
 from knightcube.gnc.guidance.one_axis.vmc_program import (
     BoundaryStates,
     ImposedLimits,
@@ -36,13 +36,13 @@ from tests.pace import ordinary_seconds
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 
 
-def peak_between_nodes(problem: Problem, found: Plan) -> float:
+def peak_between_nodes(problem: Problem, found: StepPlan) -> float:
     """Return the largest |I| over the limit on 2001 even points of the flown path."""
     motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 2001))
     return float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
 
 
-def flown_energy(problem: Problem, found: Plan) -> float:
+def flown_energy(problem: Problem, found: StepPlan) -> float:
     """Return the integral of R I^2 of the flown path by the trapezoidal rule."""
     times = np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001)
     current = problem.plant.currents(*found.path.motion(times))
@@ -223,7 +223,7 @@ def test_staying_where_one_is_costs_nothing() -> None:
 def test_q2_is_kept_within_its_bound_where_the_optimum_would_pass_it() -> None:
     """Moving outwards the free optimum swings to 0.48; bounded at 0.465 it turns earlier and pays for it."""
 
-    def largest_q2(found: Plan) -> float:
+    def largest_q2(found: StepPlan) -> float:
         angle, *_ = found.path.motion(np.linspace(0.0, found.horizon, 999))
         return float(np.abs(np.sin(0.5 * angle)).max())
 

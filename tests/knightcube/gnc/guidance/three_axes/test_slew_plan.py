@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_slew
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_task
 from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, BoresightEnd, Cone
 from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
     flown,
@@ -26,7 +26,7 @@ from tests.studies.bench.orbit_slews import clearance, slews
 def test_a_slew_costs_what_the_optimum_does_and_its_dipoles_end_in_the_target(name: str) -> None:
     case = problem(name)
     task = task_of(case, case["T"])
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
     assert plan.energy <= 1.0005 * case["energy_J"]
     assert plan.peak <= 1.001
@@ -38,7 +38,7 @@ def test_a_slew_costs_what_the_optimum_does_and_its_dipoles_end_in_the_target(na
 def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> None:
     case = problem("T-knightcube-1u-iss-B90")
     task = task_of(case, 0.98 * case["T"], longest=2.0 * case["T"], nodes=16)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.status is SlewStatus.STRETCHED
     assert case["T"] * 0.999 < plan.horizon < 1.02 * case["T"]
     assert plan.peak <= 1.001
@@ -47,7 +47,7 @@ def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> No
 def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
     """Case 21 of `bench orbit_slews`: none of its guesses comes to a path over the asked time."""
     *_, (_, task) = slews(22, 1, False)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
     assert plan.horizon == pytest.approx(task.horizon)
     assert plan.peak <= 1.001
@@ -58,13 +58,13 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
     axis = np.array([0.0, 0.0, 1.0])
     direction = matrix(np.array(case["qf"])).T @ axis
     task = replace(task_of(case, case["T"]), end=lambda _: BoresightEnd(axis, direction, np.zeros(3)))
-    free = plan_slew(task)
+    free = plan_task(task)
     assert free.energy < case["energy_J"]
     assert matrix(flown(free, task)[:4]) @ direction == pytest.approx(axis, abs=1e-4)
     middle = free.path.references(np.array([0.5 * free.horizon])).quaternion[0]
     way = matrix(middle).T @ axis
     cone = Cone("Sun", axis, lambda times: np.broadcast_to(way, (len(times), 3)), np.radians(20.0))
-    around = plan_slew(replace(task, cones=(cone,)))
+    around = plan_task(replace(task, cones=(cone,)))
     assert around.clearance[0] >= 0.0
     assert around.energy > free.energy
 
@@ -72,7 +72,7 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
 def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
     """Case 0 of `bench orbit_slews --cones --seed 43`: without limits every path goes through one."""
     (_, task), *_ = slews(1, 43, True)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.status is SlewStatus.OPTIMAL
     assert plan.peak <= 1.001
     assert clearance(task, plan) >= 0.0
@@ -82,7 +82,7 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
 def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
     """Turns about the field led all guesses of the first two through cones, which were refused."""
     *_, (_, task) = slews(case + 1, seed, True)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.peak <= 1.001
     assert clearance(task, plan) >= 0.0
     end = task.end(plan.horizon)
@@ -93,7 +93,7 @@ def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int,
 def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
     """Case 27 of `bench orbit_slews --seed 44`: closed, its dipoles were 1.4 % over their limit."""
     *_, (_, task) = slews(28, 44, False)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     assert plan.status is SlewStatus.STRETCHED
     assert plan.peak <= 1.001
     assert plan.horizon < 1.2 * task.horizon
@@ -101,12 +101,12 @@ def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
 
 def test_a_plan_near_that_of_nearly_the_same_task_takes_a_tenth_of_the_steps() -> None:
     (_, task), *_ = slews(1, 43, True)
-    plan = plan_slew(task)
+    plan = plan_task(task)
     turned = replace(task, craft=replace(task.craft, torque=np.array([2e-9, -1e-9, 1e-9])))
-    again = plan_slew(turned, plan.path)
+    again = plan_task(turned, plan.path)
     assert again.horizon == pytest.approx(task.horizon)
     assert again.steps < 30
-    assert again.energy < 1.05 * plan_slew(turned).energy
+    assert again.energy < 1.05 * plan_task(turned).energy
     assert clearance(turned, again) >= 0.0
 
 
@@ -117,7 +117,7 @@ def test_a_refusal_says_what_the_ends_lie_in() -> None:
     there = matrix(task.end(20.0).quaternion)[0]  # type: ignore[union-attr]
     cone = Cone("Moon", axis, lambda times: np.tile(there, (len(times), 1)), 0.05)
     with pytest.raises(PlanningError, match=r"all of these, from 20 s on, end in .* cone of the Moon"):
-        plan_slew(replace(task, cones=(cone,)))
+        plan_task(replace(task, cones=(cone,)))
 
 
 def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
@@ -137,4 +137,4 @@ def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
         (replace(task, horizon=20.0, longest=24.0, nodes=8), "no slew within"),
     ):
         with pytest.raises(PlanningError, match=reason):
-            plan_slew(wrong)
+            plan_task(wrong)

@@ -1,0 +1,101 @@
+"""The planners of the public interface: a step about one axis, and a slew in three axes."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from knightcube import Goal, PointingTarget, SingleAxisPlant, plan_slew, plan_step
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.errors import PlanningError, UsageError
+
+PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, stiffness=1e-5, damping=2e-6)
+NADIR, SUN = PointingTarget(Goal.NADIR), PointingTarget(Goal.SUN)
+AT = datetime(2026, 3, 20, 12, 0, tzinfo=UTC)
+SLEW: dict[str, Any] = {
+    "inertia": np.diag([1.10e-3, 1.05e-3, 0.99e-3]),
+    "dipole_limit": [0.1, 0.1, 0.1],
+    "heat": [50.0, 50.0, 50.0],
+    "elements": (
+        "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05",
+        "2 99999  97.4640 337.4170 0011973 295.7805  64.3547 15.24067411    09",
+    ),
+    "time": AT,
+    "start": NADIR,
+    "goal": SUN,
+    "duration": 600.0,
+}
+
+
+def test_the_current_of_a_step_moves_the_body_to_its_end() -> None:
+    """The equation of motion is integrated here: J w' = n A B I cos(theta) - k theta - c w."""
+    found = plan_step(PLANT, start_angle=0.2, end_angle=-0.6, horizon=12.0, start_rate=0.01, end_rate=-0.02)
+
+    def flow(time: float, state: list[float]) -> list[float]:
+        angle, rate = state
+        current = PLANT.currents(*found.path.motion(np.array([min(time, 12.0 - 1e-9)])))[0]
+        torque = 2.916e-4 * current * np.cos(angle) - 1e-5 * angle - 2e-6 * rate
+        return [rate, torque / 1.05e-3]
+
+    end = solve_ivp(flow, (0.0, 12.0), [0.2, 0.01], rtol=1e-9, atol=1e-9).y[:, -1]
+    assert end == pytest.approx([-0.6, -0.02], abs=1e-5)
+    times = np.linspace(0.0, 12.0 - 1e-9, 4001)
+    current = PLANT.currents(*found.path.motion(times))
+    assert found.energy == pytest.approx(np.trapezoid(23.0 * current**2, times), rel=1e-4)
+    assert found.peak_current == pytest.approx(np.abs(current).max(), rel=1e-3)
+
+
+def test_a_step_minimises_the_selected_energy_and_a_time_cost_shortens_it() -> None:
+    step: dict[str, Any] = {"start_angle": 0.0, "end_angle": 0.5, "horizon": 12.0}
+    heat, supply = (plan_step(PLANT, **step, minimise=kind) for kind in ("heat", "supply"))
+    assert heat.energy < supply.energy
+    assert supply.supplied < heat.supplied
+    slow, fast = (plan_step(PLANT, **step, time_cost=cost) for cost in (0.001, 0.1))
+    assert fast.horizon < slow.horizon
+    with pytest.raises(PlanningError, match="horizon"):
+        plan_step(PLANT, start_angle=0.0, end_angle=0.5, horizon=-1.0)
+
+
+def test_a_slew_leads_from_nadir_to_the_sun_within_the_limits() -> None:
+    found = plan_slew(**SLEW, cones={"moon": np.radians(15.0)})
+    path, around = found.plan.path, found.task.along(np.array([0.0, found.plan.horizon]))
+    down = -around.position[0] / np.linalg.norm(around.position[0])
+    assert attitude_matrix(path.quaternion[0]) @ down == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
+    # The equinox is at 14:46 UTC, 2.6 h after the end: the ecliptic longitude of date is -0.107 deg, and that
+    # of J2000 is smaller by the precession of 26.2 years, 0.366 deg.
+    longitude, obliquity = np.radians([-0.473, 23.44])
+    sun = np.array([1.0, np.sin(longitude) * np.cos(obliquity), np.sin(longitude) * np.sin(obliquity)])
+    sun /= np.linalg.norm(sun)
+    assert attitude_matrix(path.quaternion[-1]) @ sun == pytest.approx([0.0, 0.0, 1.0], abs=2e-4)
+    assert np.abs(path.dipole).max() <= 0.1
+    assert found.plan.clearance[0] >= 0.0
+    assert found.begin == 0.0
+
+
+def test_a_slew_starts_at_the_best_time_of_its_window() -> None:
+    """The time may carry any zone; without one it is UTC."""
+    fixed = plan_slew(**SLEW)
+    zone = timezone(timedelta(hours=2))
+    later = plan_slew(**SLEW | {"time": AT.astimezone(zone)}, window=1200.0)
+    assert 0.0 <= later.begin <= 1200.0
+    assert later.plan.energy <= fixed.plan.energy
+    assert later.compared > 1
+    naive = plan_slew(**SLEW | {"time": AT.replace(tzinfo=None)})
+    assert naive.plan.energy == fixed.plan.energy
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        ({"goal": PointingTarget(Goal.OBJECT)}, "found in flight"),
+        ({"cones": {"venus": 0.1}}, "unknown exclusion cone 'venus'"),
+        ({"window": -1.0}, "window"),
+    ],
+)
+def test_an_impossible_slew_is_refused_with_the_reason(wrong: dict[str, Any], reason: str) -> None:
+    with pytest.raises(UsageError, match=reason):
+        plan_slew(**SLEW | wrong)
