@@ -38,29 +38,29 @@ from knightcube.vision.startracker.sky_map import BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
-# px, over which the slope of the lens is taken.
+# Step (px) of the numerical derivative of the lens.
 _STEP_PX = 0.5
-# Of a chi-square of 2: exceeded by chance once in 1000, and its median.
+# Chi-square with 2 degrees of freedom: the value exceeded by chance once in 1000, and the median.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
-# Deviations beyond which a star's pull is bounded while outliers are searched for.
+# Standard deviations beyond which the influence of a star is bounded in the search for outliers.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
-# Newton's steps to the common variance, from below; they end where the squares exceed by less.
+# Maximum number of Newton steps to the common variance, and the excess of the squares at which they end.
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknowns:
-    """What may be wrong beside the attitude, and is fitted with it.
+    """The parameters that are fitted together with the attitude.
 
     Attributes:
-        scale: whether the focal length may be.
-        bend: (6,) information about the lens's bend; (0,): it has none.
-        late: (n, 2) px by which a standard deviation of the shutter's line time displaces each star; (0, 2):
-            the line time is exact.
-        scatter: whether the places may have a common variance beside their own.
+        scale: whether the focal length is fitted.
+        bend: information about the bend of the lens (6,); (0,) if the lens is exact.
+        late: displacement of each star by a standard deviation of the line time of the shutter (n, 2), px;
+            (0, 2) if the line time is exact.
+        scatter: whether a common variance may be added to those of the positions.
     """
 
     scale: bool = False
@@ -77,13 +77,13 @@ class ImageFit:
     """The attitude and the quality of its fit.
 
     Attributes:
-        fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
-        scale: factor of the tangents x/z, y/z; 1 when it was held.
-        scale_sigma: relative standard deviation of the scale; 0 when it was held.
-        bend: (6,) of the lens (`lens_bend`); zeros when it has none.
-        delay: of the shutter beside the described one, in its standard deviations.
-        squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
-        agree: (n,) whether the star was used.
+        fix: the attitude from the stars that agree; its covariance is increased if they scatter too much.
+        scale: factor of the tangents x/z, y/z; 1 if it was fixed.
+        scale_sigma: relative standard deviation of the scale; 0 if it was fixed.
+        bend: bend of the lens (6,), see `sky_map`; zeros for an exact lens.
+        delay: error of the line time of the shutter, in its standard deviations.
+        squares: squared error of each star over its covariance (n,), with two degrees of freedom.
+        agree: whether the star was used (n,).
     """
 
     fix: AttitudeFix
@@ -103,17 +103,17 @@ def fit_in_image(
     start: FloatArray,
     unknowns: Unknowns = _NONE,
 ) -> ImageFit:
-    """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
+    """Return the attitude for which stars at `reference` appear at `points`.
 
     Args:
-        points: (n, 2) px.
-        covariance: (n, 2, 2) px^2 of each.
-        reference: (n, 3) unit vectors.
-        camera: with its lens.
-        start: (4,) an attitude near the answer, reference into camera.
-        unknowns: what is fitted beside the attitude.
+        points: measured positions (n, 2), px.
+        covariance: covariance of each position (n, 2, 2), px^2.
+        reference: directions of the stars (n, 3), unit vectors.
+        camera: the camera with its lens.
+        start: approximate attitude (4,), reference to camera.
+        unknowns: the parameters that are fitted together with the attitude.
 
-    Raises AttitudeError when the stars do not determine the parameters.
+    Raises AttitudeError if the stars do not determine the parameters.
     """
     seen = _Seen(camera.unit_vectors(points), _slopes(points, camera), covariance, reference, unknowns)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
@@ -133,7 +133,7 @@ def fit_in_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pose:
-    """Attitude (3, 3), scale, bend (6,), delay, and the covariance that weights of stars give them."""
+    """Attitude (3, 3), scale, bend (6,), delay, and the covariance of these parameters."""
 
     matrix: FloatArray
     scale: float
@@ -144,9 +144,10 @@ class _Pose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Stars seen at `observed` (n, 3), at `reference` (n, 3) in the sky.
+    """Stars observed at `observed` (n, 3), camera frame, whose catalogue directions are `reference` (n, 3).
 
-    `slopes` (n, 3, 2) are d(direction)/d(place), `covariance` (n, 2, 2) px^2 is of the places.
+    `slopes` (n, 3, 2) are the derivatives of direction by position, and `covariance` (n, 2, 2), px^2, that of
+    the positions.
     """
 
     observed: FloatArray
@@ -165,21 +166,21 @@ class _Seen:
 
     @property
     def before(self) -> FloatArray:
-        """The information about the last parameters, bend and delay, before any star is seen."""
+        """The prior information about the last parameters, bend and delay."""
         return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
 
     @property
     def camera(self) -> IntArray:
-        """The places of bend and delay among the parameters, after the turn and ln scale."""
+        """The numbers of bend and delay among the parameters, after the rotation and ln scale."""
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _Pose) -> float:
-        """Return how many parameters the stars gave: of bend and delay only what was not known before."""
+        """Return the number of parameters that the stars determine; those with a prior count in part."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
-        """Return the least of the squares times `weight` (n,)."""
+        """Return the pose that minimises the squares, weighted with `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
         matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
@@ -206,7 +207,7 @@ class _Seen:
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
     def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _Pose:
-        """Return a pose with the bend and the delay that are `held` (0, 1, 6 or 7,)."""
+        """Return a pose with the bend and delay in `held` (0, 1, 6 or 7,)."""
         bends = len(self.unknowns.bend)
         return _Pose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
@@ -222,7 +223,7 @@ class _Seen:
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
     def directions(self, pose: _Pose) -> FloatArray:
-        """Return the unit vectors (n, 3) seen, at mid-exposure, through the lens of a pose."""
+        """Return the observed unit vectors (n, 3) at mid-exposure, corrected for the lens of a pose."""
         seen = bent(stretched(self.observed, pose.scale), pose.bend)
         return seen - pose.delay * self.late if len(self.late) else seen
 
@@ -231,14 +232,14 @@ class _Seen:
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
 
     def missed(self, pose: _Pose) -> FloatArray:
-        """Return by how much (n, 3) each star is seen away from where a pose puts it."""
+        """Return the difference (n, 3) between observed and predicted direction of each star."""
         return self.directions(pose) - self.reference @ pose.matrix.T
 
 
 def _without_outliers(seen: _Seen, pose: _Pose, squares: FloatArray) -> tuple[_Pose, BoolArray]:
-    """Return the fit to the stars that agree, and which (n,) do.
+    """Return the fit to the stars that agree, and a mask (n,) of these stars.
 
-    One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
+    An outlier shifts all residuals: their spread is meaningless until its influence is bounded.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
@@ -248,7 +249,7 @@ def _without_outliers(seen: _Seen, pose: _Pose, squares: FloatArray) -> tuple[_P
 
 
 def _agreeing(squares: FloatArray) -> BoolArray:
-    """Return which stars (n,) scatter as the majority does; all if too few would remain to decide."""
+    """Return which stars (n,) scatter as the majority does, or all stars if too few would remain."""
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
@@ -263,7 +264,7 @@ def _scattered(seen: _Seen, pose: _Pose, agree: BoolArray) -> tuple[_Seen, _Pose
         excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
         if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
             break
-        # d(squares)/d(variance), the pose held: it is where they are least.
+        # The derivative of the squares by the variance, at a fixed pose, because the pose minimises them.
         variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)
@@ -271,7 +272,7 @@ def _scattered(seen: _Seen, pose: _Pose, agree: BoolArray) -> tuple[_Seen, _Pose
 
 
 def _slopes(points: FloatArray, camera: CameraModel) -> FloatArray:
-    """Return d(direction)/d(place) (n, 3, 2) at points (n, 2) px."""
+    """Return the derivatives (n, 3, 2) of direction by position at points (n, 2), px."""
     moved = [
         camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
         for offset in _STEP_PX * np.eye(2)
@@ -280,7 +281,7 @@ def _slopes(points: FloatArray, camera: CameraModel) -> FloatArray:
 
 
 def _whitener(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return matrices (n, 2, 3) that turn an error of a direction into two of variance one."""
+    """Return matrices (n, 2, 3) that transform a direction error into two components of unit variance."""
     spread = slopes @ np.linalg.cholesky(covariance)
     # The pseudo-inverse: the third direction, along the line of sight, carries no error.
     return np.asarray(np.linalg.inv(np.swapaxes(spread, -1, -2) @ spread) @ np.swapaxes(spread, -1, -2))
@@ -295,15 +296,26 @@ def attitude_by(
     fit: ImageFit,
     late: FloatArray,
 ) -> AttitudeFix:
-    """Return a solver's attitude from the stars at `points` (n, 2) px that agree in an image fit.
+    """Return the attitude by a solver of Wahba's problem, from the stars that agree in an image fit.
 
-    `covariance` (n, 2, 2) px^2, `reference` (n, 3) and `late` (n, 2) are theirs, `camera` is that of the
-    fit's start. Raises AttitudeError.
+    The image fit excludes the stars that disagree and determines the lens. The solver takes the directions of
+    the other stars, each with one error, the mean over both axes (Michalski 3.4).
+
+    Args:
+        solver: the solver.
+        points: measured positions (n, 2), px.
+        covariance: covariance of each position (n, 2, 2), px^2.
+        reference: directions of the stars (n, 3), unit vectors.
+        camera: the camera with which the fit was started.
+        fit: the image fit.
+        late: displacement of each star per standard deviation of the line time (n, 2), px, or (0, 2).
+
+    Raises AttitudeError if the stars do not determine the attitude.
     """
     if len(late):
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
+    # Off the boresight a pixel subtends a smaller angle: by cos^2 along the radius and by cos across it.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     return solver(seen, reference[fit.agree], sigma)

@@ -24,10 +24,14 @@ from knightcube.vision.startracker.identification.attitude_fit import scale_slop
 
 
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return where stars at `direction` (n, 3), unit vectors, appear to a camera at `velocity` (3,) m/s.
+    """Return the apparent directions (n, 3) of stars for a moving camera, as unit vectors.
 
-    The velocity is with respect to the solar system's barycentre, in the axes of the directions. Raises
-    ValueError unless it is finite and below the speed of light.
+    Args:
+        direction: unit vectors (n, 3) of the stars.
+        velocity: velocity of the camera (3,) relative to the barycentre of the solar system, m/s, in the axes
+            of the directions.
+
+    Raises ValueError unless the velocity is finite and below the speed of light.
     """
     beta = np.asarray(velocity, dtype=float) / SPEED_OF_LIGHT
     square = float(beta @ beta)
@@ -40,16 +44,16 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 BENDS = 6
-# Standard deviations of the tilt along x and y, as a part of the corner's tangent, and of the distortion
-# there by its two terms: 20 px of 1024, 3 and 1 %. The decentring is the product of tilt and distortion.
+# Standard deviations of the tilt along x and y, relative to the corner's tangent, and of the two terms of the
+# distortion in the corner: 20 px of 1024, 3 % and 1 %. The decentring is the product of tilt and distortion.
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
-# px, and a share of the radius: what is known better is taken to be known so well.
+# Minimum standard deviations of the image centre (px) and of the distortion (relative to the radius).
 _LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
 
 
 def usual_bend(camera: CameraModel) -> FloatArray:
-    """Return the information (6,) about the bend that is usual of lenses."""
+    """Return the information (6,), the reciprocal prior variances, about the bend of a typical lens."""
     corner = float(np.tan(camera.half_diagonal))
     first, second = _DISTORTION
     off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
@@ -57,9 +61,9 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 
 
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
-    """Return the information (6,) about the bend of a lens known so well; (0,) of one that is exact.
+    """Return the information (6,) about the bend of a lens of known accuracy; (0,) for an exact lens.
 
-    An axis that is off the described one turns all stars alike, which is the mounting's, and tilts the lens.
+    An error of the optical axis rotates all stars alike, which counts as mounting error, and tilts the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)
@@ -71,7 +75,7 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
 
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return the unit vectors (n, 3) of what a lens of this `bend` (6,) shows at `direction` (n, 3)."""
+    """Return unit vectors `direction` (n, 3) corrected for the `bend` (6,) of the lens."""
     if not bend.any():
         return direction
     out = direction + bend_slope(direction) @ bend
@@ -79,7 +83,7 @@ def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:
-    """Return by how much directions (n, 3) move per unit of tilt, decentring and distortion, (n, 3, 6)."""
+    """Return the derivatives (n, 3, 6) of directions `seen` (n, 3) by tilt, decentring and distortion."""
     tangent = seen[:, :2] / seen[:, 2:]
     square = np.sum(tangent**2, axis=1, keepdims=True)
     # Tilt and distortion stretch a tangent u along itself, by u_x, u_y, |u|^2 and |u|^4.
@@ -143,9 +147,14 @@ _BEND_STEPS = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkyMap:
-    """A camera with its attitude (4,), ICRS to camera, and the bend (6,) of its lens.
+    """The conversion between pixels and directions for a camera of known attitude.
 
-    `velocity` (3,) m/s of the camera: directions of the sky are then free of aberration.
+    Attributes:
+        camera: the camera and its lens.
+        quaternion: attitude (4,), ICRS to camera.
+        bend: remaining lens errors (6,); zeros for an exact lens.
+        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration; None: no
+            correction.
     """
 
     camera: CameraModel
@@ -154,13 +163,13 @@ class SkyMap:
     velocity: FloatArray | None = None
 
     def directions(self, points: FloatArray) -> FloatArray:
-        """Return the unit vectors (n, 3), ICRS, of pixels (n, 2)."""
+        """Return the directions (n, 3), ICRS unit vectors, of pixels (n, 2)."""
         seen = bent(self.camera.unit_vectors(points), self.bend) @ attitude_matrix(self.quaternion)
-        # Apparent to a camera that flies the other way: right to the square of v/c, 0.002".
+        # The inverse is the aberration for the opposite velocity: accurate to (v/c)^2, 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
-        """Return the pixels (n, 2) of unit vectors (n, 3), ICRS; NaN of what the camera does not see."""
+        """Return the pixels (n, 2) of unit vectors (n, 3), ICRS; NaN for directions that are not imaged."""
         if self.velocity is not None:
             directions = apparent(directions, self.velocity)
         wanted = self.camera.project(directions @ attitude_matrix(self.quaternion).T)
@@ -172,11 +181,12 @@ class SkyMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShortTrails:
-    """How stars that are nearly points move over the exposure.
+    """The motion of stars over an exposure during which the camera rotates by a few pixels.
 
     Attributes:
-        turn: (3,) rad, of the camera over the exposure, its axes.
-        delay: exposures from one row's to the next's, and `delay_sigma`, its standard deviation.
+        turn: rotation of the camera over the exposure (3,), rad, camera axes.
+        delay: delay between consecutive rows of a rolling shutter, in exposure times.
+        delay_sigma: standard deviation of `delay`.
     """
 
     turn: FloatArray
@@ -184,10 +194,10 @@ class ShortTrails:
     delay_sigma: float = 0.0
 
     def of(self, camera: CameraModel, direction: FloatArray) -> FloatArray:
-        """Return by how much stars at `direction` (n, 3), camera axes, move: (n, 2) px."""
+        """Return the displacements (n, 2), px, over the exposure of stars at `direction` (n, 3)."""
         moved = 0.5 * np.cross(direction, self.turn)
         return np.nan_to_num(camera.project(direction + moved) - camera.project(direction - moved))
 
     def late(self, camera: CameraModel, points: FloatArray) -> FloatArray:
-        """Return by how much stars at `points` (n, 2) px are off for each exposure of delay: (n, 2) px."""
+        """Return the displacements (n, 2), px, of stars at `points` (n, 2) per exposure time of delay."""
         return self.of(camera, camera.unit_vectors(points)) * (points[:, 1:] - camera.centre[1])

@@ -35,27 +35,27 @@ class SolveStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSolution:
-    """Attitude at mid-exposure, and the rate where the stars are streaks.
+    """The attitude of one frame at mid-exposure, and the rate if the stars are streaks.
 
     Attributes:
-        status: the fields below `camera` hold for SOLVED only.
-        reason: why it is not solved, in a sentence; empty when it is.
-        kind: what the frame shows.
-        points: (n, 2) px at mid-exposure of the points taken for stars, brightest first.
-        covariance: (n, 2, 2) px^2.
-        late: (n, 2) px by which one standard deviation of the shutter's line time displaces the points;
-            (0, 2) where it is exact.
-        camera: with the focal length fitted to the stars, if it was free.
-        star: (n,) numbers of guide stars, -1 for none.
-        expected: (n, 2) px, where attitude, lens and shutter put the guide star; NaN for none.
-        fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
-        scale_sigma: relative standard deviation of the focal length; 0 where it was given.
-        bend: (6,) of a lens that is not exact, as the stars show it (`lens_bend`), else zeros.
-        log10_false_alarm: of the probability that a frame of random points would have been solved.
-        tracked: whether the stars were found near the prior attitude.
-        motion: from the streaks, camera frame; None for points.
-        mirrored: whether the picture shows the sky as a mirror does; `fix` is then of the picture with left
-            and right exchanged about the optical axis, `points` and `expected` are of the picture as it came.
+        status: the attributes from `star` on are valid for SOLVED only.
+        reason: why the frame was not solved, in one sentence; empty if it was.
+        kind: whether the frame shows points or streaks.
+        camera: the camera, with the focal length fitted to the stars if it was free.
+        points: positions of the detected stars at mid-exposure (n, 2), px, the brightest first.
+        covariance: of the positions (n, 2, 2), px^2.
+        late: displacement of the points by one standard deviation of the line time of the shutter (n, 2), px;
+            (0, 2) if the line time is exact.
+        star: numbers of the guide stars (n,); -1 for a point without one.
+        expected: predicted positions of the guide stars (n, 2), px; NaN for a point without one.
+        fix: attitude, ICRS to camera, and its covariance; the scalar part of the quaternion is not negative.
+        scale_sigma: relative standard deviation of the focal length; 0 if it was given.
+        bend: fitted errors of an inexact lens (6,), see `sky_map`; zeros for an exact lens.
+        log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
+        tracked: whether the stars were identified near the prior attitude.
+        motion: motion from the streaks, camera frame; None for points.
+        mirrored: whether the image shows the mirrored sky. `fix` is then the attitude of the image with left
+            and right exchanged about the optical axis; `points` and `expected` refer to the original image.
     """
 
     status: SolveStatus
@@ -77,35 +77,35 @@ class FrameSolution:
 
     @property
     def matched(self) -> IntArray:
-        """Which of the points (m,) are guide stars."""
+        """The numbers (m,) of the points that are guide stars."""
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with a covariance (3, 3) rad^2 added to its attitude's, where it has one."""
+        """Return the solution with `by` (3, 3), rad^2, added to the covariance of its attitude, if any."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
 
     def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
-        """Return the way from pixels to the sky and back; None when not solved.
+        """Return the conversion between pixels and directions; None if the frame was not solved.
 
-        `velocity` (3,) m/s is that which the frame was solved with.
+        `velocity` (3,), m/s, is the velocity with which the frame was solved.
         """
         return None if self.fix is None else SkyMap(self.camera, self.fix.quaternion, self.bend, velocity)
 
 
 NODES = (0.0, 0.25, 0.75, 1.0)
-"""Parts of the exposure at which the turn from its middle is evaluated."""
+"""Fractions of the exposure at which the rotation since mid-exposure is evaluated."""
 MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """How a frame's attitude averages the attitudes during its exposure.
+    """The weights with which the attitude of a frame averages the attitudes during its exposure.
 
     Attributes:
-        weights: of the turns at `NODES`; the remainder to one is the weight of the middle.
-        noise_share: variance by white angular acceleration, over q T^3.
+        weights: weights of the rotations at `NODES`; the remainder to one is the weight of mid-exposure.
+        noise_share: variance due to white angular acceleration, in units of q T^3.
     """
 
     weights: tuple[float, float, float, float]
@@ -115,13 +115,13 @@ class Weighting:
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
 """Points: the mean over the exposure, by Simpson's rule."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
-"""Streaks fitted at a constant rate, whose ends decide, or measured at their ends alone."""
+"""Streaks fitted at a constant rate, which their ends determine, or measured at their ends alone."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Streaks fitted with an acceleration: the middle of the parabola nearest to the motion."""
+"""Streaks fitted with an acceleration: the middle of the parabola that fits the motion best."""
 
 
 def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
-    """Return the weighting of a frame with such motion."""
+    """Return the weighting of a frame with this motion."""
     if motion.status not in MOVED:
         return MEAN
     fitted = isinstance(motion, MotionResult) and motion.rate_model == "accelerating"
@@ -131,24 +131,24 @@ def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
 def middle_covariance(
     weighting: Weighting, turns: FloatArray, angular_acceleration_psd: FloatArray, exposure: float
 ) -> FloatArray:
-    """Return the covariance (3, 3) rad^2 of the measured attitude about that of mid-exposure.
+    """Return the covariance (3, 3), rad^2, of the measured attitude relative to that at mid-exposure.
 
     Args:
-        weighting: of the frame.
-        turns: (4, 3) rad, by the estimate, from mid-exposure to each of `NODES`.
-        angular_acceleration_psd: (3, 3) rad^2/s^3, density of unmodelled white angular acceleration.
-        exposure: s.
+        weighting: weighting of the frame.
+        turns: estimated rotations from mid-exposure to each of `NODES` (4, 3), rad.
+        angular_acceleration_psd: density of unmodelled white angular acceleration (3, 3), rad^2/s^3.
+        exposure: exposure time, s.
     """
     known = np.asarray(weighting.weights) @ turns
     return np.outer(known, known) + angular_acceleration_psd * weighting.noise_share * exposure**3
 
 
 def timing_covariance(motion: MotionResult) -> FloatArray:
-    """Return the covariance (3, 3) rad^2 of the turn that all stars of a frame share as error.
+    """Return the covariance (3, 3), rad^2, of the rotation error that all stars of a frame share.
 
-    If the rate changes, only the light along a streak shows where its middle was. A wrong acceleration makes
-    all stars early or late by the same time, which no number of stars averages out. The best star's
-    uncertainty along its path bounds it.
+    If the rate changes, only the light along a streak determines its position at mid-exposure. A wrong
+    acceleration makes all stars early or late by the same time, which does not average out over the stars.
+    The uncertainty of the best star along its path bounds this error.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))

@@ -1,8 +1,8 @@
 """The steps from stars in a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
 
-Points are measured by `detection`; of streaks, the places of their stars at mid-exposure serve as points.
-Identification searches near a prior attitude first, where there is one, then the whole sky. The attitude is
-that of mid-exposure.
+Points are measured by `detection`; for streaks, the positions of their stars at mid-exposure serve as points.
+Identification searches near a prior attitude first, if there is one, then in the whole sky. The result is the
+attitude at mid-exposure.
 """
 
 from __future__ import annotations
@@ -37,45 +37,45 @@ from knightcube.vision.streaks.maximum_likelihood.course import Course
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
-# px: error of a place from unknown distortion of the lens or the star's colour.
+# Position error (px) due to residual distortion of the lens or to the colour of the star.
 _LEAST_SIGMA_PX = 0.005
-# px: the same of a lens that is stated to be exact.
+# Position error (px) due to the colour of the star, for a lens of stated accuracy.
 _COLOUR_PX = 0.002
-# Of what the stars are wider than described: how far the middle of all may be off (campaign `resting`).
+# Common centroid error, as a fraction of the excess PSF width (campaign `resting`).
 _SHAPE_DOUBT = 0.05
-# px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
-# the room of their places' errors, in which fewer stars agree by chance.
+# Position error (px) of an uncalibrated lens in identification. It is tried second: most pictures need only
+# the errors of their positions, within which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
-# px, across the boresight and at the edge about it: what such a lens and the air leave beyond the fit of the
-# lens. Photographs differ from other solvers' attitudes by this (bench `untold_lens`).
+# Attitude error of an uncalibrated lens and of the air beyond the fit of the lens, in px across the boresight
+# and at the edge about it. Attitudes of photographs by other solvers differ by this (bench `untold_lens`).
 _UNTOLD_LENS_PX = 0.25
-# Standard deviations of light; fainter stars of a motion are not identified.
+# Minimum significance of a streaked star (standard deviations of its light) for identification.
 _LEAST_SIGNIFICANCE = 5.0
-# px, standard deviation from which a star has no place: both ends of its streak may lie outside of the frame.
+# Standard deviation (px) above which a star has no usable position: its streak may end outside of the frame.
 _PLACELESS_PX = 5.0
-# Chi-square of 3, exceeded by chance once in 100,000: an attitude farther from the prior is another's.
+# Limit of agreement with the prior: chi-square with 3 degrees of freedom, exceeded once in 100,000 by chance.
 _NEAR = 25.9
-# Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
+# Number of stars that tracking looks for, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
 PRIOR_SIGMAS = 4.0
-# Above the larger radius a search of the whole frame is cheaper.
+# Limits of the search radius (px); above the larger one, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 
 
 @dataclass(frozen=True, slots=True)
 class SolveSettings:
-    """How a frame is solved.
+    """Settings and methods of the star tracker.
 
     Attributes:
-        detection: settings for points.
-        likelihood: settings for the streaks of a picture; a flight's job names its own estimator.
-        identification: settings of the default method.
-        method: another method of identification.
-        attitude: a solver of directions for the attitude; None takes it from the fit in the image.
-        velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
-        lens: how well a lens of certain focal length is known; None: exactly.
-        untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
-            else the focal length is all that is uncertain.
+        detection: settings of the detection of points.
+        likelihood: settings of the estimator of streaks in a picture; in flight the job has its own.
+        identification: settings of the default identification method.
+        method: another identification method; None: the default.
+        attitude: a solver of Wahba's problem for the attitude; None: the fit in the image.
+        velocity: velocity of the camera relative to the barycentre (3,), m/s, for aberration; None: no
+            correction.
+        lens: accuracy of a lens of known focal length; None: exact.
+        untold_lens: whether a lens of uncertain focal length may also have a displaced axis and distortion.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -90,7 +90,7 @@ class SolveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudePrior:
-    """Predicted attitude (4,), ICRS to camera, and its standard deviation about each axis, rad."""
+    """A predicted attitude (4,), ICRS to camera, and its standard deviation about each axis, rad."""
 
     quaternion: FloatArray
     sigma: float
@@ -98,9 +98,9 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component.
+    """A predicted rate (3,), rad/s, camera axes, and the standard deviation of each component.
 
-    `course`: how the camera turned over the exposure, where that is known.
+    `course` is the rotation of the camera over the exposure, if it is known.
     """
 
     rate: FloatArray
@@ -134,7 +134,7 @@ def solve_places(
     prior: AttitudePrior | None = None,
     flux: FloatArray | None = None,
 ) -> FrameSolution:
-    """Return the attitude from places (n, 2) px of stars, brightest first, and covariances (n, 2, 2)."""
+    """Return the attitude from positions (n, 2), px, of stars, the brightest first, and their covariances."""
     seen = FrameSolution(
         SolveStatus.NO_STARS, "no star stands above the noise", kind, camera, points, covariance
     )
@@ -149,7 +149,7 @@ def solve_motion(
     settings: SolveSettings,
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude at mid-exposure of a frame of streaks, from its motion and the stars it placed."""
+    """Return the attitude at mid-exposure of a frame of streaks, from the motion and its star positions."""
     seen = FrameSolution(
         SolveStatus.NO_STARS,
         f"the streaks give no motion: {motion.status.value}",
@@ -183,9 +183,10 @@ def points_near(
     prior: AttitudePrior,
     trails: ShortTrails | None = None,
 ) -> Detections:
-    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior.
+    """Return the stars near the predicted positions of the brightest guide stars.
 
-    `trails`: how they move over the exposure, where that is known and a few px.
+    If the prior is too uncertain, no stars are returned. `trails` is the motion of the stars over the
+    exposure, if it is known and at most a few pixels.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
@@ -207,9 +208,9 @@ def solve_near(
     prior: AttitudePrior,
     trails: ShortTrails | None = None,
 ) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted places alone; None if they do not agree.
+    """Return the attitude from stars near their predicted positions; None if they do not agree.
 
-    `trails`: as of `points_near`.
+    `trails` is as in `points_near`.
     """
     found = points_near(pixels, camera, sky, settings, prior, trails)
     if not len(found):
@@ -229,7 +230,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude found near the prior is near it: it was tested against chance only there."""
+    """Return whether an attitude agrees with the prior, near which alone it was tested against chance."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
@@ -238,10 +239,10 @@ def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
 
 
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
-    """Return a solution that claims no more than the shape of the stars allows.
+    """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
-    Where they are wider than described, by a tail of the lens or light astray, their middle is a matter of
-    which light is weighed: all places are off alike.
+    The centroid of a star with a tail, due to the lens or to stray light, depends on the weights of its
+    pixels: all positions have the same error.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
@@ -258,7 +259,7 @@ def _identify(
     settings: SolveSettings,
     prior: AttitudePrior | None,
 ) -> FrameSolution:
-    """Return `seen` with its stars identified, near the prior first, then in the whole sky."""
+    """Return `seen` with its stars identified, first near the prior, then in the whole sky."""
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
@@ -270,19 +271,19 @@ def _identify(
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
     options = settings.identification
     if seen.kind is FrameKind.STREAKS:
-        # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
+        # The rate of a mirrored picture would be wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
     if found.status is Status.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
         found = identify(star_field(seen, flux, scale, _UNTOLD_SIGMA_PX), sky, options)
     if found.mirrored:
-        # Fitted as it should be, reported as it came.
+        # The mirrored positions are fitted, and the original ones reported.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
     return _with_attitude(seen, found, sky, settings)
 
 
 def _mirrored(seen: FrameSolution) -> FrameSolution:
-    """Return `seen` with left and right of its places exchanged about the optical axis."""
+    """Return `seen` with left and right of its positions exchanged about the optical axis."""
     axis = np.array([2.0 * seen.camera.centre[0], 0.0])
     turned = np.array([-1.0, 1.0])
     return replace(
@@ -297,11 +298,11 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
 def star_field(
     seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
 ) -> StarField:
-    """Return the directions of the points of `seen`, with their errors of `least` px or more, to identify."""
+    """Return the points of `seen` as directions for identification, with errors of at least `least` px."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
-    # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
+    # Off the boresight a pixel subtends a smaller angle: by cos^2 along the radius and by cos across it.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)
@@ -311,7 +312,7 @@ def star_field(
 def _with_attitude(
     seen: FrameSolution, found: Identification, sky: SkyIndex, settings: SolveSettings
 ) -> FrameSolution:
-    """Return `seen` with the identified stars and the attitude fitted to their places in the image."""
+    """Return `seen` with the identified stars and the attitude fitted to their positions in the image."""
     if found.status is not Status.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
@@ -359,18 +360,18 @@ def _with_attitude(
 def _known_bend(
     camera: CameraModel, settings: SolveSettings, free_scale: bool, free_lens: bool
 ) -> FloatArray:
-    """Return the information (6,) about the lens's bend before the stars are seen, (0,) where it has none."""
+    """Return the prior information (6,) about the bend of the lens; (0,) if no bend is fitted."""
     if free_lens:
         return usual_bend(camera)
     return np.zeros(0) if free_scale or settings.lens is None else known_bend(camera, settings.lens)
 
 
 def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
-    """Return the camera with the focal length, and the distortion of a pinhole, that were found."""
+    """Return the camera with the fitted focal length, and a pinhole with the fitted distortion."""
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
         return camera
-    # Of the tangent's square, where `distortion` is of the corner's.
+    # `distortion` is relative to the square of the corner's tangent, k1 to the square of the tangent.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)
@@ -379,7 +380,7 @@ def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
 
 
 def lens_floor(camera: CameraModel) -> FloatArray:
-    """Return the covariance (3, 3) rad^2 that a lens which is not calibrated adds to an attitude."""
+    """Return the covariance (3, 3), rad^2, that an uncalibrated lens adds to an attitude."""
     across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
     return np.diag((_UNTOLD_LENS_PX * np.array([across, across, about])) ** 2)
 
