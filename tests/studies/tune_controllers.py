@@ -24,7 +24,7 @@ from knightcube.gnc.control.one_axis.lq_tracker import AngleController
 from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import angle_of
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
-from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD
+from tests.support.thread_loop import BELIEVED, PERIOD
 
 TRUE = replace(BELIEVED, stiffness=1e-5, damping=2e-6)
 RELEASE = (angle_of(0.2), -0.1)

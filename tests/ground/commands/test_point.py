@@ -15,7 +15,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of
-from tests.knightcube.gnc.guidance.three_axes.orbits import JULIAN_DATE, circular
+from tests.support.circular_orbits import JULIAN_DATE, circular
 
 ORBIT = circular(700.0)
 TIME = np.array([300.0])

@@ -40,7 +40,8 @@ from knightcube.gnc.guidance.three_axes.slew_task import (
     along,
     cones,
 )
-from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
+from tests.studies.campaigns.orbit_pointing_flight import AXES, TORQUE, WEIGHTS
+from tests.support.recorded_slews import (
     FILE,
     flown,
     matrix,
@@ -48,7 +49,6 @@ from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
     recorded,
     task_of,
 )
-from tests.studies.campaigns.orbit_pointing_flight import AXES, TORQUE, WEIGHTS
 
 CRAFT = {
     "1U": (

@@ -1,7 +1,7 @@
 """Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N] [--picture PNG]`.
 
 Random slews over the testbed's range, with thread, disturbance and moving ends
-(tests.knightcube.gnc.guidance.problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
+(tests.support.step_problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
 and too short ones, which are stretched.
 Solve times are of this process's processor time; cost is compared with the collocation oracle at the same
 horizon; limits are watched on 4001 points of the path.
@@ -21,8 +21,8 @@ import numpy as np
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan
-from tests.knightcube.gnc.guidance.oracle import solve
-from tests.knightcube.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems
+from tests.support.collocation_oracle import solve
+from tests.support.step_problems import STEPS, THESIS, Problem, feasible_problems
 
 FEASIBLE = (1.1, 2.5)
 TOO_SHORT = (0.6, 0.99)

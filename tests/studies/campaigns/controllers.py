@@ -13,7 +13,7 @@ Two powers are given (`knightcube.gnc.coil_power`): V |I|, which the chopped coi
 minimise.
 
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
-command and held, by direct collocation (tests.knightcube.gnc.guidance.oracle). What reaches its targets later
+command and held, by direct collocation (tests.support.collocation_oracle). What reaches its targets later
 may lie below.
 """
 
@@ -31,9 +31,9 @@ from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from sim_hal.settings import Simulation
-from tests.knightcube.gnc.guidance.oracle import Slew, solve
 from tests.scenario.flights import demo_config, demo_world, fly, thesis_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.collocation_oracle import Slew, solve
 
 DURATION = 700.0
 REACHED_AFTER = 10.0

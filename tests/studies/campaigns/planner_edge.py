@@ -2,7 +2,7 @@
 
 Start and target lie at |q2| of 0.60 to 0.68; a known thread of 0 to 2e-5 N m/rad pulls up to ten times harder
 than the coil can; the horizon is 5 to 60 s. Each slew is planned, and solved by the tests' own collocation
-(`tests.knightcube.gnc.guidance.oracle`), which shares nothing with the planner. A slew counts as failed when
+(`tests.support.collocation_oracle`), which shares nothing with the planner. A slew counts as failed when
 the collocation finds a path within |q2| <= 0.68 over the asked horizon and the planner none, as dear when the
 planner's path costs more than 1.001 times the collocation's, and as late when it is stretched although the
 collocation keeps the horizon.
@@ -20,9 +20,9 @@ import numpy as np
 
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from tests.knightcube.gnc.guidance.oracle import solve
-from tests.knightcube.gnc.guidance.problems import KNIGHTCUBE, Problem
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.collocation_oracle import solve
+from tests.support.step_problems import KNIGHTCUBE, Problem
 
 INTERVALS = 1200
 DEAR = 1.001

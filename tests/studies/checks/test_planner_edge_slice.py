@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from knightcube.gnc.guidance.one_axis.vmc import PlanStatus
-from tests.knightcube.gnc.guidance.problems import Problem
 from tests.studies.campaigns.planner_edge import PLANT, cases, run, verdict
+from tests.support.step_problems import Problem
 
 
 def test_no_slew_with_a_path_is_refused_or_dear() -> None:

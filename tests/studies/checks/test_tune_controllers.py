@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from knightcube.reference.control import PidController, PidSettings
-from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD
 from tests.studies.campaigns import controllers
 from tests.studies.tune_controllers import OVERSHOOT, SETTLED_S, fly
+from tests.support.thread_loop import BELIEVED, PERIOD
 
 
 def test_the_flown_pid_keeps_the_criterion_with_less_power_than_three_poles() -> None:

@@ -13,7 +13,14 @@ from knightcube.gnc.control.three_axes.pointing_law import FAR, SLOW
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
 from knightcube.gnc.guidance.three_axes.attitude_law import references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LAW, LIMIT, ORBIT, STEP, WEIGHTS
+from tests.knightcube.gnc.control.three_axes.test_pointing_law import (
+    INERTIA,
+    LAW,
+    LIMIT,
+    ORBIT,
+    STEP,
+    WEIGHTS,
+)
 
 NADIR = PointingTarget(Goal.NADIR, roll=0.0)
 NEAR, AWAY = np.array([0.5 * FAR, 0.0, 0.0]), np.array([0.0, 1.2 * FAR, 0.0])

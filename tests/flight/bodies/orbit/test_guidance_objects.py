@@ -20,7 +20,7 @@ from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, following, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.tracking.tracker import ObjectTracker, TrackSettings
-from tests.knightcube.gnc.tracking.passes import PIXEL, sightings
+from tests.support.object_passes import PIXEL, sightings
 
 BORESIGHT = np.array([0.0, -1.0, 0.0])
 SENSOR = Sensor(BORESIGHT, np.radians(10.0))

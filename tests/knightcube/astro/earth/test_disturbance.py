@@ -11,8 +11,8 @@ from knightcube.gnc.control.three_axes.pointing_job import slew
 from knightcube.gnc.guidance.three_axes.slew_task import along
 from sim_hal.worlds.free_body.craft import CRAFTS, box
 from sim_hal.worlds.free_body.pressure import drag
-from tests.knightcube.gnc.control.three_axes.test_pointing import ORBIT
-from tests.knightcube.gnc.control.three_axes.test_slew_table import AXES, BEGIN, NADIR, WISH
+from tests.knightcube.gnc.control.three_axes.test_pointing_job import AXES, BEGIN, NADIR, WISH
+from tests.knightcube.gnc.control.three_axes.test_pointing_law import ORBIT
 
 ARM = np.array([0.012, -0.009, 0.013])
 """m."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.knightcube.gnc.guidance.oracle import Slew, solve
-from tests.knightcube.gnc.guidance.problems import known_optima
+from tests.support.collocation_oracle import Slew, solve
+from tests.support.step_problems import known_optima
 
 
 def test_the_oracle_reproduces_the_published_optima_to_1e_4() -> None:

@@ -17,7 +17,7 @@ from knightcube.gnc.tracking.tracker import (
     tides,
     update,
 )
-from tests.knightcube.gnc.tracking.passes import PIXEL, Pass, a_pass, sightings
+from tests.support.object_passes import PIXEL, Pass, a_pass, sightings
 
 _SIGMA, _ATTITUDE = 0.1 * PIXEL, 0.05 * PIXEL
 _PERIOD = 1.0

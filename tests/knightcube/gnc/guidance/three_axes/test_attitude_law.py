@@ -31,7 +31,7 @@ from knightcube.gnc.guidance.three_axes.attitude_law import (
     sun,
     velocity,
 )
-from tests.knightcube.gnc.guidance.three_axes.orbits import JULIAN_DATE, RADIUS, RATE, circular
+from tests.support.circular_orbits import JULIAN_DATE, RADIUS, RATE, circular
 
 ORBIT = circular(3000.0)
 X, Y, Z = np.eye(3)

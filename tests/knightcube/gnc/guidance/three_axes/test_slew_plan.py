@@ -10,14 +10,14 @@ import pytest
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_task
 from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, BoresightEnd, Cone
-from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
+from tests.studies.bench.orbit_slews import clearance, slews
+from tests.support.recorded_slews import (
     flown,
     matrix,
     off_degrees,
     problem,
     task_of,
 )
-from tests.studies.bench.orbit_slews import clearance, slews
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCra
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
 from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, SlewTask
 
-FILE = Path(__file__).resolve().parents[5].parent / "shared" / "data" / "optimum_orbit.json"
+FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum_orbit.json"
 
 
 @cache

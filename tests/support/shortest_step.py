@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from tests.knightcube.gnc.guidance.oracle import Slew
+from tests.support.collocation_oracle import Slew
 
 _STEP = 0.05
 _LONGEST = 24.0

@@ -34,7 +34,7 @@ from knightcube.gnc.control.three_axes.pointing_table import (
     step_costs,
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
-from tests.knightcube.gnc.guidance.three_axes.orbits import circular
+from tests.support.circular_orbits import circular
 
 ORBIT = circular(7_500.0)
 INERTIA = np.diag([1.10e-3, 1.05e-3, 0.99e-3])

@@ -12,11 +12,11 @@ import pytest
 
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
-from tests.knightcube.gnc.guidance.oracle import Slew
-from tests.knightcube.gnc.guidance.shortest import shortest_time
+from tests.support.collocation_oracle import Slew
+from tests.support.shortest_step import shortest_time
 
 KNIGHTCUBE = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148)
-OPTIMUM_FILE = Path(__file__).resolve().parents[4].parent / "shared" / "data" / "optimum.json"
+OPTIMUM_FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum.json"
 
 
 @dataclass(frozen=True)

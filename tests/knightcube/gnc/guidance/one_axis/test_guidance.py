@@ -13,7 +13,7 @@ from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, GuidanceS
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
-from tests.knightcube.gnc.guidance.problems import KNIGHTCUBE
+from tests.support.step_problems import KNIGHTCUBE
 
 SECOND = 1_000_000_000
 RULES = AcceptanceRules(late_after=1.0)

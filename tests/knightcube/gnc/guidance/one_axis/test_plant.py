@@ -20,7 +20,7 @@ from knightcube.gnc.guidance.one_axis.plant import (
     q2_rate_of,
     rate_of,
 )
-from tests.knightcube.gnc.guidance.problems import KNIGHTCUBE
+from tests.support.step_problems import KNIGHTCUBE
 
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 ANGLE, RATE = st.floats(-1.4, 1.4), st.floats(-0.2, 0.2)

@@ -17,7 +17,7 @@ from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
 from knightcube.gnc.control.three_axes.pointing_table import PointingPreview, PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from tests.knightcube.gnc.control.three_axes.test_pointing import (
+from tests.knightcube.gnc.control.three_axes.test_pointing_law import (
     INERTIA,
     LAW,
     LIMIT,
