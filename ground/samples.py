@@ -21,7 +21,7 @@ from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.images import write_picture
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.sky_map import Pointing
 from sim_hal import earth_camera, star_camera
 

@@ -12,8 +12,7 @@ from flight.schema.orbit_devices import SolarStrings, WideCamera
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.lens import Lens
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from sim_hal.emulators.device import SerialEnd
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors

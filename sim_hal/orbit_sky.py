@@ -18,7 +18,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.emulators.star_camera import Expose
 from sim_hal.worlds.surroundings import OrbitingWorld, Surroundings
 

@@ -47,7 +47,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.gnc.tracking.tracker import TrackSettings
 from knightcube.vision import frame_job, wide_job
 from knightcube.vision.camera.exposure import Exposures
-from knightcube.vision.camera.knowledge import CameraKnowledge
+from knightcube.vision.camera.lens import CameraKnowledge
 from knightcube.vision.frame_job import TrackerSettings
 from knightcube.vision.kept_frames import KeptFrames
 from knightcube.vision.objects.sighted import SightSettings

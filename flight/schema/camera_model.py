@@ -6,9 +6,7 @@ import math
 
 from flight.schema.devices import Camera
 from flight.schema.orbit_devices import WideCamera
-from knightcube.vision.camera.knowledge import CameraKnowledge
-from knightcube.vision.camera.lens import CameraModel, Lens
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 

@@ -17,7 +17,7 @@ from flight.schema.values import (
     Section,
     Sign,
 )
-from knightcube.vision.camera.knowledge import CameraKnowledge
+from knightcube.vision.camera.lens import CameraKnowledge
 
 
 class InertialUnit(Section, frozen=True, kw_only=True):

@@ -18,13 +18,15 @@ from ground.pictures.horizon import draw_horizon
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import grey_stretch, write_picture
-from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.horizon.knowledge import LEAST_ALTITUDE, HorizonKnowledge
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.response import LogarithmicResponse
-from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
-from knightcube.vision.horizon.solution import HorizonSolution, NadirMeasurement
+from knightcube.vision.camera.lens import CameraModel, Pinhole
+from knightcube.vision.horizon.nadir import HorizonSolution, NadirMeasurement, find_nadir
+from knightcube.vision.horizon.settings import (
+    LEAST_ALTITUDE,
+    EdgeSettings,
+    HorizonKnowledge,
+    HorizonSettings,
+    LogarithmicResponse,
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

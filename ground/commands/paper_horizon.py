@@ -16,17 +16,19 @@ from ground.commands.options import check_size, finite
 from ground.pictures.horizon import draw_circle
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
-from knightcube.reference.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
-from knightcube.reference.horizon.scanned_circle import (
+from knightcube.reference.horizon import (
     LINES,
+    GraphicMethodError,
+    LevelCamera,
     NoHorizonError,
     ScannedHorizon,
     circle_nadir,
+    graphic_nadir,
+    propagated_nadir,
     scan_horizon,
 )
 from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.horizon.vector_method import carried_nadir
 
 METHODS = ("circle", "graphic", "vector")
 
@@ -133,7 +135,7 @@ def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _
         before = circle_nadir(second.circle, camera, altitude)
     else:
         before = np.array(options.nadir) / np.linalg.norm(options.nadir)
-    return _Found(carried_nadir(before, second.middle, seen.middle), seen)
+    return _Found(propagated_nadir(before, second.middle, seen.middle), seen)
 
 
 def _graphic(

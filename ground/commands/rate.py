@@ -19,7 +19,7 @@ from ground.pictures.overlay import draw_marks
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import grey_stretch, write_picture
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import detect
 from knightcube.vision.objects.report import SpaceObject
 from knightcube.vision.objects.settings import ObjectSettings

@@ -7,11 +7,11 @@ import numpy.typing as npt
 
 from ground.pictures.overlay import STREAK, UNUSED, draw_ring, outlined
 from knightcube.astro.arrays import FloatArray
-from knightcube.reference.horizon.scanned_circle import ScannedHorizon
+from knightcube.reference.horizon import ScannedHorizon
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.illumination import limb_rays
-from knightcube.vision.horizon.limb_equation import View
-from knightcube.vision.horizon.solution import HorizonSolution
+from knightcube.vision.horizon.limb_fit import View
+from knightcube.vision.horizon.nadir import HorizonSolution
 
 _RADIUS = 5.0
 _DOT = 0.0

@@ -18,8 +18,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.earth.sun import J2000, earth_velocity, julian_date
 from knightcube.errors import InputError
-from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once

@@ -15,10 +15,9 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
-from knightcube.vision.horizon.response import LogarithmicResponse
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResponse, SensedDirection
+from knightcube.vision.sun.solar_cells import SolarStrings
 
 SUNLIT_COUNTS = 30.0
 """Of a pixel that the sunlit Earth lights, beyond what its scattered light gives beside it."""
@@ -93,9 +92,9 @@ def run(job: WideJob) -> WideFound:
 
 
 def _sun(job: WideJob) -> tuple[Sighted | None, str]:
-    from knightcube.vision.sun.settings import LINEAR, SunSettings  # noqa: PLC0415 - see the top
+    from knightcube.vision.sun.direction import LINEAR, SunSettings  # noqa: PLC0415 - see the top
     from knightcube.vision.sun.several_cameras import sun_of_cameras  # noqa: PLC0415
-    from knightcube.vision.sun.strings import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
+    from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
 
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
@@ -117,26 +116,25 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 
 def _false(job: WideJob) -> dict[int, str] | None:
     """Return why pictures are not of what a fine attitude puts before their cameras; None without one."""
-    from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS  # noqa: PLC0415 - see the top
-    from knightcube.vision.horizon.false_picture import why_false  # noqa: PLC0415
-    from knightcube.vision.horizon.filled_camera import light_seen  # noqa: PLC0415
+    from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
+    from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
 
     rough, position = job.knowledge.attitude, job.knowledge.position
     nadir, sun = _expected_nadir(job.knowledge), _lit_from(job.knowledge, None)
     if rough is None or rough.sigma > JUDGING_SIGMA or position is None or nadir is None or sun is None:
         return None
     altitude = float(np.linalg.norm(position)) - MEAN_RADIUS
-    looks = {n: light_seen(frame, job.cameras[n], SUNLIT_COUNTS) for n, frame in job.frames.items()}
+    looks = {n: image_brightness(frame, job.cameras[n], SUNLIT_COUNTS) for n, frame in job.frames.items()}
     reasons = {n: why_false(look, nadir, altitude, sun) for n, look in looks.items()}
     return {n: reason for n, reason in reasons.items() if reason}
 
 
 def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tuple[Sighted | None, str]:
-    from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS  # noqa: PLC0415 - see the top
-    from knightcube.vision.horizon.filled_camera import coarse_nadir, light_seen  # noqa: PLC0415
+    from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness  # noqa: PLC0415
+    from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
+    from knightcube.vision.horizon.nadir import HorizonStatus  # noqa: PLC0415
     from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings  # noqa: PLC0415
     from knightcube.vision.horizon.several_cameras import nadir_of_cameras  # noqa: PLC0415
-    from knightcube.vision.horizon.solution import HorizonStatus  # noqa: PLC0415
 
     settings = HorizonSettings(edges=EdgeSettings(response=job.response))
     found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings)
@@ -144,7 +142,9 @@ def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tu
         return Sighted(found.nadir.direction, found.nadir.covariance, found.cameras), ""
     if found.status is not HorizonStatus.NO_HORIZON or knowledge.position is None:
         return None, found.reason
-    looks = [light_seen(frame, job.cameras[number], SUNLIT_COUNTS) for number, frame in job.frames.items()]
+    looks = [
+        image_brightness(frame, job.cameras[number], SUNLIT_COUNTS) for number, frame in job.frames.items()
+    ]
     altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS
     coarse = coarse_nadir(looks, altitude, _lit_from(knowledge, sun))
     if coarse is None:

@@ -11,8 +11,7 @@ import numpy as np
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.lens import CameraModel, Lens
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 
 DEVICE = "Earth camera model"
 

@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera.point_spread import Float32Array, PointSpread
 
 Vectors = Callable[[FloatArray], FloatArray]

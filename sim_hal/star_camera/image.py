@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import FloatArray, Image, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera import detector
 from sim_hal.star_camera.attitude_history import AttitudeHistory
 from sim_hal.star_camera.exposure import Vectors, expose

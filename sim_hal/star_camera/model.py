@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 DEVICE = "star camera model"
 

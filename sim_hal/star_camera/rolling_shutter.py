@@ -16,7 +16,7 @@ import numpy as np
 
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera.exposure import Span, add_patches, path_lengths, spans, touches
 from sim_hal.star_camera.model import DEVICE
 from sim_hal.star_camera.point_spread import Float32Array, PointSpread

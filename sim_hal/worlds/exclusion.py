@@ -13,7 +13,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import SUN_RADIUS
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:

@@ -11,7 +11,7 @@ from hal.drivers.ads1115 import STEP, AdsSolarStrings, StringWiring, config_for
 from hal.interfaces.errors import OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
-from knightcube.vision.sun.strings import CoarseSunStatus, SolarStrings, coarse_sun
+from knightcube.vision.sun.solar_cells import CoarseSunStatus, SolarStrings, coarse_sun
 from sim_hal.clock import SimClock
 from sim_hal.emulators.ads1115 import EmulatedAds1115
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus

@@ -28,8 +28,7 @@ from knightcube.astro.quaternion import about_axis_y, from_rotation_vector, mult
 from knightcube.gnc.guidance.one_axis.vmc import plan
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.frame_job import solve_frame
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.solution import HorizonStatus
+from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import SolveStatus

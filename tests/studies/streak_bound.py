@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
 
 # Parameters of one star's information: turn (3), point spread, then position (2), electrons, background.

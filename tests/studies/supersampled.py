@@ -17,7 +17,7 @@ from scipy import fft
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 Cells = npt.NDArray[np.floating[Any]]
 """Light (rows, columns) on a grid of cells."""

@@ -54,7 +54,7 @@ from knightcube.gnc.estimation.free_settings import FreeFilterSettings
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.sun.solar_cells import SolarStrings
 
 _BELOW = 0.8
 """Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""

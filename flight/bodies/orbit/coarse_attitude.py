@@ -36,11 +36,14 @@ from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
 from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
-from knightcube.vision.horizon.response import LogarithmicResponse
-from knightcube.vision.sun.field_and_strings import FieldAndStrings, Sky, StringFix
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.settings import (
+    HorizonKnowledge,
+    LogarithmicResponse,
+    RoughAttitude,
+    SensedDirection,
+)
+from knightcube.vision.sun.solar_cells import FieldAndStrings, Sky, SolarStrings, StringFix
 from knightcube.vision.wide_job import Sighted, WideFound, WideJob
 
 PERIOD_NS = 5 * SECOND_NS

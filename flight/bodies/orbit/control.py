@@ -31,7 +31,7 @@ from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler
 from knightcube.gnc.control.three_axes.pointing_law import damping_dipole
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.vision.sun.strings import SolarStrings, coarse_sun
+from knightcube.vision.sun.solar_cells import SolarStrings, coarse_sun
 
 
 class FieldBrake:

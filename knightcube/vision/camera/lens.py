@@ -1,9 +1,12 @@
-"""A calibrated camera: a pinhole with radial distortion about its optical axis.
+"""Camera models: the pinhole, the lens with radial distortion, the mounted camera, and their uncertainty.
 
-A direction of tangents u = (x/z, y/z) maps to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre (Brown 1966,
-radial terms). Frame and pixels are those of `knightcube.vision.camera.pinhole`. Beyond the tangent where the
-distorted radius stops growing the polynomial folds back on itself: nothing is imaged there, and a lens that
-folds within its own detector is rejected.
+Camera frame: boresight +z, x along columns to the right, y along rows down; pixel (0, 0) is the centre of
+the top-left pixel. The pinhole follows Sease 2.1-2.4, corrected: stars behind the camera are dropped, and
+pixel offsets count from 0.
+
+The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre
+(Brown 1966, radial terms). Beyond the tangent where the distorted radius stops growing the polynomial folds
+back on itself. The lens images nothing there, and a lens that folds within its own detector is rejected.
 """
 
 from __future__ import annotations
@@ -14,8 +17,61 @@ from typing import Protocol, Self
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import FlightError
-from knightcube.vision.camera.pinhole import Pinhole
+
+
+@dataclass(frozen=True, slots=True)
+class Pinhole:
+    """An ideal camera: `columns` x `rows` pixels, focal length in pixels."""
+
+    columns: int
+    rows: int
+    focal_length: float
+
+    @classmethod
+    def from_field_of_view(cls, columns: int, rows: int, field_of_view: float) -> Pinhole:
+        """Return the camera whose columns span `field_of_view` rad, edge to edge (Sease 2.4)."""
+        return cls(columns, rows, 0.5 * columns / np.tan(0.5 * field_of_view))
+
+    @property
+    def ideal(self) -> Pinhole:
+        """The camera itself, which has no distortion."""
+        return self
+
+    def rescaled(self, factor: float) -> Pinhole:
+        """Return the camera with its focal length multiplied by `factor`."""
+        return Pinhole(self.columns, self.rows, self.focal_length * factor)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """The pixel (x, y) on the boresight: (columns - 1)/2, (rows - 1)/2."""
+        return 0.5 * (self.columns - 1), 0.5 * (self.rows - 1)
+
+    def project(self, vectors: FloatArray) -> FloatArray:
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; those with z <= 0 become NaN."""
+        v = np.asarray(vectors, dtype=float)
+        z = np.where(v[..., 2:] > 0.0, v[..., 2:], np.nan)
+        return np.asarray(self.focal_length * v[..., :2] / z + np.array(self.centre))
+
+    def unit_vectors(self, points: FloatArray) -> FloatArray:
+        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2) (Sease 3.20, 3.21)."""
+        offset = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
+        v = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1)
+        return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
+
+    def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
+        """Tell which pixels (n, 2) lie on the detector, widened by `margin` pixels; NaN does not."""
+        x, y = points[..., 0], points[..., 1]
+        inside_x = (x >= -0.5 - margin) & (x <= self.columns - 0.5 + margin)
+        inside_y = (y >= -0.5 - margin) & (y <= self.rows - 0.5 + margin)
+        return np.asarray(inside_x & inside_y)
+
+    @property
+    def half_diagonal(self) -> float:
+        """The angle in rad from the boresight to the detector's corner."""
+        return float(np.arctan(0.5 * np.hypot(self.columns, self.rows) / self.focal_length))
+
 
 _MOST_STEPS = 60
 # Newton's error is of the order of its last step's square: 1e-8 in tangent leaves rounding.
@@ -204,3 +260,57 @@ def _reach(k1: float, k2: float) -> float:
     # The smaller positive root, without cancellation: for k2 = 0 it is -1/(3 k1).
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MountedCamera:
+    """A lens and its mounting.
+
+    Attributes:
+        lens: pixels to directions in the camera's axes.
+        mounting: quaternion (4,), body into camera.
+        to_camera: the matrix (3, 3) of that.
+    """
+
+    lens: CameraModel
+    mounting: FloatArray
+    to_camera: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mounting", np.asarray(self.mounting, dtype=float))
+        object.__setattr__(self, "to_camera", attitude_matrix(self.mounting))
+
+    def seen(self, directions: FloatArray) -> FloatArray:
+        """Return directions (..., 3), body axes, in the camera's."""
+        return np.asarray(directions @ self.to_camera.T)
+
+    def in_body(self, rays: FloatArray) -> FloatArray:
+        """Return rays (..., 3), camera axes, in the body's."""
+        return np.asarray(rays @ self.to_camera)
+
+
+UNSTATED = 30e-6
+"""s from row to row, by which a shutter may roll that nobody described: 1,000 rows in 30 ms, as many do."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraKnowledge:
+    """By how much a camera may differ from its description: standard deviations, 0 where it is exact.
+
+    The defaults are those of a camera that nobody calibrated, its field of view believed.
+
+    Attributes:
+        focal_length: share of itself.
+        centre: px, of the optical axis along x and along y.
+        distortion: share of its radius by which a corner may be displaced.
+        line_time: s from one row's exposure to the next's; None: exact where it is stated, else `UNSTATED`.
+    """
+
+    focal_length: float = 0.0
+    centre: float = 2.0
+    distortion: float = 0.005
+    line_time: float | None = None
+
+
+EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
+"""A camera that is as it is described, as an emulated one."""

@@ -1,5 +1,6 @@
-"""What every method asks of a frame of stars first, of points and of streaks alike.
+"""Properties of a frame of stars that the methods for points and for streaks share.
 
-`saturation` (at which count pixels clip, whether the frame can be used), `background` (level and noise),
-`hot_pixels`, `box_sums` (light of 3 x 3 pixels), `regions` (connected pixels and their moments).
+`saturation` gives the count at which pixels saturate and whether the frame can be used, `background` the
+local level and noise and the sums over 3 x 3 pixels, and `regions` connected pixels, their moments and hot
+pixels.
 """

@@ -1,8 +1,9 @@
-"""Local level and noise of a frame.
+"""Local background level and noise of a frame, and the sums of its light over 3 x 3 pixels.
 
-The thesis thresholds at the image's mean, which passes half of all pixels once there is noise (errata,
+The thesis thresholds at the image's mean, which half of all pixels exceed once there is noise (errata,
 chapter 3). Here level and noise are clipped moments of a sub-sample of each block of pixels, so that streaks,
-a slow gradient of stray light and hot pixels hardly move them.
+a slow gradient of stray light and hot pixels hardly change them. The sum over 3 x 3 pixels is nearly the
+matched filter of a star that is one pixel wide.
 """
 
 from __future__ import annotations
@@ -94,3 +95,42 @@ def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
     weights[np.arange(pixels), first] += 1.0 - share
     weights[np.arange(pixels), np.minimum(first + 1, blocks - 1)] += share
     return weights
+
+
+# Pixels of a frame that are summed at a time.
+_STRETCH = 32_768
+
+
+def box_sum(image: Image) -> Image:
+    """Return the sum over 3 x 3 pixels about each pixel of (rows, columns); the outermost are zero."""
+    columns, flat = image.shape[1], np.ascontiguousarray(image).reshape(-1)
+    total = np.empty(image.shape, dtype=image.dtype)
+    sums = total.reshape(-1)
+    # Rows run into each other, which only the outermost pixels see. A stretch that stays in the processor's
+    # cache takes a third of the time of the whole frame at once.
+    for start in range(columns + 1, flat.size - columns - 1, _STRETCH):
+        stop = min(start + _STRETCH, flat.size - columns - 1)
+        down = flat[start - columns - 1 : stop - columns + 1] + flat[start - 1 : stop + 1]
+        down += flat[start + columns - 1 : stop + columns + 1]
+        inner = sums[start:stop]
+        np.add(down[:-2], down[1:-1], out=inner)
+        inner += down[2:]
+    total[[0, -1]] = 0
+    total[:, [0, -1]] = 0
+    return total
+
+
+def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
+    """Return the flat `sums` over 3 x 3 pixels of a frame of `shape` from which light was `taken`.
+
+    `pixels` (m,) are flat, no one twice; `taken` (m,) is their light.
+    """
+    out, (rows, columns) = sums.copy(), shape
+    for down in (-columns, 0, columns):
+        for beside in (-1, 0, 1):
+            # Sums that run over the frame's edge end on its outermost pixels, which are zero.
+            out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
+    framed = out.reshape(rows, columns)
+    framed[[0, -1]] = 0
+    framed[:, [0, -1]] = 0
+    return out

@@ -1,4 +1,8 @@
-"""At which count pixels clip, and frames that hold no scene: dead or overexposed ones."""
+"""The count at which pixels saturate, the step between counts, and frames without a scene.
+
+A frame without a scene is dead (one value everywhere) or overexposed. The step between counts is 257 where
+8-bit counts were written as 16 bits, and 16 where 12-bit counts were.
+"""
 
 from __future__ import annotations
 
@@ -80,3 +84,25 @@ def at_least(pixels: Image, level: float) -> BoolArray:
     if not np.issubdtype(pixels.dtype, np.integer) or not 0.0 <= level <= np.iinfo(pixels.dtype).max:
         return np.asarray(pixels >= level)
     return np.asarray(pixels >= pixels.dtype.type(np.ceil(level)))
+
+
+# Pixels are sampled so sparsely first; repaired ones between the steps are fewer than this part.
+_STRIDE = 16
+_MOST_BETWEEN = 0.01
+
+
+def in_steps(pixels: Image) -> tuple[Image, int, int]:
+    """Return unsigned `pixels` (rows, columns) in steps of their counts, the step, and the count of step 0.
+
+    Pixels whose counts have no common step come back as they are, with 1 and 0.
+    """
+    values = np.unique(pixels[::_STRIDE, ::_STRIDE]).astype(np.int64)
+    step = int(np.gcd.reduce(values - values[0]))
+    if step <= 1:
+        return pixels, 1, 0
+    offset = int(values[0]) % step
+    between = np.count_nonzero((pixels.astype(np.int64) - offset) % step)
+    if between > _MOST_BETWEEN * pixels.size:
+        return pixels, 1, 0
+    steps = (pixels.astype(np.int64) - offset + step // 2) // step
+    return np.maximum(steps, 0).astype(pixels.dtype), step, offset

@@ -1,9 +1,9 @@
-"""Edges along scan lines to a fraction of a pixel: the steepest place, at the scale of the edge itself.
+"""Edges along scan lines to a fraction of a pixel, and the same edges as directions.
 
-Lines are read, normalised, made binary and filtered as in Meller 3.1, in both directions; every change is
+Lines are read, normalised, made binary and filtered as in Meller 3.1, in both directions. Every change is
 then refined: the signal's slope, smoothed by a Gaussian, has its peak where the limb's brightness falls
-fastest. The scale is doubled as long as the edge outgrows it (Lindeberg 1998, Int. J. Comput. Vision 30,
-117), so that a limb of one pixel and one of a hundred are both found where they are steepest.
+fastest. The scale is doubled as long as the edge is wider (Lindeberg 1998, Int. J. Comput. Vision 30, 117),
+so that a limb of one pixel and a limb of a hundred pixels are both located at their steepest point.
 """
 
 from __future__ import annotations
@@ -14,10 +14,29 @@ from functools import lru_cache
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.vision.camera.lens import CameraModel, Lens
 from knightcube.vision.camera.pixel_access import PixelAccess
-from knightcube.vision.horizon.binary_edges import run_filtered
-from knightcube.vision.horizon.response import light_of
-from knightcube.vision.horizon.settings import EdgeSettings
+from knightcube.vision.horizon.settings import EdgeSettings, light_of
+
+RUN = 5
+"""px: window of the majority filter; shorter fluctuations are removed."""
+
+
+def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
+    """Return binary lines (n, m) with runs shorter than half of `run` px, odd, filtered out (step 2 of 3.1).
+
+    A pixel becomes what most of the `run` pixels about it are; beyond a line's ends stands its last pixel.
+    """
+    half = run // 2
+    size = binary.shape[1]
+    padded = np.empty((len(binary), size + 2 * half), dtype=np.int16)
+    padded[:, half : half + size] = binary
+    padded[:, :half], padded[:, half + size :] = binary[:, :1], binary[:, -1:]
+    total = padded[:, :size].copy()
+    for place in range(1, run):
+        total += padded[:, place : place + size]
+    return np.asarray(total > half)
+
 
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """px, standard deviations of the Gaussian."""
@@ -297,3 +316,115 @@ def _slope(size: float) -> tuple[IntArray, FloatArray, int]:
     for place in range(2 * reach + 1):
         matrix[place : place + len(kernel), place] = kernel
     return window, matrix, reach
+
+
+_RIGHT: FloatArray = np.array([1.0, 0.0])
+_DOWN: FloatArray = np.array([0.0, 1.0])
+_SAMPLE = 32
+"""px between samples along a line."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeRays:
+    """Edges as directions.
+
+    Attributes:
+        rays: (n, 3) unit, camera axes.
+        brighter: (n, 3) the ray's change over one pixel towards the bright side along the scan line.
+        pixel: (n,) rad, the size of a pixel there.
+    """
+
+    rays: FloatArray
+    brighter: FloatArray
+    pixel: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    def chosen(self, which: BoolArray | IntArray) -> EdgeRays:
+        """Return the edges `which`, flags (n,) or indices."""
+        return EdgeRays(self.rays[which], self.brighter[which], self.pixel[which])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Pixels on the lines that were read: directions (m, 3), and whether they are bright (m,)."""
+
+    rays: FloatArray
+    bright: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """Edges and samples as seen from the camera.
+
+    Attributes:
+        space: px between the lines that were read.
+        edges: in pixels.
+        rays: the same as directions.
+        across, down: (n, 3) the ray's change over a pixel to the right, and downwards.
+        samples: where it is bright.
+    """
+
+    space: float
+    edges: Edges
+    rays: EdgeRays
+    across: FloatArray
+    down: FloatArray
+    samples: Samples
+
+
+def observe(
+    edges: Edges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
+) -> Observation:
+    """Return edges and samples as directions; edges outside the lens's image are excluded.
+
+    `samples` replace those of the lines.
+    """
+    count = len(edges)
+    rays = camera.unit_vectors(np.concatenate([edges.points, edges.points + _RIGHT, edges.points + _DOWN]))
+    here = rays[:count]
+    across, down = rays[count : 2 * count] - here, rays[2 * count :] - here
+    seen = np.isfinite(here[:, 0]) & np.isfinite(across[:, 0]) & np.isfinite(down[:, 0])
+    if not seen.all():
+        edges, here, across, down = edges.chosen(seen), here[seen], across[seen], down[seen]
+    brighter = edges.towards[:, :1] * across + edges.towards[:, 1:] * down
+    return Observation(
+        lines.space,
+        edges,
+        EdgeRays(here, brighter, np.sqrt(np.einsum("ij,ij->i", brighter, brighter))),
+        across,
+        down,
+        _samples_of_lines(lines, camera) if samples is None else samples,
+    )
+
+
+def _samples_of_lines(lines: ScanLines, camera: CameraModel) -> Samples:
+    bright = []
+    for binary in (lines.column_bright, lines.row_bright):
+        bright.append(binary[:, _along(binary.shape[1])].ravel())
+    rays, imaged = _sample_rays(Lens.of(camera), tuple(lines.columns.tolist()), tuple(lines.rows.tolist()))
+    return Samples(rays, np.concatenate(bright)[imaged])
+
+
+def _along(size: int) -> IntArray:
+    """Return the places of the samples along a line of `size` px."""
+    return np.arange(_SAMPLE // 2, size, _SAMPLE * max(1, size // 512))
+
+
+@lru_cache(maxsize=8)
+def _sample_rays(
+    camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
+) -> tuple[FloatArray, BoolArray]:
+    """Return directions (m, 3) of the samples on those lines, and which of all of them the lens images.
+
+    They are the same in frame after frame.
+    """
+    x, y = np.meshgrid(columns, _along(camera.rows), indexing="ij")
+    other_y, other_x = np.meshgrid(rows, _along(camera.columns), indexing="ij")
+    points = np.concatenate(
+        [np.stack([x.ravel(), y.ravel()], axis=1), np.stack([other_x.ravel(), other_y.ravel()], axis=1)]
+    )
+    rays = camera.unit_vectors(points.astype(float))
+    imaged = np.isfinite(rays[:, 0])
+    return rays[imaged], imaged

@@ -1,15 +1,22 @@
-"""One possible horizon: fitted in full and tested against prior knowledge."""
+"""One possible horizon: its edges on the limb, the fit, and the evidence for and against it.
+
+The significance of a horizon is an upper bound of the expected number of cones, among all that differ in the
+image, near which chance edges lie as often and as closely. The density of chance edges is that of the edges
+beside the limb. These edges lie on curves: a coast or the rim of a cloud with radius R that touches the limb
+stays within the gate g of it over 2 sqrt(2 g R). Scan lines across one such piece are not independent, so
+that pieces are counted instead of scan lines.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.horizon.chance import limb_in_view, log10_chance
+from knightcube.vision.horizon.edges import Observation
 from knightcube.vision.horizon.illumination import (
     DAYLIGHT,
     GLARE,
@@ -24,19 +31,184 @@ from knightcube.vision.horizon.initial_guess import (
     Place,
     sun_from,
 )
-from knightcube.vision.horizon.knowledge import HorizonKnowledge
-from knightcube.vision.horizon.limb_equation import View, limb_residuals
-from knightcube.vision.horizon.limb_fit import UNKNOWN, FittedLimb, Prior, fit_limb, stepped
-from knightcube.vision.horizon.limb_points import (
-    LOWEST_SUN,
-    LimbPoints,
-    limb_points,
-    near_limb,
-    placed_by_profile,
+from knightcube.vision.horizon.limb_fit import (
+    UNKNOWN,
+    FittedLimb,
+    Prior,
+    View,
+    crossed,
+    fit_limb,
+    limb_gradients,
+    limb_residuals,
+    stepped,
 )
-from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
-from knightcube.vision.horizon.observation import Observation
-from knightcube.vision.horizon.settings import HorizonSettings
+from knightcube.vision.horizon.limb_profile import SCALE_HEIGHT, UNIT_DEPTH_HEIGHT, fit_profiles
+from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
+
+_GRAZING = 0.3
+"""Cosine: a scan line more oblique to the limb places it badly."""
+LOWEST_SUN = np.radians(1.0)
+"""Of a limb point's Sun: lower, the light reaches high air only, and the limb appears higher."""
+_FINE = SCALE_HEIGHT / 6.0
+"""m a pixel: with finer pixels the steepest place is used; the profile is longer than the samples kept."""
+_ALIKE = 10.0
+"""px: length over which the light behind the limb is correlated."""
+_PIXEL_SIGMA = 12.0**-0.5
+"""px: a square pixel's own blur."""
+_LEAST_SPREAD = 0.03
+"""px: least error of a profile's place."""
+_OTHER_AIR = 500.0
+"""m: shift of the limb between bright and dark ground in air thicker or thinner than assumed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimbPoints:
+    """The edges assigned to the limb.
+
+    Attributes:
+        index: (n,) which of the picture's edges they are.
+        rays: (n, 3).
+        sigma: (n,) rad, their spreads normal to the limb.
+        pixel: (n,) rad, a pixel's size there normal to the limb.
+        inward: (n,) cosine of the angle between scan line and the way across the limb.
+        residuals, gradients: (n,) and (n, 5), of the edges, see `limb_gradients`.
+    """
+
+    index: IntArray
+    rays: FloatArray
+    sigma: FloatArray
+    pixel: FloatArray
+    inward: FloatArray
+    residuals: FloatArray
+    gradients: FloatArray
+
+    def chosen(self, which: BoolArray) -> LimbPoints:
+        """Return the points `which` (n,)."""
+        return LimbPoints(*(getattr(self, each.name)[which] for each in fields(self)))
+
+
+def near_limb(view: View, seen: Observation, tolerance: float) -> BoolArray:
+    """Return which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
+    near = np.abs(limb_residuals(view, seen.rays.rays)) < tolerance * seen.rays.pixel
+    return np.asarray(near & (seen.rays.brighter @ view.nadir > 0.0))
+
+
+def limb_points(view: View, seen: Observation, members: BoolArray, sun: FloatArray | None) -> LimbPoints:
+    """Return the members in daylight whose scan line is not too oblique to the limb."""
+    chosen = np.flatnonzero(members)
+    rays = seen.rays.rays[chosen]
+    if sun is not None:
+        day = sun_elevation(view, rays, sun) > LOWEST_SUN
+        chosen, rays = chosen[day], rays[day]
+    residuals, gradients = limb_gradients(view, rays)
+    slopes = _slopes(seen, chosen, rays, gradients)
+    size = np.sqrt(np.einsum("ij,ij->i", slopes, slopes))
+    inward = -np.einsum("ij,ij->i", slopes, seen.edges.towards[chosen]) / size
+    sigma = seen.edges.sigma[chosen] * inward * size
+    points = LimbPoints(chosen, rays, sigma, size, inward, residuals, gradients)
+    return points.chosen(inward > _GRAZING)
+
+
+def placed_by_profile(
+    view: View, seen: Observation, limb: LimbPoints, settings: HorizonSettings
+) -> LimbPoints:
+    """Return the points placed by the limb's profile if pixels are coarse enough for it."""
+    reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
+    metres = limb.pixel * reach
+    if not len(metres) or float(np.median(metres)) < _FINE:
+        return limb
+    blur = np.hypot(settings.edges.psf_sigma, _PIXEL_SIGMA) * metres
+    edges = seen.edges.chosen(limb.index)
+    shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
+    rays = limb.rays + shift[:, None] * seen.rays.brighter[limb.index]
+    rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
+    # Lines closer together than the ground's features are not independent.
+    alike = np.sqrt(max(1.0, _ALIKE / seen.space))
+    least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
+    sigma = alike * np.hypot(spread, least) * limb.inward * limb.pixel
+    return replace(limb, rays=rays, sigma=sigma).chosen(sound)
+
+
+def _slopes(seen: Observation, chosen: IntArray, rays: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Return the residuals' change (n, 2) rad a pixel to the right and downwards, from gradients (n, 5)."""
+    # The effect of a turn d on a residual, g (d x u), a step s of the ray u does with d = u x s.
+    turns = crossed(gradients[:, :3], rays)
+    across, down = seen.across[chosen], seen.down[chosen]
+    return -np.stack([np.einsum("ij,ij->i", turns, step) for step in (across, down)], axis=1)
+
+
+_GATES = (0.25, 0.5, 1.0, 2.0)
+"""px: the one that gives the fewest chance cones counts."""
+_ROUND = 0.1
+"""Of the picture's size: radius of the curves on which chance edges lie."""
+_BESIDE = 0.05
+"""Of the picture's size: distance from the limb within which other edges give the density."""
+
+
+@dataclass(frozen=True, slots=True)
+class LimbInView:
+    """The limb in a picture.
+
+    Attributes:
+        length: px, of the part that should show edges.
+        crossings: of that part and the scan lines.
+        all_crossings: of all that is in the picture, and the scan lines.
+    """
+
+    length: float
+    crossings: float
+    all_crossings: float
+
+
+def limb_in_view(
+    points: FloatArray, inside: BoolArray, due: BoolArray, space: tuple[float, float]
+) -> LimbInView:
+    """Return a closed limb `points` (n, 2) px where they are `inside` the picture (n,), and `due` (n,) there.
+
+    `space` is px between the columns that are read, and between the rows.
+    """
+    with np.errstate(invalid="ignore"):
+        step = np.abs(np.roll(points, -1, axis=0) - points)
+    both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
+    size = np.hypot(step[:, 0], step[:, 1])
+    # A column is crossed where the limb goes along x.
+    crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
+    return LimbInView(
+        *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
+    )
+
+
+def log10_chance(
+    limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
+) -> float:
+    """Return log10 of the bound on chance cones as good as a limb.
+
+    `residuals` (k,) px are those of its edges, `others` (m,) px the distances of all other edges from the
+    limb; `unknowns` is 2 for nadir, 3 with the altitude.
+    """
+    size = float(max(camera.columns, camera.rows))
+    lines = max(limb.crossings, float(len(residuals)), 1.0)
+    beside = _BESIDE * size
+    # One edge more than seen: none beside the limb does not make the density zero.
+    near = np.count_nonzero(np.abs(others) < beside) + 1.0
+    density = near / (2.0 * beside * max(limb.all_crossings, lines))
+    best = math.inf
+    for gate in _GATES:
+        hits = np.count_nonzero(np.abs(residuals) <= gate) / lines
+        pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
+        chance = min(2.0 * gate * density, 0.5)
+        cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
+        best = min(best, cones + _log10_tail(pieces, hits, chance))
+    return best
+
+
+def _log10_tail(number: float, share: float, chance: float) -> float:
+    """Return log10 of the probability that a `share` of `number` or more happens (Chernoff's bound)."""
+    if share <= chance:
+        return 0.0
+    rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
+    return -number * (share * math.log(share / chance) + rest) / math.log(10.0)
+
 
 _UNKNOWN_TURN = 1.0
 """rad: the prior on an unknown turn about nadir; on a sphere it has no effect."""

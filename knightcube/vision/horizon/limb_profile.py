@@ -1,11 +1,15 @@
-"""The brightness of the sunlit limb at each tangent height, by Rayleigh scattering alone.
+"""The brightness of the sunlit limb against tangent height, and its fit to the samples along a scan line.
 
-A line of sight of tangent height h passes the optical depth t(h) = t0 exp(-h/H), t0 = t_v sqrt(2 pi R/H),
-with t_v the vertical depth of Rayleigh scattering and H the air's scale height; lower down it ends on the
-ground, at the elevation whose sine is sqrt(-2h/R). Sunlit air shines as 1 - exp(-t); the ground, of whatever
-brightness, is seen through it as exp(-t). Unblurred that falls fastest where t = 1, 15.4 km up. No
-refraction: it lowers the apparent limb by 1 to 2 km, within the spread that
-`HorizonSettings.limb_height_sigma` states.
+A line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H), t0 = t_v sqrt(2 pi R/H),
+with t_v the vertical depth of Rayleigh scattering and H the scale height of the air. Below the surface the
+line ends on the ground, at the elevation whose sine is sqrt(-2h/R). Sunlit air has the brightness
+1 - exp(-t); the ground, of any brightness, is attenuated by exp(-t). Without blur the brightness falls
+fastest where t = 1, at 15.4 km. Refraction is neglected: it lowers the apparent limb by 1 to 2 km, within
+`HorizonSettings.limb_height_sigma`.
+
+The profile across an edge is background + a air(h) + g ground(h), where h falls by a known number of metres
+per pixel. The position of unit optical depth is fitted together with the three brightnesses. Unlike the
+steepest place, it is not shifted inwards by bright ground behind the limb or outwards by thinning haze.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 
 SCALE_HEIGHT = 8000.0
@@ -83,3 +87,65 @@ def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
     frequency = 2.0 * np.pi * np.fft.rfftfreq(len(padded), _STEP)
     spectrum = np.fft.rfft(padded) * np.exp(-0.5 * (widths[:, None] * frequency) ** 2)
     return np.asarray(np.fft.irfft(spectrum, len(padded), axis=1)[:, margin:-margin])
+
+
+_FIT_STEPS = 2
+_OUTSIDE, _INSIDE = -8.0, 4.0
+"""px from the steepest place: the part of the profile that is fitted."""
+_FLOOR, _SHARE = 0.02, 0.08
+"""Noise of a sample: of the limb's brightness, and of the sample's own."""
+_FARTHEST = 2.0
+"""px from the steepest place: a limb farther away is rejected."""
+_LEAST = 7
+"""Samples."""
+
+
+def fit_profiles(
+    profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return the limb's places (n,) px, their spreads (n,) px, and which are sound (n,).
+
+    `profiles` (n, m) is light at `steps` (n, m) px along each line to the bright side, NaN where there is
+    none; `metres` (n,) of tangent height a pixel; `blur` (n,) m. The places are on the scale of `steps`.
+    """
+    usable = np.isfinite(profiles) & (steps >= _OUTSIDE) & (steps <= _INSIDE)
+    light = np.where(usable, profiles, 0.0)
+    enough = np.count_nonzero(usable, axis=1) >= _LEAST
+    top = np.max(np.where(usable, profiles, -np.inf), axis=1, initial=0.0)
+    height = np.maximum(top, 1e-12)[:, None]
+    light = light / height
+    weights = usable / (_FLOOR + _SHARE * np.clip(light, 0.0, 1.0)) ** 2
+    place = np.zeros(len(profiles))
+    amounts = np.zeros((len(profiles), 3))
+    # Weak priors that keep the equations regular if a profile leaves a parameter open.
+    prior = np.diag([1.0, 1.0, 1.0, 0.1])
+    of_place = np.zeros((len(profiles), 4, 1))
+    of_place[:, 3] = 1.0
+    for _ in range(_FIT_STEPS):
+        heights = UNIT_DEPTH_HEIGHT - (steps - place[:, None]) * metres[:, None]
+        air, ground, air_slope, ground_slope = limb_light(heights, blur)
+        if not amounts.any():
+            amounts = _amounts(light, weights, air, ground)
+        model = amounts[:, :1] + amounts[:, 1:2] * air + amounts[:, 2:] * ground
+        shift = (amounts[:, 1:2] * air_slope + amounts[:, 2:] * ground_slope) * metres[:, None]
+        columns = np.stack([np.ones_like(air), air, ground, shift], axis=2)
+        weighted = columns * weights[:, :, None]
+        normal = weighted.transpose(0, 2, 1) @ columns + prior
+        slope = weighted.transpose(0, 2, 1) @ (light - model)[:, :, None]
+        # With the step the inverse's last column: the place's variance.
+        answer = np.linalg.solve(normal, np.concatenate([slope, of_place], axis=2))
+        amounts = amounts + answer[:, :3, 0]
+        place = place + np.minimum(np.maximum(answer[:, 3, 0], -1.0), 1.0)
+    misfit = np.sum(weights * (light - model) ** 2, axis=1) / np.maximum(
+        np.count_nonzero(usable, axis=1) - 4, 1
+    )
+    spread = np.sqrt(answer[:, 3, 1] * np.maximum(misfit, 0.3))
+    sound = enough & (np.abs(place) < _FARTHEST) & (amounts[:, 1] > 0.2)
+    return place, spread, sound
+
+
+def _amounts(light: FloatArray, weights: FloatArray, air: FloatArray, ground: FloatArray) -> FloatArray:
+    """Return background, air and ground (n, 3) that explain the light best where the limb is now."""
+    columns = np.stack([np.ones_like(air), air, ground], axis=2)
+    weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
+    return np.asarray(np.linalg.solve(weighted @ columns + np.eye(3), weighted @ light[:, :, None])[:, :, 0])

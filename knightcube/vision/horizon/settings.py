@@ -1,13 +1,103 @@
-"""Settings of the search for the horizon."""
+"""Settings of the horizon search, the camera's response to light, and prior knowledge for one image.
+
+A horizon does not determine the rotation about nadir. The prior knowledge (position, Sun, rough attitude,
+directions from other sensors) resolves it and tests a fitted horizon.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import UsageError
-from knightcube.vision.horizon.knowledge import LEAST_ALTITUDE
-from knightcube.vision.horizon.response import LogarithmicResponse
+
+ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
+LEAST_ALTITUDE = 50e3
+"""m: lower down, within the air, no limb is visible."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensedDirection:
+    """A direction known in both frames: the coarse Sun of the solar strings, or the magnetic field.
+
+    Attributes:
+        camera: (3,) as sensed, camera axes; of any length.
+        inertial: (3,) by ephemeris or field model; of any length.
+        sigma: rad, of an axis.
+    """
+
+    camera: FloatArray
+    inertial: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoughAttitude:
+    """An attitude of the camera, inertial into camera axes, (4,) scalar last, and its spread, rad an axis."""
+
+    quaternion: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HorizonKnowledge:
+    """Data of GPS, ephemerides and coarse sensors; the horizon is fitted without them, too.
+
+    Attributes:
+        position: (3,) m from the Earth's centre, inertial axes: sets the altitude and, with `pole`, the
+            ellipsoid's cone.
+        altitude: m above a sphere of the mean radius, where there is no position.
+        sun: (3,) towards the Sun, inertial axes; of any length.
+        pole: (3,) the Earth's axis, inertial axes.
+        attitude: a rough one, from the filter.
+        sensed: directions from coarse sensors.
+
+    Raises ValueError for a value that is not finite, of another shape, or inside the Earth.
+    """
+
+    position: FloatArray | None = None
+    altitude: float | None = None
+    sun: FloatArray | None = None
+    pole: FloatArray = field(default_factory=ICRS_POLE.copy)
+    attitude: RoughAttitude | None = None
+    sensed: tuple[SensedDirection, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("position", "sun", "pole"):
+            value = getattr(self, name)
+            if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
+                raise ValueError(f"{name} = {value}: give (3,) finite numbers")
+        if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
+            raise ValueError(f"position = {self.position}: inside the Earth, give metres from its centre")
+        if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:
+            raise ValueError(
+                f"altitude = {self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class LogarithmicResponse:
+    """counts = pedestal + counts_per_decade log10(1 + light), light in units of the dark current."""
+
+    pedestal: float
+    counts_per_decade: float
+
+    def light(self, counts: Image) -> FloatArray:
+        """Return the light of `counts` (...)."""
+        return np.asarray(10.0 ** ((counts - self.pedestal) / self.counts_per_decade) - 1.0)
+
+
+def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
+    """Return the light of counts (...), of any scale; without a response they are proportional to it."""
+    if response is None:
+        return np.asarray(counts, dtype=float)
+    if counts.dtype == np.uint8:
+        return np.asarray(response.light(np.arange(256.0))[counts])
+    return response.light(counts)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,17 +18,18 @@ from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import multiply
-from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.camera.pixel_access import PixelAccess
-from knightcube.vision.horizon.azimuth import orientation
-from knightcube.vision.horizon.initial_guess import SPHERE_ALTITUDE_SIGMA, place_of
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
-from knightcube.vision.horizon.limb_equation import View
-from knightcube.vision.horizon.limb_fit import UNKNOWN, FittedLimb, Prior, fit_limb, shared_error
+from knightcube.vision.horizon.initial_guess import SPHERE_ALTITUDE_SIGMA, orientation, place_of
+from knightcube.vision.horizon.limb_fit import UNKNOWN, FittedLimb, Prior, View, fit_limb, shared_error
 from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.settings import HorizonSettings
-from knightcube.vision.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
+from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, NadirMeasurement, find_nadir
+from knightcube.vision.horizon.settings import (
+    HorizonKnowledge,
+    HorizonSettings,
+    RoughAttitude,
+    SensedDirection,
+)
 
 _IMPROBABLE = 1e-6
 """Chance by which two cameras' nadirs are not one."""

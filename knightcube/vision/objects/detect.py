@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.judge import Judge
 from knightcube.vision.objects.report import ObjectReport, SpaceObject, Verdict
 from knightcube.vision.objects.rso_indicators import INDICATORS, Indicators, evaluate

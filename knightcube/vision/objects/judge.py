@@ -10,7 +10,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import FlightError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.merged import brightest_left, cut_patch, fit_stars
 from knightcube.vision.objects.report import SpaceObject, Verdict
 from knightcube.vision.objects.rso_indicators import star_ends

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.regions import label_pixels, line_of
 from knightcube.vision.objects.star_light import (
     SHAPE_ERROR,

@@ -23,7 +23,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.background import MAD_TO_SIGMA
 from knightcube.vision.streaks.corners.grouping import centre_of_rotation
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.regions import line_of, positions
 from knightcube.vision.objects.rso_indicators import star_ends
 from knightcube.vision.objects.settings import ObjectSettings

@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.background import Background
 from knightcube.vision.streaks.corners.streaks import Segmented
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import SkyMap, apparent
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus

@@ -18,8 +18,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
-from knightcube.vision.camera.knowledge import CameraKnowledge
-from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel
 from knightcube.vision.startracker.identification.attitude_fit import scale_slope
 
 

@@ -16,9 +16,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.attitude.wahba import AttitudeError, Solver
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from knightcube.vision.camera.knowledge import CameraKnowledge
-from knightcube.vision.camera.lens import CameraModel, Lens, LensError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
 from knightcube.vision.startracker.detection import (
     Detections,
     DetectionSettings,

@@ -26,8 +26,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import FlightError
-from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus

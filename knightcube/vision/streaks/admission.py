@@ -13,7 +13,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import FlightError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.saturation import FrameState, frame_state
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 

@@ -2,26 +2,140 @@
 
     solution = find_sun(ArrayPixels(frame), camera, SunSettings())
 
-A few rows are read; the rim of each patch brighter than the level and not too large is traced, and a circle
-on the sphere fitted to it. The circle's centre is the Sun's, whether the disc is saturated, has glare, or is
-partly cut off.
+A few rows are read. The rim of each patch that is brighter than the level and not too large is traced, and a
+circle on the sphere is fitted to it. The circle's centre is the Sun's, even if the disc is saturated, has
+glare, or is partly cut off by the frame's edge.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.camera.pixel_access import PixelAccess
-from knightcube.vision.sun.candidates import bright_patches, window
-from knightcube.vision.sun.circle import Circle, fit_circle
-from knightcube.vision.sun.rim import SPOKES, Rim, trace
-from knightcube.vision.sun.settings import SunSettings
-from knightcube.vision.sun.solution import SunMeasurement, SunSolution, SunStatus
+from knightcube.vision.sun.disc import SPOKES, Circle, Rim, bright_patches, fit_circle, trace, window
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SunSettings:
+    """How the Sun is distinguished from other bright objects, and its assumed errors.
+
+    At one exposure the Sun's bright disc, glare included, has one radius: give that within about a fifth;
+    within wide bounds a cloud may pass for the Sun. The defaults are for a logarithmic camera like the Fuga
+    15d; `LINEAR` is for a linear one whose white clouds come near to saturation.
+
+    Attributes:
+        level: counts, exceeded by the Sun's image. For a logarithmic camera well above the brightest cloud,
+            so that only the disc remains; for a linear one a little below saturation.
+        stride: px between the rows that are read first.
+        least_radius: rad; smaller patches are hot pixels. The disc itself has 0.0047.
+        greatest_radius: rad; larger patches are clouds, or the Earth.
+        tolerance: px rms by which the rim may be off a circle.
+        least_agreement: share of the rim within the frame that must lie on the circle.
+        least_arc: rad of the rim that must be seen.
+        rim_sigma: px, a rim point's error that the fit's residuals may not show.
+        floor_sigma: px an axis, least error of the centre, from the pixels' pattern.
+    """
+
+    level: float = 200.0
+    stride: int = 3
+    least_radius: float = math.radians(0.35)
+    greatest_radius: float = math.radians(0.6)
+    tolerance: float = 0.25
+    least_agreement: float = 0.55
+    least_arc: float = math.radians(110.0)
+    rim_sigma: float = 0.03
+    floor_sigma: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise UsageError(f"stride {self.stride}: must be a whole number of pixels from 1")
+        if not 0.0 < self.least_radius < self.greatest_radius < 0.5:
+            raise UsageError(
+                f"least_radius {self.least_radius} and greatest_radius {self.greatest_radius}: "
+                "give rad that grow, the greatest below 0.5"
+            )
+        for name in ("level", "tolerance", "rim_sigma", "floor_sigma"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise UsageError(f"{name} {getattr(self, name)}: must be positive")
+        if not 0.5 <= self.least_agreement <= 1.0:
+            raise UsageError(f"least_agreement {self.least_agreement}: must lie between 0.5 and 1")
+        if not 0.0 < self.least_arc <= 2.0 * math.pi:
+            raise UsageError(f"least_arc {self.least_arc}: must lie between 0 and 2 pi rad")
+
+
+LINEAR = SunSettings(least_radius=math.radians(1.3), greatest_radius=math.radians(2.0))
+"""For a linear 8-bit camera, a white matt surface at 200 counts, its optics scattering 1 % of the light."""
+
+
+class SunStatus(Enum):
+    """The outcome of the search for the Sun."""
+
+    FOUND = "found"
+    PARTIAL = "partial"
+    """Found, but cut by the frame's edge: see the covariance."""
+    NO_SUN = "no-sun"
+    """Nothing is bright enough."""
+    NOT_THE_SUN = "not-the-sun"
+    """Something is bright enough, but too small, too large or not round: see the reason."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SunMeasurement:
+    """The direction to the Sun's centre from one frame.
+
+    Attributes:
+        direction: (3,) unit vector in camera axes.
+        basis: (2, 3), two unit vectors normal to it and to one another.
+        tangent_covariance: (2, 2) rad^2, of the direction's error along `basis`; without the lens's
+            calibration.
+        point: (2,) px, of the centre; NaN outside the lens's image.
+        radius: rad, of the bright disc, glare included.
+        residual: px rms, of the rim points that were used.
+        arc: rad of the rim that was used.
+        cut: whether the frame's edge cuts the bright disc.
+    """
+
+    direction: FloatArray
+    basis: FloatArray
+    tangent_covariance: FloatArray
+    point: FloatArray
+    radius: float
+    residual: float
+    arc: float
+    cut: bool
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The covariance (3, 3) rad^2 of the direction's error: of rank 2, nothing along the direction."""
+        return np.asarray(self.basis.T @ self.tangent_covariance @ self.basis)
+
+    @property
+    def sigma(self) -> float:
+        """The root of the mean variance over the two axes, rad."""
+        return float(np.sqrt(0.5 * np.trace(self.tangent_covariance)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SunSolution:
+    """The outcome of one frame.
+
+    Attributes:
+        sun: the measurement, when the status is FOUND or PARTIAL.
+        pixels_read: number of pixels read.
+    """
+
+    status: SunStatus
+    reason: str = ""
+    sun: SunMeasurement | None = None
+    pixels_read: int = 0
+
 
 _ROUNDS = 3
 """Most tracings of the rim, each from the centre that the last one found."""

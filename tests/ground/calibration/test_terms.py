@@ -9,8 +9,7 @@ import pytest
 
 from ground.calibration.terms import FixedTerms, fit_terms
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.lens import Lens
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Lens, Pinhole
 from tests.knightcube.vision.startracker.test_calibration import _begun, _frames, _lens
 
 

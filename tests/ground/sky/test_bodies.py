@@ -9,7 +9,7 @@ import pytest
 
 from ground.sky.bodies import bodies_in, directions_of_bodies
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.sky_map import Pointing, SkyMap
 
 # Julian date TT of the great conjunction, 2020 December 21, 18:20 UTC: 6.1' apart, by the almanacs.

@@ -11,7 +11,7 @@ import pytest
 
 from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
 from knightcube.errors import InputError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.star_tracker import StarTracker, camera_of_field, field_of_view
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 

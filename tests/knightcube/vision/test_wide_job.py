@@ -6,10 +6,9 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_matrix
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.camera.lens import MountedCamera, Pinhole
+from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude
+from knightcube.vision.sun.solar_cells import SolarStrings
 from knightcube.vision.wide_job import EARTHLIGHT_SIGMA, WideJob, run
 
 SUN, NADIR = np.array([-0.59, 0.13, 0.80]), np.array([0.66, -0.62, -0.42])

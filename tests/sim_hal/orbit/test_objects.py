@@ -15,7 +15,7 @@ from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.clock import SimClock
 from sim_hal.objects import Objects
 from sim_hal.posed_camera import posed_camera

@@ -18,10 +18,9 @@ from hal.interfaces.wires import SECOND_NS, Rig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.sun.direction import find_sun
-from knightcube.vision.sun.settings import SunSettings
+from knightcube.vision.sun.direction import SunSettings, find_sun
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.grammar import parse

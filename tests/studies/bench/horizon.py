@@ -19,9 +19,8 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.horizon.edges import find_edges
+from knightcube.vision.horizon.edges import find_edges, observe
 from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.observation import observe
 from sim_hal.earth_camera import nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.nadir import VIEWS, camera_model, coarse_knowledge, finder_settings

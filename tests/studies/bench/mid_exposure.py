@@ -27,7 +27,7 @@ from knightcube.astro.attitude import esoq2
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import FlightError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solution import FrameSolution

@@ -27,7 +27,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.sky_map import Pointing
 from knightcube.vision.startracker.solution import FrameSolution

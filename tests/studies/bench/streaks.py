@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.streaks.corners import streak_rate
 from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
 from knightcube.vision.streaks.corners.rate_fit import RotationFit, fit_rotation

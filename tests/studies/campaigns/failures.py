@@ -25,7 +25,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings

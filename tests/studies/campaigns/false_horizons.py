@@ -17,11 +17,9 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import Image
-from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.horizon.knowledge import HorizonKnowledge
+from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.settings import HorizonSettings
+from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, nadir, render
 from sim_hal.earth_camera.truth import sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene

@@ -22,14 +22,20 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.reference.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
-from knightcube.reference.horizon.scanned_circle import NoHorizonError, circle_nadir, scan_horizon
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
+from knightcube.reference.horizon import (
+    GraphicMethodError,
+    LevelCamera,
+    NoHorizonError,
+    circle_nadir,
+    graphic_nadir,
+    propagated_nadir,
+    scan_horizon,
+)
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
 from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
 from knightcube.vision.horizon.several_cameras import nadir_of_cameras
-from knightcube.vision.horizon.vector_method import carried_nadir
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -194,7 +200,7 @@ def _methods(
             before, after = (scan_horizon(frame, lens, lines).middle for frame in (earlier, frames[0]))
         except NoHorizonError:
             return None
-        return first.in_body(carried_nadir(known, before, after))
+        return first.in_body(propagated_nadir(known, before, after))
 
     return {
         "default": default,

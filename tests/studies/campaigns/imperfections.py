@@ -15,7 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.knowledge import UNSTATED, CameraKnowledge
+from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
 from tests.studies.supersampled import Optics, coma, disc, gaussian, halo, moffat
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]

@@ -24,11 +24,14 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.response import LogarithmicResponse
-from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
-from knightcube.vision.horizon.solution import HorizonStatus
+from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
+from knightcube.vision.horizon.settings import (
+    EdgeSettings,
+    HorizonKnowledge,
+    HorizonSettings,
+    LogarithmicResponse,
+    SensedDirection,
+)
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
 from sim_hal.earth_camera.atmosphere import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction, random_scene

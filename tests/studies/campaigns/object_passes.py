@@ -26,8 +26,7 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.gnc.tracking.tracker import FrameSightings, LineOfSightState, ObjectTracker, TrackSettings
-from knightcube.vision.camera.knowledge import EXACT
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
 from knightcube.vision.objects.sighted import Sighted, SightSettings

@@ -30,15 +30,14 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, normalise, to_rotation_vector
 from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Report, begin
 from knightcube.gnc.attitude.single_frame import Sight
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.cameras import cameras_by_limb
-from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS
-from knightcube.vision.horizon.filled_camera import coarse_nadir, light_seen
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
+from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
+from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, SensedDirection
 from knightcube.vision.horizon.several_cameras import nadir_of_cameras
-from knightcube.vision.sun.settings import SunSettings
+from knightcube.vision.sun.direction import SunSettings
 from knightcube.vision.sun.several_cameras import SunOfCameras, sun_of_cameras
-from knightcube.vision.sun.strings import CoarseSun, SolarStrings, coarse_sun
+from knightcube.vision.sun.solar_cells import CoarseSun, SolarStrings, coarse_sun
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.worlds.solar_strings import SolarStringsModel
 from tests.studies.campaigns import orbit_world
@@ -146,13 +145,7 @@ class _Flight:
         sun = sun_of_cameras(frames, self._cameras, coarse, SunSettings())
         self._give_sun(now_ns, sun, truth.sun[k], fine)
         knowledge = self._knowledge(k, report, coarse)
-        chosen = frames
-        if fine and believed is not None:
-            order = cameras_by_limb(
-                believed @ down, self._altitude(k), believed @ truth.sun[k], self._cameras
-            )
-            chosen = {one.index: frames[one.index] for one in order if one.lit > 0.0}
-        nadir = nadir_of_cameras(chosen, self._cameras, knowledge, finder_settings(self._model))
+        nadir = nadir_of_cameras(frames, self._cameras, knowledge, finder_settings(self._model))
         if nadir.nadir is not None:
             covariance = nadir.nadir.covariance * max(1.0, ALIKE / self.case.parameters["period"])
             self._filter.direction("nadir", now_ns, nadir.nadir.direction, down, covariance)
@@ -195,7 +188,9 @@ class _Flight:
         """Note the coarse nadir of the light in all frames, and with the Sun the coarse attitude."""
         if sun.direction is None or sun.covariance is None:
             return
-        looks = [light_seen(frame, self._cameras[number], EARTHLIGHT) for number, frame in frames.items()]
+        looks = [
+            image_brightness(frame, self._cameras[number], EARTHLIGHT) for number, frame in frames.items()
+        ]
         found = coarse_nadir(looks, self._altitude(k), sun.direction)
         if found is None:
             return

@@ -25,7 +25,7 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from knightcube.vision.camera.knowledge import EXACT, CameraKnowledge
+from knightcube.vision.camera.lens import EXACT, CameraKnowledge
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
 from knightcube.vision.startracker.detection import DetectionSettings

@@ -20,7 +20,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
-from knightcube.vision.sun.strings import SolarStrings, coarse_sun
+from knightcube.vision.sun.solar_cells import SolarStrings, coarse_sun
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from sim_hal.worlds.solar_strings import SolarStringsModel

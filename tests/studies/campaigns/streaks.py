@@ -17,7 +17,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
-from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.startracker.two_ends import attitudes_of_ends
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate

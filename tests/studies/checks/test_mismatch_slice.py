@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.knowledge import EXACT
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import EXACT, Pinhole
 from tests.studies.campaigns import mismatch
 from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.imperfections import IMPERFECTIONS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from tests.studies.streak_bound import endpoint_bound, rate_bound
 
 _ELECTRONS = 1.9e10 * np.pi / 4.0 * 0.025**2 * 0.2

@@ -11,11 +11,10 @@ from enum import IntFlag
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
 from knightcube.vision.frame.background import MAD_TO_SIGMA
 from knightcube.vision.frame.regions import label_pixels
 from knightcube.vision.frame.saturation import saturation_level
-from knightcube.vision.records import select
 from knightcube.vision.startracker.detection.measurement import (
     FrameSpread,
     Measured,

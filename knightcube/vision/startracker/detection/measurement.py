@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.frame.hot_pixels import are_hot
+from knightcube.vision.frame.regions import are_hot
 from knightcube.vision.startracker.detection.psf_fit import (
     FLUX,
     WIDTH,

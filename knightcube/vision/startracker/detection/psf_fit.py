@@ -18,8 +18,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.vision.records import select
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from knightcube.vision.frame.background import (
     interpolation_weights,
     place_among_blocks,
 )
-from knightcube.vision.frame.hot_pixels import find_hot_pixels
+from knightcube.vision.frame.regions import find_hot_pixels
 
 Float32Array = npt.NDArray[np.float32]
 

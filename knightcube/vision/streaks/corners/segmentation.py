@@ -11,10 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.vision.frame.box_sums import box_sum
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
+from knightcube.vision.frame.background import box_sum
 from knightcube.vision.frame.regions import label_pixels, moments
-from knightcube.vision.records import select
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.saturation import saturation_level
 from knightcube.vision.streaks.admission import admit, in_time, validate
 from knightcube.vision.streaks.corners.rate_fit import fit_rotation

@@ -12,8 +12,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.vision.frame.background import Background, estimate_background
-from knightcube.vision.frame.hot_pixels import repair_hot_pixels
-from knightcube.vision.frame.regions import positions
+from knightcube.vision.frame.regions import positions, repair_hot_pixels
 from knightcube.vision.frame.saturation import saturation_level
 from knightcube.vision.streaks.corners.detectors import cornerness
 from knightcube.vision.streaks.corners.endpoints import find_corners

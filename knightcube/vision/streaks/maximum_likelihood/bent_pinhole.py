@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 # Rounds of the contraction that takes a lens' errors out of a place: they are parts of a hundred.
 _ROUNDS = 6

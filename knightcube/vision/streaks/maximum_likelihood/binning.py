@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.saturation import at_least
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 
 # Pieces lie within this many px of one circle, are this many turns apart, and differ in light by this factor.

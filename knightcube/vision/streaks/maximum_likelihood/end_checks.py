@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, positions
 from knightcube.vision.streaks.maximum_likelihood.scene import path_lengths

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.motion import sensitivities
 from knightcube.vision.streaks.maximum_likelihood.normal_equations import (
     ALONE,

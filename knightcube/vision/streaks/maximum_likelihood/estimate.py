@@ -13,7 +13,7 @@ from itertools import chain, islice
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame.saturation import saturation_count
 from knightcube.vision.streaks.admission import admit, in_time, validate
 from knightcube.vision.streaks.maximum_likelihood.blobs import Blobs

@@ -8,11 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import BoolArray, Image
-from knightcube.vision.frame.background import estimate_background
-from knightcube.vision.frame.box_sums import box_sum
-from knightcube.vision.frame.count_step import in_steps
-from knightcube.vision.frame.hot_pixels import find_hot_pixels
-from knightcube.vision.frame.saturation import at_least, saturation_count
+from knightcube.vision.frame.background import box_sum, estimate_background
+from knightcube.vision.frame.regions import find_hot_pixels
+from knightcube.vision.frame.saturation import at_least, in_steps, saturation_count
 
 Float32Array = npt.NDArray[np.float32]
 

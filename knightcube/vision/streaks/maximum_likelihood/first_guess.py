@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from knightcube.vision.streaks.maximum_likelihood.blobs import Blobs
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame

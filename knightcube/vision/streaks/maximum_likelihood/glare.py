@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray
-from knightcube.vision.frame.box_sums import box_sum
+from knightcube.vision.frame.background import box_sum
 from knightcube.vision.streaks.maximum_likelihood.blobs import Blobs
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.agreement import agreed_step
 from knightcube.vision.streaks.maximum_likelihood.equation_solver import Solution, moved, solve
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame

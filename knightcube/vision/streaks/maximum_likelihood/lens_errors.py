@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.bent_pinhole import BentPinhole
 from knightcube.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from knightcube.vision.streaks.maximum_likelihood.motion import moving, positions

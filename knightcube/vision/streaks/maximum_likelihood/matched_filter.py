@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.frame.box_sums import less_boxes
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.frame.background import less_boxes
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
 from knightcube.vision.streaks.maximum_likelihood.filter_peaks import (
     FARTHEST,

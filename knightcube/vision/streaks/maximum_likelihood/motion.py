@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.bent_pinhole import BentPinhole
 
 _TINY = 1e-12

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood import spot_model, streak_model
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from knightcube.vision.streaks.maximum_likelihood.scene import Scene

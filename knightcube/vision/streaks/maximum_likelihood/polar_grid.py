@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from knightcube.astro.arrays import Image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.binning import Binning
 from knightcube.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame

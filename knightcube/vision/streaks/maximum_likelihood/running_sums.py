@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from knightcube.vision.streaks.maximum_likelihood.polar_grid import PolarGrid, sampled
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.records import select
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions
 from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter
 

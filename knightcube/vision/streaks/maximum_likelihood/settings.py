@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from knightcube.vision.camera.knowledge import UNSTATED, CameraKnowledge
+from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
 
 _UNCALIBRATED = CameraKnowledge()
 

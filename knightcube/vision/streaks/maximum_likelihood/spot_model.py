@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions, sensitivities
 from knightcube.vision.streaks.maximum_likelihood.scene import window_times
 from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, moving, paths
 from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter

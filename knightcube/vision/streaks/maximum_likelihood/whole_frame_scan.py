@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from knightcube.vision.streaks.maximum_likelihood.polar_grid import polar_grid

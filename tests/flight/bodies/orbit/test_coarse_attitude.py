@@ -27,7 +27,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.sun.solar_cells import SolarStrings
 from sim_hal.worlds.solar_strings import SolarStringsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])

@@ -24,8 +24,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.wide_job import Sighted, WideFound
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])

@@ -13,7 +13,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.carried_sun import MEMORY
-from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.sun.solar_cells import SolarStrings
 
 SUN = np.array([0.36, 0.48, 0.8])
 FIELD = np.array([2e-5, 0.0, 3e-5])

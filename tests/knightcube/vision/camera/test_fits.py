@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
-from knightcube.vision.camera.fits import primary_image
-from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.images import primary_image, read_image
 
 PIXELS = np.array([[0, 1, 2], [127, 128, 255]])
 

@@ -8,8 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.lens import CameraModel, Lens, LensError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import CameraModel, Lens, LensError, Pinhole
 
 _PINHOLE = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 CAMERA = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
 COLUMN = st.floats(-0.5, 1023.5)

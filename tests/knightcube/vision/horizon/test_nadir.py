@@ -10,16 +10,20 @@ import pytest
 
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.reference.horizon.circle import fit_circle
+from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.camera.pixel_access import ArrayPixels
 from knightcube.vision.horizon.edges import find_edges
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
 from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT, limb_light
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
-from knightcube.vision.horizon.solution import HorizonSolution, HorizonStatus
+from knightcube.vision.horizon.nadir import HorizonSolution, HorizonStatus, find_nadir
+from knightcube.vision.horizon.settings import (
+    EdgeSettings,
+    HorizonKnowledge,
+    HorizonSettings,
+    RoughAttitude,
+    SensedDirection,
+)
 from sim_hal.earth_camera import Atmosphere, EarthScene, limb_truth, nadir, render
 from tests.sim_hal.earth_camera.scenes import limb_scene, random_scene
 from tests.studies.campaigns.campaign import Result, fly_here

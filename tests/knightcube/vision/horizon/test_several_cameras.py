@@ -11,14 +11,13 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.cameras import cameras_by_limb
-from knightcube.vision.horizon.filled_camera import coarse_nadir, light_seen
-from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
 from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
+from knightcube.vision.horizon.nadir import HorizonStatus
+from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, SensedDirection
 from knightcube.vision.horizon.several_cameras import JointNadir, nadir_of_cameras
-from knightcube.vision.horizon.solution import HorizonStatus
-from sim_hal.earth_camera import EarthScene, limb_truth, render
+from sim_hal.earth_camera import EarthScene, render
 from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_geometry import suite
 
@@ -143,7 +142,7 @@ def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
         nadir = boresight + off @ aside
         seen = instant(VT, nadir / np.linalg.norm(nadir), np.array([0.9, 0.3, 0.1]), seed)
         assert nadir_of_cameras(seen.frames, VT, seen.knowledge(), SETTINGS).nadir is None
-        looks = [light_seen(frame, VT[number], EARTHLIGHT) for number, frame in seen.frames.items()]
+        looks = [image_brightness(frame, VT[number], EARTHLIGHT) for number, frame in seen.frames.items()]
         assert [round(look.share, 1) for look in looks] == [1.0, 0.0, 0.0]
         coarse = coarse_nadir(looks, ALTITUDE, seen.sun_in_body)
         assert coarse is not None
@@ -155,18 +154,5 @@ def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
 
 def test_dark_pictures_give_no_coarse_nadir() -> None:
     dark = np.full((512, 512), 8, dtype=np.uint8)
-    looks = [light_seen(dark, camera, EARTHLIGHT) for camera in VT]
+    looks = [image_brightness(dark, camera, EARTHLIGHT) for camera in VT]
     assert coarse_nadir(looks, ALTITUDE, np.array([0.0, 0.0, 1.0])) is None
-
-
-def test_the_camera_with_the_most_sunlit_limb_is_read_first(level: Instant) -> None:
-    """Against the simulator's own limb, on the ellipsoid and through the lens."""
-    order = cameras_by_limb(level.nadir, ALTITUDE, level.sun_in_body, UW)
-    truth = [limb_truth(scene, MODEL, count=720).solar_cosines for scene in level.scenes]
-    lit = {
-        number: np.count_nonzero(cosines > 0.0) * 2.0 * np.pi / 720 for number, cosines in enumerate(truth)
-    }
-    assert [one.lit for one in order] == sorted((one.lit for one in order), reverse=True)
-    for one in order:
-        assert one.lit == pytest.approx(lit[one.index], abs=0.15)
-    assert order[-1].index == 3

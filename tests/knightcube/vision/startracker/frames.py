@@ -9,7 +9,7 @@ import numpy as np
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion

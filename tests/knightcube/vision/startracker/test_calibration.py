@@ -10,8 +10,7 @@ from ground.calibration.calibration import PARAMETERS, Calibration, LensPrior, c
 from ground.calibration.lens_fit import CalibrationError, Fit, MatchedFrame, parameters_of, residuals, step
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
-from knightcube.vision.camera.lens import Lens
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Lens, Pinhole
 
 _OPEN = LensPrior(np.inf, np.inf, np.inf, np.inf)
 

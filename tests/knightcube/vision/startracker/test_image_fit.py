@@ -14,7 +14,7 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, fit_in_image
 from tests.studies.bench.untold_lens import drawn
 

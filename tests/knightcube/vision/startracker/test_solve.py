@@ -17,7 +17,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus

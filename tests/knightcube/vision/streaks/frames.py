@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.special import erf
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 
 # Stars on the whole sky brighter than V, Hipparcos.
 _COUNTS_V = (6.0, 6.5, 7.0, 8.0, 8.5)

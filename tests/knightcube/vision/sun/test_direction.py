@@ -12,11 +12,9 @@ from flight.schema.orbit_devices import WideCamera
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.errors import UsageError
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.sun.direction import find_sun
-from knightcube.vision.sun.settings import LINEAR, SunSettings
-from knightcube.vision.sun.solution import SunStatus
+from knightcube.vision.sun.direction import LINEAR, SunSettings, SunStatus, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction
 from sim_hal.orbit_assembly import wide_model
 from tests.sim_hal.earth_camera.scenes import LOW, pointing

@@ -9,12 +9,11 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import from_matrix, from_rotation_vector
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.horizon.vector_method import shortest_turn
-from knightcube.vision.sun.settings import SunSettings
+from knightcube.vision.camera.lens import MountedCamera
+from knightcube.vision.horizon.initial_guess import shortest_turn
+from knightcube.vision.sun.direction import SunSettings, SunStatus
 from knightcube.vision.sun.several_cameras import sun_of_cameras
-from knightcube.vision.sun.solution import SunStatus
-from knightcube.vision.sun.strings import CoarseSun, CoarseSunStatus, SolarStrings, coarse_sun
+from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, SolarStrings, coarse_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction
 from tests.sim_hal.earth_camera.scenes import random_sun_scene
 

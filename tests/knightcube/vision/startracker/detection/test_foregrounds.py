@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.frame.hot_pixels import are_hot
+from knightcube.vision.frame.regions import are_hot
 from tests.studies.bench.foregrounds import found_boresight, photographed, rendered, rows_of, spoilt_scene
 from tests.studies.bench.sky import PHOTOGRAPHS, angle_arcsec
 

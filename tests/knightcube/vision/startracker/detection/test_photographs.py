@@ -11,7 +11,7 @@ import pytest
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.detection import FrameKind, detect, kind_of_frame
 
 SKY = Path(__file__).parents[5].parent / "shared" / "data" / "sky"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood.binning import Binning
 from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult

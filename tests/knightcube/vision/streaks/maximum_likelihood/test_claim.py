@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.vision.camera.knowledge import EXACT, UNSTATED, CameraKnowledge
+from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
 from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from knightcube.vision.streaks.maximum_likelihood.iteration import ExposedCamera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.maximum_likelihood import spot_model, streak_model
 from knightcube.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, moving, paths, sensitivities

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.frame.count_step import in_steps
+from knightcube.vision.frame.saturation import in_steps
 
 _EIGHT_BITS = np.random.default_rng(1).normal(20.0, 2.0, (64, 96)).astype(np.uint8)
 

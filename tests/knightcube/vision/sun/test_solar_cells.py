@@ -11,9 +11,9 @@ from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.errors import UsageError
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.sun.cameras import cameras_by_sun
-from knightcube.vision.sun.strings import CoarseSun, CoarseSunStatus, SolarStrings, coarse_sun
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.sun.several_cameras import cameras_by_sun
+from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, SolarStrings, coarse_sun
 from sim_hal.worlds.solar_strings import SolarStringsModel
 from tests.sim_hal.earth_camera.scenes import pointing, random_direction
 

@@ -9,11 +9,18 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.vision.horizon.cone import nadirs_of_pairs, nadirs_of_triples
-from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS, earth, mean_sphere
 from knightcube.vision.horizon.illumination import limb_rays, sun_elevation
-from knightcube.vision.horizon.limb_equation import View, limb_gradients, limb_residuals
-from knightcube.vision.horizon.limb_fit import Prior, fit_limb
+from knightcube.vision.horizon.initial_guess import nadirs_of_pairs, nadirs_of_triples
+from knightcube.vision.horizon.limb_fit import (
+    MEAN_RADIUS,
+    Prior,
+    View,
+    earth,
+    fit_limb,
+    limb_gradients,
+    limb_residuals,
+    mean_sphere,
+)
 from sim_hal.earth_camera import EarthScene
 from sim_hal.earth_camera.truth import limb_directions
 

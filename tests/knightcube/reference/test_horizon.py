@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.reference.horizon.circle import Circle, NoCircleError, fit_circle
-from knightcube.reference.horizon.graphic_method import (
+from knightcube.reference.horizon import (
     GraphicMethodError,
+    HorizonCircle,
     LevelCamera,
+    NoCircleError,
+    first_edges,
+    fit_circle,
     graphic_nadir,
+    high_average,
     horizon_plane_depth,
+    horizon_points,
+    propagated_nadir,
 )
-from knightcube.vision.horizon.binary_edges import first_edges, high_average, horizon_points, run_filtered
-from knightcube.vision.horizon.limb_equation import turn
-from knightcube.vision.horizon.vector_method import carried_nadir, shortest_turn
+from knightcube.vision.horizon.edges import run_filtered
+from knightcube.vision.horizon.initial_guess import shortest_turn
+from knightcube.vision.horizon.limb_fit import turn
 
 PAPER_POINTS = np.array([[258.0, 128.0], [215.0, 256.0], [200.0, 384.0]])
 """Edge points of the MAQSAT picture (Meller 3.1)."""
@@ -87,7 +93,7 @@ CAMERAS = (
 BORESIGHTS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
-def _seen_circle(camera: LevelCamera, boresight: FloatArray, nadir: FloatArray) -> Circle:
+def _seen_circle(camera: LevelCamera, boresight: FloatArray, nadir: FloatArray) -> HorizonCircle:
     """Return the circle through three limb points at the picture's middle, projected exactly."""
     right = np.array([*camera.right, 0.0])
     down = np.array([0.0, 0.0, 1.0])
@@ -118,7 +124,7 @@ def test_the_horizon_plane_lies_below_by_the_tangents_projection() -> None:
 
 
 def test_cameras_that_look_the_same_way_are_refused() -> None:
-    circle = Circle(np.array([255.5, 900.0]), 600.0)
+    circle = HorizonCircle(np.array([255.5, 900.0]), 600.0)
     with pytest.raises(GraphicMethodError, match="nearly parallel"):
         graphic_nadir((CAMERAS[0], CAMERAS[0]), (circle, circle), ALTITUDE)
 
@@ -129,7 +135,7 @@ def test_nadir_is_carried_on_by_the_rotation_of_a_sight() -> None:
     rotation = turn(np.array([0.02, -0.01, 0.0]))
     nadir = np.array([0.1, 0.9, 0.3])
     nadir /= np.linalg.norm(nadir)
-    assert carried_nadir(nadir, before, rotation @ before) == pytest.approx(rotation @ nadir, abs=1e-12)
+    assert propagated_nadir(nadir, before, rotation @ before) == pytest.approx(rotation @ nadir, abs=1e-12)
 
 
 def test_the_shortest_turn_is_a_rotation_even_between_opposites() -> None:

@@ -9,12 +9,10 @@ import pytest
 
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.horizon.chance import LimbInView, limb_in_view, log10_chance
-from knightcube.vision.horizon.knowledge import HorizonKnowledge
-from knightcube.vision.horizon.nadir import find_nadir
-from knightcube.vision.horizon.settings import HorizonSettings
-from knightcube.vision.horizon.solution import HorizonStatus
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.horizon.hypothesis import LimbInView, limb_in_view, log10_chance
+from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
+from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 FAR = (100e3, 40e6)

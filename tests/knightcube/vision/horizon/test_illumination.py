@@ -9,11 +9,9 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.vision.camera.mounted import MountedCamera
-from knightcube.vision.camera.pinhole import Pinhole
-from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS
-from knightcube.vision.horizon.false_picture import why_false
-from knightcube.vision.horizon.filled_camera import light_seen
+from knightcube.vision.camera.lens import MountedCamera, Pinhole
+from knightcube.vision.horizon.illumination import image_brightness, why_false
+from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
 from knightcube.vision.wide_job import SUNLIT_COUNTS
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.earth_camera.model import EarthCameraModel
@@ -42,7 +40,7 @@ def view(seed: int) -> tuple[Image, FloatArray, float, FloatArray]:
 
 
 def judged(picture: Image, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
-    return why_false(light_seen(picture, CAMERA, SUNLIT_COUNTS), nadir, altitude, sun)
+    return why_false(image_brightness(picture, CAMERA, SUNLIT_COUNTS), nadir, altitude, sun)
 
 
 def test_no_sound_picture_is_false() -> None:

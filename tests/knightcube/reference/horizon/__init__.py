@@ -1,1 +1,0 @@
-"""Tests of the horizon methods kept for comparison."""
