@@ -45,12 +45,12 @@ from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config, Executive
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.gnc.tracking.tracker import TrackSettings
-from knightcube.vision import frame_job, wide_job
+from knightcube.vision import frame_job, horizon_camera_job
 from knightcube.vision.camera.exposure import Exposures
 from knightcube.vision.camera.lens import CameraKnowledge
 from knightcube.vision.frame_job import TrackerSettings
 from knightcube.vision.kept_frames import KeptFrames
-from knightcube.vision.objects.sighted import SightSettings
+from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
@@ -103,7 +103,9 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         tracker=_tracker(camera),
         angular_acceleration_psd=body.estimation.angular_acceleration_psd,
         velocity=body.estimation.velocity,
-        objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
+        objects=None
+        if camera.objects is None
+        else ObjectMeasurementSettings(faintest=camera.objects.faintest),
         knowledge=body.estimation.knowledge,
         seeks=body.control.follows_objects,
         calm=body.control.exposure_start,
@@ -177,7 +179,7 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     if config.camera is not None:
         made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     if config.wide_cameras:
-        made.append(Worker(wide_task.WORKER, wide_job.run, vision_latency_ns, vision_timeout_ns))
+        made.append(Worker(wide_task.WORKER, horizon_camera_job.run, vision_latency_ns, vision_timeout_ns))
     return made
 
 

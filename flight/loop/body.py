@@ -26,7 +26,7 @@ from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
-from knightcube.vision.wide_job import WideFound, WideJob
+from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 
 COMMANDED = 1000
 """Commanded slews are numbered from here on."""
@@ -310,10 +310,10 @@ class WideCameraUse(Protocol):
     def needed(self) -> bool:
         """Whether the cameras are to be read often, as little else tells the attitude."""
 
-    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+    def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
         """Return the worker's job for frames by their cameras' numbers."""
 
-    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+    def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
         """Accept Sun and nadir of a time; return whether each of them was used."""
 
 

@@ -20,8 +20,7 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.objects.detect import detect
-from knightcube.vision.objects.report import SpaceObject
+from knightcube.vision.objects.detect import SpaceObject, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate

@@ -25,7 +25,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.kept_frames import KeptFrames, keep_frame
-from knightcube.vision.objects.sighted import Sighted, SightSettings
+from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
@@ -99,7 +99,7 @@ class FrameJob:
     attitude_prior: AttitudePrior | None
     previous_checksum: int | None = None
     motion_first: bool = True
-    objects: SightSettings | None = None
+    objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
 
 
@@ -112,7 +112,7 @@ class FrameFound:
 
     motion: Found
     solution: FrameSolution | None
-    objects: Sighted | None = None
+    objects: MeasuredObjects | None = None
 
 
 def run(job: FrameJob) -> FrameFound:
@@ -285,12 +285,16 @@ def _motion(job: FrameJob) -> Found:
 
 
 def _objects(
-    job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, solution: FrameSolution, settings: SightSettings
-) -> Sighted | None:
+    job: FrameJob,
+    tracker: TrackerSettings,
+    sky: SkyIndex,
+    solution: FrameSolution,
+    settings: ObjectMeasurementSettings,
+) -> MeasuredObjects | None:
     """Return what may be objects."""
-    from knightcube.vision.objects.sight import sight  # noqa: PLC0415 - scipy comes with it
+    from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - scipy comes with it
 
-    return sight(
+    return measure_objects(
         job.pixels,
         solution,
         job.exposure,

@@ -43,8 +43,8 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
+from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult, MeasuredDirection
 from knightcube.vision.sun.solar_cells import FieldAndStrings, Sky, SolarStrings, StringFix
-from knightcube.vision.wide_job import Sighted, WideFound, WideJob
 
 PERIOD_NS = 5 * SECOND_NS
 """Between readings that are judged: more often they say nothing new."""
@@ -200,14 +200,16 @@ class WideFeed:
         dark = around is not None and around.sunlit <= 0.0
         return not dark or self._filter.knowledge is Knowledge.LOST
 
-    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+    def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
         """Return the worker's job for frames of one instant, with what is known of their time."""
         times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
         time_ns = sum(times) // len(times)
         pixels = {number: frame.pixels for number, frame in frames.items()}
-        return WideJob(pixels, self._cameras, self._known(time_ns), self._strings(time_ns), self._response)
+        return HorizonCameraJob(
+            pixels, self._cameras, self._known(time_ns), self._strings(time_ns), self._response
+        )
 
-    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+    def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
         """Start the filter from Sun, nadir and field, or feed it; return whether Sun and nadir were used."""
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
@@ -316,7 +318,7 @@ def wide_feed_of(
     return WideFeed(cameras, error, filter_, environment, sun, response)
 
 
-def _is_of_strings(sun: Sighted | None) -> bool:
+def _is_of_strings(sun: MeasuredDirection | None) -> bool:
     return sun is not None and not sun.cameras
 
 

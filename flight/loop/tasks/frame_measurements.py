@@ -23,7 +23,7 @@ from knightcube.vision.camera.exposure import Exposures
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
 from knightcube.vision.kept_frames import KeptFrames
-from knightcube.vision.objects.sighted import SightSettings
+from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.solution import (
     NODES,
     FrameSolution,
@@ -80,7 +80,7 @@ class ImagingSettings:
     knowledge: Callable[[], Knowledge]
     seeks: Callable[[], bool]
     calm: Callable[[int, int], int]
-    objects: SightSettings | None = None
+    objects: ObjectMeasurementSettings | None = None
     kept: KeptFrames | None = None
 
 

@@ -35,7 +35,7 @@ from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, Track, TrackSettings
 from knightcube.vision.frame_job import FrameFound
-from knightcube.vision.objects.sighted import Sighted
+from knightcube.vision.objects.settings import MeasuredObjects
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 _ROWS = 32
@@ -79,7 +79,7 @@ class ObjectTracks:
         self._recorder = services.recorder
         self._events = services.events
 
-    def ingest(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
+    def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
         """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
         self._record_sightings(sequence, middle_ns, sighted, now_ns)
         orbit = self._body.estimation.orbit(middle_ns)
@@ -104,7 +104,7 @@ class ObjectTracks:
             self._record_track(track, now_ns)
         self._body.control.accept_tracks(self._tracker.objects, now_ns)
 
-    def _record_sightings(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
+    def _record_sightings(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,

@@ -18,7 +18,7 @@ from flight.loop.fdir import facts
 from flight.loop.services import Services
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import DeviceError
-from knightcube.vision.wide_job import WideFound
+from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 WORKER = "wide"
 _SPARSE = 8
@@ -92,7 +92,7 @@ class WideImaging:
             text = f"wide cameras: {result.outcome}: {result.error}"
             self._services.events.report(events.VISION_FAILED, now_ns, text)
             return
-        found: WideFound = result.value
+        found: HorizonCameraResult = result.value
         self._judge(found, now_ns)
         used = self._sight.accept(job[0], found)
         self._record(now_ns, job, found, used)
@@ -152,7 +152,7 @@ class WideImaging:
             text = f"{text}: {error}" if error else text
         self._services.facts.update(facts.WIDE_LOST, bool(old), now_ns, text)
 
-    def _judge(self, found: WideFound, now_ns: int) -> None:
+    def _judge(self, found: HorizonCameraResult, now_ns: int) -> None:
         """Report cameras whose pictures are not of what they must see."""
         if found.false is None:
             return
@@ -163,7 +163,7 @@ class WideImaging:
         self._services.facts.update(facts.WIDE_FALSE, bool(found.false), now_ns, text)
 
     def _record(
-        self, now_ns: int, job: tuple[int, int, int], found: WideFound, used: tuple[bool, bool]
+        self, now_ns: int, job: tuple[int, int, int], found: HorizonCameraResult, used: tuple[bool, bool]
     ) -> None:
         sun, nadir, recorder = found.sun, found.nadir, self._services.recorder
         recorder.record(

@@ -1,7 +1,8 @@
-"""Resident space objects among the streaks of one frame (Sease chapter 4).
+"""Resident space objects in a frame of stars (Sease chapter 4).
 
-`detect` composes: `rso_indicators` (which streaks do not move as the stars do), `short_regions` (points),
-`judge` (whether stars explain the pixels: `star_light`; with the stars removed: `merged`), `report`.
+`detect` finds objects among streaks: `rso_indicators` selects the streaks that do not move as the stars do,
+`star_light` tests whether stars explain the pixels, and `merged` searches a region once its stars are
+removed.
 
-`sight` gives directions among the stars of what may be objects, in frames of streaks or points (`sighted`).
+`measure` gives the directions of possible objects among the stars, in frames of streaks or of points.
 """

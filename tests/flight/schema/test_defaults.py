@@ -37,7 +37,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "OrbitFilterSettings": (orbit.OrbitEstimation, orbit.Craft),
     "PlanningSettings": (testbed.Guidance,),
     "ResponseSettings": (testbed.Plant, devices.InertialUnit),
-    "SightSettings": (devices.ObjectTracking,),
+    "ObjectMeasurementSettings": (devices.ObjectTracking,),
     "SolveSettings": OF_CAMERA,
     "StationSettings": (sections.Link,),
     "StreakSettings": OF_CAMERA,

@@ -9,7 +9,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
-from knightcube.vision.objects.sighted import SightSettings
+from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -41,5 +41,12 @@ def frame_job(
     rate = RatePrior(turn, 1e-4) if knows else None
     attitude = AttitudePrior(multiply(off, held), 1e-4) if knows else None
     return FrameJob(
-        pixels, CAMERA.pinhole, EXPOSURE, likelihood, tracker, rate, attitude, objects=SightSettings()
+        pixels,
+        CAMERA.pinhole,
+        EXPOSURE,
+        likelihood,
+        tracker,
+        rate,
+        attitude,
+        objects=ObjectMeasurementSettings(),
     )

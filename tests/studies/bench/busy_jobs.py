@@ -84,14 +84,14 @@ def see(job: Any) -> Any:
 
 def see_wide(job: Any) -> Any:
     """Work on the wide cameras' frames."""
-    return _again("knightcube.vision.wide_job", job)
+    return _again("knightcube.vision.horizon_camera_job", job)
 
 
 BUSY: dict[str, Callable[[Any], Any]] = {
     "knightcube.gnc.guidance.one_axis.job": plan_testbed,
     "knightcube.gnc.control.three_axes.pointing_job": plan_orbit,
     "knightcube.vision.frame_job": see,
-    "knightcube.vision.wide_job": see_wide,
+    "knightcube.vision.horizon_camera_job": see_wide,
 }
 """By the module of the job that is done again."""
 

@@ -76,7 +76,7 @@ _ROLES = {
     "knightcube.gnc.guidance.one_axis.job": "planner",
     "knightcube.gnc.control.three_axes.pointing_job": "planner",
     "knightcube.vision.frame_job": "vision",
-    "knightcube.vision.wide_job": "wide",
+    "knightcube.vision.horizon_camera_job": "wide",
     "hal.guardian": "guardian",
     "tests.studies.bench.busy_jobs:plan_testbed": "planner",
     "tests.studies.bench.busy_jobs:plan_orbit": "planner",

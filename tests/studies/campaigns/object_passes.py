@@ -29,7 +29,7 @@ from knightcube.gnc.tracking.tracker import FrameSightings, LineOfSightState, Ob
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look
-from knightcube.vision.objects.sighted import Sighted, SightSettings
+from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
@@ -141,7 +141,7 @@ class _Frame:
     motion: FloatArray
     observer: FloatArray
 
-    def sighted(self, magnitude: float | None, rng: np.random.Generator) -> Sighted | None:
+    def sighted(self, magnitude: float | None, rng: np.random.Generator) -> MeasuredObjects | None:
         """Return what the frame shows, by the flight's own vision."""
         times = np.linspace(-0.5 * EXPOSURE, 0.5 * EXPOSURE, 9)
         attitudes = np.array([multiply(from_rotation_vector(self.turn * t), self.quaternion) for t in times])
@@ -159,11 +159,17 @@ class _Frame:
         off = from_rotation_vector(rng.normal(scale=1e-4, size=3))
         priors = RatePrior(self.turn, 1e-4), AttitudePrior(multiply(off, self.quaternion), 1e-4)
         job = FrameJob(
-            pixels, CAMERA.pinhole, EXPOSURE, likelihood, tracker, *priors, objects=SightSettings()
+            pixels,
+            CAMERA.pinhole,
+            EXPOSURE,
+            likelihood,
+            tracker,
+            *priors,
+            objects=ObjectMeasurementSettings(),
         )
         return look(job).objects
 
-    def judged(self, sighted: Sighted | None, magnitude: float | None) -> Result:
+    def judged(self, sighted: MeasuredObjects | None, magnitude: float | None) -> Result:
         """Return the sighting's error and claim, px of an axis, the bound, and how many others there are."""
         if sighted is None:
             return {"solved": False, "others": 0}

@@ -19,8 +19,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.vision.camera.lens import EXACT
-from knightcube.vision.objects.detect import detect
-from knightcube.vision.objects.report import ObjectReport
+from knightcube.vision.objects.detect import ObjectReport, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate

@@ -20,7 +20,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
-from knightcube.vision.objects.report import ObjectReport
+from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.rso import source_tracks
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.objects.report import ObjectReport
+from knightcube.vision.objects.detect import ObjectReport
 
 Shown = tuple[str, Image, ObjectReport | None, FloatArray]
 """A title, a frame, what was found in it, and where the object is: ends (2, 2) px."""

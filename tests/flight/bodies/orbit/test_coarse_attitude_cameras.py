@@ -25,7 +25,7 @@ from knightcube.gnc.estimation.estimate import Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.wide_job import Sighted, WideFound
+from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])
@@ -70,16 +70,18 @@ class Still:
             times = (self.now_ns, self.now_ns, self.now_ns)
             self.filter.accept(ImuReading(*times, self.attitude, np.zeros(3), field, np.zeros(3)))
 
-    def seen(self, sigma: float, sun: bool = True, nadir: bool = True, turn: float = 0.0) -> WideFound:
+    def seen(
+        self, sigma: float, sun: bool = True, nadir: bool = True, turn: float = 0.0
+    ) -> HorizonCameraResult:
         """Return what the cameras show of a body that is turned by `turn` rad from where it is."""
         body = attitude_matrix(multiply(from_rotation_vector(np.array([turn, 0.0, 0.0])), self.attitude))
 
-        def sighted(direction: FloatArray) -> Sighted:
-            return Sighted(body @ direction, sigma**2 * np.eye(3), (0,))
+        def sighted(direction: FloatArray) -> MeasuredDirection:
+            return MeasuredDirection(body @ direction, sigma**2 * np.eye(3), (0,))
 
-        return WideFound(sighted(SUN) if sun else None, sighted(DOWN) if nadir else None)
+        return HorizonCameraResult(sighted(SUN) if sun else None, sighted(DOWN) if nadir else None)
 
-    def look(self, found: WideFound) -> tuple[bool, bool]:
+    def look(self, found: HorizonCameraResult) -> tuple[bool, bool]:
         return self.feed.accept(self.now_ns - SECOND_NS, found)
 
     @property
@@ -100,7 +102,7 @@ def test_sun_and_nadir_start_the_filter_and_one_direction_with_the_field_does() 
 def test_a_nadir_of_eleven_degrees_starts_it_too_and_alone_says_nothing() -> None:
     craft = Still(2)
     craft.rest(3)
-    assert craft.look(WideFound(None, None)) == (False, False)
+    assert craft.look(HorizonCameraResult(None, None)) == (False, False)
     assert craft.look(craft.seen(np.radians(11.0), sun=False)) == (False, True)
     assert craft.filter.runs
 
@@ -153,7 +155,7 @@ def test_the_strings_own_sun_is_not_fed_twice() -> None:
     craft.rest(1)
     found = craft.seen(1e-4, nadir=False)
     assert found.sun is not None
-    strings = WideFound(Sighted(found.sun.direction, found.sun.covariance, ()), None)
+    strings = HorizonCameraResult(MeasuredDirection(found.sun.direction, found.sun.covariance, ()), None)
     assert craft.look(strings) == (False, False)
     assert craft.look(found) == (True, False)
 

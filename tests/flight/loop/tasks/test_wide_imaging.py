@@ -16,7 +16,7 @@ from flight.loop.tasks.wide_imaging import WORKER, WideImaging, WideSettings
 from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS
-from knightcube.vision.wide_job import Sighted, WideFound, WideJob
+from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult, MeasuredDirection
 
 SETTINGS = WideSettings((5_000_000, 5_000_000), 5 * SECOND_NS, 60 * SECOND_NS, 2 * SECOND_NS, 120 * SECOND_NS)
 
@@ -71,18 +71,18 @@ class Bench:
         assert fact in {facts.WIDE_LOST, facts.WIDE_FALSE}
         (self.said if fact is facts.WIDE_LOST else self.false).append(holds)
 
-    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+    def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
         self.jobs.append(frames)
-        return cast(WideJob, None)
+        return cast(HorizonCameraJob, None)
 
-    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+    def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
         self.accepted.append(time_ns)
         return found.sun is not None, False
 
     def fly(self, seconds: int) -> None:
         """Run once a second; the worker answers within the next."""
-        sun = Sighted(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,))
-        found = WideFound(sun, None, false=self.denied)
+        sun = MeasuredDirection(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,))
+        found = HorizonCameraResult(sun, None, false=self.denied)
         for _ in range(seconds):
             if self.task.busy_since_ns() is not None:
                 self.task.finish(JobResult(WORKER, "done", found, "", 0, 0, 0), self.now_ns)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.objects.detect import detect
-from knightcube.vision.objects.report import ObjectReport, SpaceObject, Verdict
+from knightcube.vision.objects.detect import ObjectReport, SpaceObject, Verdict, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion

@@ -11,7 +11,7 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.vision.frame_job import FrameFound, run
-from knightcube.vision.objects.sighted import Sighted
+from knightcube.vision.objects.settings import MeasuredObjects
 from knightcube.vision.startracker.index.build import default_index
 from sim_hal.star_camera import SourceTrack
 from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
@@ -36,7 +36,7 @@ class Shot:
         seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
         return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))
 
-    def sighting(self, sighted: Sighted | None) -> int | None:
+    def sighting(self, sighted: MeasuredObjects | None) -> int | None:
         """Return which sighting is within a pixel of it."""
         assert sighted is not None
         away = np.linalg.norm(sighted.points - self.place, axis=1)

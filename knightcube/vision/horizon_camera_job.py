@@ -30,7 +30,7 @@ JUDGING_SIGMA = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WideJob:
+class HorizonCameraJob:
     """Frames of one instant, by their cameras' numbers, and what is known besides.
 
     Attributes:
@@ -48,7 +48,7 @@ class WideJob:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sighted:
+class MeasuredDirection:
     """A direction (3,) in body axes with its covariance (3, 3) rad^2, and the cameras that gave it.
 
     Without a camera it is the Sun of the strings, or a nadir by the light in all frames.
@@ -65,7 +65,7 @@ class Sighted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WideFound:
+class HorizonCameraResult:
     """Sun and nadir, None where there is none, and why.
 
     Attributes:
@@ -73,14 +73,14 @@ class WideFound:
             where no attitude judged.
     """
 
-    sun: Sighted | None
-    nadir: Sighted | None
+    sun: MeasuredDirection | None
+    nadir: MeasuredDirection | None
     sun_reason: str = ""
     nadir_reason: str = ""
     false: Mapping[int, str] | None = None
 
 
-def run(job: WideJob) -> WideFound:
+def run(job: HorizonCameraJob) -> HorizonCameraResult:
     """Return Sun and nadir; at the top level of a module for the worker process to import."""
     sun, sun_reason = _sun(job)
     knowledge = job.knowledge
@@ -88,10 +88,10 @@ def run(job: WideJob) -> WideFound:
         known = SensedDirection(sun.direction, knowledge.sun, sun.sigma)
         knowledge = replace(knowledge, sensed=(*knowledge.sensed, known))
     nadir, nadir_reason = _nadir(job, knowledge, sun)
-    return WideFound(sun, nadir, sun_reason, nadir_reason, _false(job))
+    return HorizonCameraResult(sun, nadir, sun_reason, nadir_reason, _false(job))
 
 
-def _sun(job: WideJob) -> tuple[Sighted | None, str]:
+def _sun(job: HorizonCameraJob) -> tuple[MeasuredDirection | None, str]:
     from knightcube.vision.sun.direction import LINEAR, SunSettings  # noqa: PLC0415 - see the top
     from knightcube.vision.sun.several_cameras import sun_of_cameras  # noqa: PLC0415
     from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
@@ -103,7 +103,7 @@ def _sun(job: WideJob) -> tuple[Sighted | None, str]:
     if found.direction is None or found.covariance is None:
         return None, found.reason
     cameras = () if found.camera is None else (found.camera,)
-    return Sighted(found.direction, found.covariance, cameras), found.reason
+    return MeasuredDirection(found.direction, found.covariance, cameras), found.reason
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
@@ -114,7 +114,7 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
     return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
 
 
-def _false(job: WideJob) -> dict[int, str] | None:
+def _false(job: HorizonCameraJob) -> dict[int, str] | None:
     """Return why pictures are not of what a fine attitude puts before their cameras; None without one."""
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
     from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
@@ -129,7 +129,9 @@ def _false(job: WideJob) -> dict[int, str] | None:
     return {n: reason for n, reason in reasons.items() if reason}
 
 
-def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tuple[Sighted | None, str]:
+def _nadir(
+    job: HorizonCameraJob, knowledge: HorizonKnowledge, sun: MeasuredDirection | None
+) -> tuple[MeasuredDirection | None, str]:
     from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness  # noqa: PLC0415
     from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
     from knightcube.vision.horizon.nadir import HorizonStatus  # noqa: PLC0415
@@ -139,7 +141,7 @@ def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tu
     settings = HorizonSettings(edges=EdgeSettings(response=job.response))
     found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings)
     if found.nadir is not None:
-        return Sighted(found.nadir.direction, found.nadir.covariance, found.cameras), ""
+        return MeasuredDirection(found.nadir.direction, found.nadir.covariance, found.cameras), ""
     if found.status is not HorizonStatus.NO_HORIZON or knowledge.position is None:
         return None, found.reason
     looks = [
@@ -149,10 +151,10 @@ def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tu
     coarse = coarse_nadir(looks, altitude, _lit_from(knowledge, sun))
     if coarse is None:
         return None, found.reason
-    return Sighted(coarse.direction, coarse.covariance, ()), found.reason
+    return MeasuredDirection(coarse.direction, coarse.covariance, ()), found.reason
 
 
-def _lit_from(knowledge: HorizonKnowledge, sun: Sighted | None) -> FloatArray | None:
+def _lit_from(knowledge: HorizonKnowledge, sun: MeasuredDirection | None) -> FloatArray | None:
     """Return the Sun's direction (3,) in body axes, by sight or by a rough attitude; None where unknown."""
     if sun is not None:
         return sun.direction
