@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 STREAK = 20.0
-"""px, wanted: between 5, below which a rate is poor, and 100, where faint stars are lost."""
+"""Wanted streak length (px): rates are poor below 5 px, and faint stars are lost above 100 px."""
 POINT = 1.0
-"""px: a star that moves less in the usual exposure is a point."""
+"""Motion in the usual exposure (px) below which a star is a point."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,9 +34,9 @@ SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
-"""BITPIX to the pixels' type."""
+"""Pixel types by BITPIX."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
-"""The BZERO by which unsigned numbers are stored as signed ones (section 4.4.2.5)."""
+"""BZERO with which unsigned numbers are stored as signed numbers (section 4.4.2.5)."""
 
 
 def primary_image(content: bytes, name: str) -> Image:
@@ -114,13 +114,13 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 EXTRA = "pip install 'knightcube-flight[images]'"
 
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
-"""TIFF 6.0, section 8."""
+"""Tag and value of TIFF 6.0, section 8."""
 GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
-"""Pillow's names of grey pixels that are whole numbers of 8 or 16 bits."""
+"""Pillow's names of grey pixels of 8 or 16 bits."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Of red, green and blue: ITU-R BT.601."""
+"""Weights of red, green and blue (ITU-R BT.601)."""
 _NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
 # Pillow keeps the high byte of 16-bit colour. Given the other order of bytes, it keeps the low one.
 _OTHER_BYTES = {

@@ -280,24 +280,25 @@ class MountedCamera:
         object.__setattr__(self, "mounting", np.asarray(self.mounting, dtype=float))
         object.__setattr__(self, "to_camera", attitude_matrix(self.mounting))
 
-    def seen(self, directions: FloatArray) -> FloatArray:
-        """Return directions (..., 3), body axes, in the camera's."""
+    def in_camera(self, directions: FloatArray) -> FloatArray:
+        """Return directions (..., 3), given in body axes, in camera axes."""
         return np.asarray(directions @ self.to_camera.T)
 
     def in_body(self, rays: FloatArray) -> FloatArray:
-        """Return rays (..., 3), camera axes, in the body's."""
+        """Return rays (..., 3), given in camera axes, in body axes."""
         return np.asarray(rays @ self.to_camera)
 
 
 UNSTATED = 30e-6
-"""s from row to row, by which a shutter may roll that nobody described: 1,000 rows in 30 ms, as many do."""
+"""Standard deviation (s) of the line time of a shutter without a description: 1,000 rows in 30 ms are
+common."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraKnowledge:
-    """By how much a camera may differ from its description: standard deviations, 0 where it is exact.
+    """Standard deviations of a camera about its description; 0 where the description is exact.
 
-    The defaults are those of a camera that nobody calibrated, its field of view believed.
+    The defaults hold for a camera without calibration whose field of view is correct.
 
     Attributes:
         focal_length: share of itself.
@@ -313,4 +314,4 @@ class CameraKnowledge:
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
-"""A camera that is as it is described, as an emulated one."""
+"""Knowledge of a camera that equals its description, such as an emulated camera."""

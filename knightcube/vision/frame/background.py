@@ -18,7 +18,7 @@ from knightcube.astro.arrays import FloatArray, Image, IntArray
 _CLIP = 3.0
 _CLIPPED_SIGMA = 0.98658
 MAD_TO_SIGMA = 1.4826
-"""A normal variable's standard deviation over its median absolute deviation."""
+"""Ratio of the standard deviation of a normal variable to its median absolute deviation."""
 # Rounding to whole counts adds 1/12 count^2; where it hides all other noise it is the noise.
 _ROUNDING_VARIANCE = 1.0 / 12.0
 

@@ -19,7 +19,7 @@ from knightcube.vision.camera.pixel_access import PixelAccess
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
-"""px: window of the majority filter; shorter fluctuations are removed."""
+"""Window of the majority filter (px): shorter fluctuations are removed."""
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
@@ -39,26 +39,26 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 
 
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""px, standard deviations of the Gaussian."""
+"""Standard deviations of the Gaussian (px)."""
 _REACH = 3.0
-"""Scales: distance from the change of the binary line within which the steepest place is searched."""
+"""Largest distance, in scales, of the steepest point from the change of the binary line."""
 _TAIL = 3.5
-"""Scales: where the Gaussian is cut off."""
+"""Distance, in scales, at which the Gaussian is truncated."""
 _OUTGROWN = 1.4
-"""A doubled scale that gains more did not cover the edge: its spread is 1.4 scales."""
+"""Gain above which a doubled scale still does not cover the edge: its spread is 1.4 scales."""
 _MARGIN = 4.0
-"""px: edges nearer to the border are ignored; some detectors have a black frame."""
+"""Distance from the border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
-"""px and scales: error of an edge's place before the fit measures the scatter."""
+"""Prior error of an edge position: a constant (px) and a share of the scale."""
 _SAMPLES = 2048
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
-"""Median of absolute differences of two pixels to one pixel's standard deviation, of normal noise."""
+"""Ratio of the standard deviation of one pixel to the median absolute difference of two, normal noise."""
 _STANDS_OUT = 6.0
-"""Standard deviations of the dark; brighter pixels are lit."""
+"""Threshold of lit pixels, in standard deviations of dark pixels."""
 _LEAST_LIT = 16
-"""Samples: fewer lit ones are a hot pixel or a star."""
+"""Least number of lit samples: fewer are a hot pixel or a star."""
 _PROFILE: IntArray = np.arange(-9, 6)
-"""px from an edge towards the bright side: the samples that are kept."""
+"""Positions of the samples that are kept, px from the edge towards the bright side."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -321,7 +321,7 @@ def _slope(size: float) -> tuple[IntArray, FloatArray, int]:
 _RIGHT: FloatArray = np.array([1.0, 0.0])
 _DOWN: FloatArray = np.array([0.0, 1.0])
 _SAMPLE = 32
-"""px between samples along a line."""
+"""Distance between samples along a line (px)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -46,19 +46,19 @@ from knightcube.vision.horizon.limb_profile import SCALE_HEIGHT, UNIT_DEPTH_HEIG
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Cosine: a scan line more oblique to the limb places it badly."""
+"""Least cosine between a scan line and the normal of the limb: a more oblique line is inaccurate."""
 LOWEST_SUN = np.radians(1.0)
-"""Of a limb point's Sun: lower, the light reaches high air only, and the limb appears higher."""
+"""Least elevation of the Sun at a limb point (rad): with a lower Sun the limb appears higher."""
 _FINE = SCALE_HEIGHT / 6.0
-"""m a pixel: with finer pixels the steepest place is used; the profile is longer than the samples kept."""
+"""Pixel size (m) below which the steepest point is used: the profile exceeds the samples that are kept."""
 _ALIKE = 10.0
-"""px: length over which the light behind the limb is correlated."""
+"""Correlation length (px) of the brightness behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
-"""px: a square pixel's own blur."""
+"""Standard deviation of the blur by a square pixel (px)."""
 _LEAST_SPREAD = 0.03
-"""px: least error of a profile's place."""
+"""Least error of a position fitted to the profile (px)."""
 _OTHER_AIR = 500.0
-"""m: shift of the limb between bright and dark ground in air thicker or thinner than assumed."""
+"""Shift of the limb (m) between bright and dark ground, in air thicker or thinner than assumed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,30 +87,32 @@ class LimbPoints:
         return LimbPoints(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
-def near_limb(view: View, seen: Observation, tolerance: float) -> BoolArray:
+def near_limb(view: View, observation: Observation, tolerance: float) -> BoolArray:
     """Return which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
-    near = np.abs(limb_residuals(view, seen.rays.rays)) < tolerance * seen.rays.pixel
-    return np.asarray(near & (seen.rays.brighter @ view.nadir > 0.0))
+    near = np.abs(limb_residuals(view, observation.rays.rays)) < tolerance * observation.rays.pixel
+    return np.asarray(near & (observation.rays.brighter @ view.nadir > 0.0))
 
 
-def limb_points(view: View, seen: Observation, members: BoolArray, sun: FloatArray | None) -> LimbPoints:
+def limb_points(
+    view: View, observation: Observation, members: BoolArray, sun: FloatArray | None
+) -> LimbPoints:
     """Return the members in daylight whose scan line is not too oblique to the limb."""
     chosen = np.flatnonzero(members)
-    rays = seen.rays.rays[chosen]
+    rays = observation.rays.rays[chosen]
     if sun is not None:
         day = sun_elevation(view, rays, sun) > LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
-    slopes = _slopes(seen, chosen, rays, gradients)
+    slopes = _slopes(observation, chosen, rays, gradients)
     size = np.sqrt(np.einsum("ij,ij->i", slopes, slopes))
-    inward = -np.einsum("ij,ij->i", slopes, seen.edges.towards[chosen]) / size
-    sigma = seen.edges.sigma[chosen] * inward * size
+    inward = -np.einsum("ij,ij->i", slopes, observation.edges.towards[chosen]) / size
+    sigma = observation.edges.sigma[chosen] * inward * size
     points = LimbPoints(chosen, rays, sigma, size, inward, residuals, gradients)
     return points.chosen(inward > _GRAZING)
 
 
 def placed_by_profile(
-    view: View, seen: Observation, limb: LimbPoints, settings: HorizonSettings
+    view: View, observation: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
     """Return the points placed by the limb's profile if pixels are coarse enough for it."""
     reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
@@ -118,31 +120,33 @@ def placed_by_profile(
     if not len(metres) or float(np.median(metres)) < _FINE:
         return limb
     blur = np.hypot(settings.edges.psf_sigma, _PIXEL_SIGMA) * metres
-    edges = seen.edges.chosen(limb.index)
+    edges = observation.edges.chosen(limb.index)
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
-    rays = limb.rays + shift[:, None] * seen.rays.brighter[limb.index]
+    rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
     # Lines closer together than the ground's features are not independent.
-    alike = np.sqrt(max(1.0, _ALIKE / seen.space))
+    alike = np.sqrt(max(1.0, _ALIKE / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
     sigma = alike * np.hypot(spread, least) * limb.inward * limb.pixel
     return replace(limb, rays=rays, sigma=sigma).chosen(sound)
 
 
-def _slopes(seen: Observation, chosen: IntArray, rays: FloatArray, gradients: FloatArray) -> FloatArray:
+def _slopes(
+    observation: Observation, chosen: IntArray, rays: FloatArray, gradients: FloatArray
+) -> FloatArray:
     """Return the residuals' change (n, 2) rad a pixel to the right and downwards, from gradients (n, 5)."""
     # The effect of a turn d on a residual, g (d x u), a step s of the ray u does with d = u x s.
     turns = crossed(gradients[:, :3], rays)
-    across, down = seen.across[chosen], seen.down[chosen]
+    across, down = observation.across[chosen], observation.down[chosen]
     return -np.stack([np.einsum("ij,ij->i", turns, step) for step in (across, down)], axis=1)
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""px: the one that gives the fewest chance cones counts."""
+"""Gates (px): the gate with the fewest chance cones counts."""
 _ROUND = 0.1
-"""Of the picture's size: radius of the curves on which chance edges lie."""
+"""Radius of the curves on which chance edges lie, as a fraction of the image size."""
 _BESIDE = 0.05
-"""Of the picture's size: distance from the limb within which other edges give the density."""
+"""Distance from the limb within which other edges give the density, as a fraction of the image size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +193,7 @@ def log10_chance(
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge more than seen: none beside the limb does not make the density zero.
+    # One edge is added: without an edge beside the limb the density is still not zero.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
@@ -211,14 +215,14 @@ def _log10_tail(number: float, share: float, chance: float) -> float:
 
 
 _UNKNOWN_TURN = 1.0
-"""rad: the prior on an unknown turn about nadir; on a sphere it has no effect."""
+"""Prior standard deviation of an unknown rotation about nadir (rad); it has no effect on a sphere."""
 _NIGHT = np.radians(-8.0)
-"""Elevation of the Sun: an edge there is not the limb."""
+"""Elevation of the Sun (rad) below which an edge is not the limb."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
 _BORDER = 8.0
-"""px."""
+"""Distance from the image border (px) within which the limb needs no edges."""
 _NEAR = 0.0375
-"""Of the picture's size, little more than the space of two scan lines: a nearer edge covers the limb."""
+"""Distance within which an edge covers the limb, as a fraction of the image size: about two scan lines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,7 +269,7 @@ class Hypothesis:
 
 def examine(
     guess: InitialGuess,
-    seen: Observation,
+    observation: Observation,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
     camera: CameraModel,
@@ -274,28 +278,28 @@ def examine(
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
-    fitted = _fitted(guess.view, seen, guess.members, sun, settings, prior)
+    fitted = _fitted(guess.view, observation, guess.members, sun, settings, prior)
     if fitted is None:
         return None
     fit, limb = fitted
-    members = near_limb(fit.view, seen, settings.tolerance)
-    used = np.zeros(len(seen.edges), dtype=bool)
+    members = near_limb(fit.view, observation, settings.tolerance)
+    used = np.zeros(len(observation.edges), dtype=bool)
     used[limb.index[fit.used]] = True
     night = 0.0
     if sun is not None and np.any(members):
-        night = float(np.mean(sun_elevation(fit.view, seen.rays.rays[members], sun) < _NIGHT))
+        night = float(np.mean(sun_elevation(fit.view, observation.rays.rays[members], sun) < _NIGHT))
     return Hypothesis(
         fit,
         used,
         limb.chosen(fit.used),
         float(np.sqrt(np.mean((fit.residuals / limb.pixel)[fit.used] ** 2))),
         guess,
-        agreement(fit.view, sun, seen.samples),
-        _coverage(fit.view, seen, used, sun, camera),
+        agreement(fit.view, sun, observation.samples),
+        _coverage(fit.view, observation, used, sun, camera),
         night,
         settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
-        _chance(guess, fit, limb, seen, used, sun, camera, settings),
-        _breadth(fit.view, seen, used, settings),
+        _chance(guess, fit, limb, observation, used, sun, camera, settings),
+        _breadth(fit.view, observation, used, settings),
         _altitude_off(fit, place, settings),
     )
 
@@ -311,7 +315,7 @@ def _chance(
     guess: InitialGuess,
     fit: FittedLimb,
     limb: LimbPoints,
-    seen: Observation,
+    observation: Observation,
     used: BoolArray,
     sun: FloatArray | None,
     camera: CameraModel,
@@ -323,7 +327,7 @@ def _chance(
     inside = camera.contains(points, -_BORDER)
     due: BoolArray = inside if sun is None else sun_elevation(fit.view, rays, sun) > LOWEST_SUN
     columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
-    others = (limb_residuals(fit.view, seen.rays.rays) / seen.rays.pixel)[~used]
+    others = (limb_residuals(fit.view, observation.rays.rays) / observation.rays.pixel)[~used]
     residuals = (fit.residuals / limb.pixel)[fit.used]
     in_view = limb_in_view(points, inside, due, (columns, rows))
     unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
@@ -331,16 +335,16 @@ def _chance(
     return chance + math.log10(guess.orientation.share)
 
 
-def _breadth(view: View, seen: Observation, used: BoolArray, settings: HorizonSettings) -> float:
+def _breadth(view: View, observation: Observation, used: BoolArray, settings: HorizonSettings) -> float:
     """Return the breadth of the used edges over that of the air and the blur."""
     reach = math.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
-    air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(seen.rays.pixel[used])))
-    return float(np.median(seen.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma)
+    air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(observation.rays.pixel[used])))
+    return float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma)
 
 
 def _fitted(
     view: View,
-    seen: Observation,
+    observation: Observation,
     members: BoolArray,
     sun: FloatArray | None,
     settings: HorizonSettings,
@@ -350,14 +354,14 @@ def _fitted(
 
     One step towards the steepest places of the edges, and from there the fit to their profiles.
     """
-    limb = limb_points(view, seen, members, sun)
+    limb = limb_points(view, observation, members, sun)
     if len(limb.index) < settings.least_edges:
         return None
     start = stepped(view, limb.residuals, limb.gradients, limb.sigma, prior)
     if start is None:
         return None
-    limb = limb_points(start, seen, near_limb(start, seen, settings.tolerance), sun)
-    limb = placed_by_profile(start, seen, limb, settings)
+    limb = limb_points(start, observation, near_limb(start, observation, settings.tolerance), sun)
+    limb = placed_by_profile(start, observation, limb, settings)
     if len(limb.index) < settings.least_edges:
         return None
     fit = fit_limb(start, limb.rays, limb.sigma, prior)
@@ -368,7 +372,7 @@ def _fitted(
 
 def _coverage(
     view: View,
-    seen: Observation,
+    observation: Observation,
     used: BoolArray,
     sun: FloatArray | None,
     camera: CameraModel,
@@ -383,7 +387,7 @@ def _coverage(
     if not len(points):
         return 1.0
     space = _NEAR * max(camera.columns, camera.rows)
-    edges = seen.edges.points[used]
+    edges = observation.edges.points[used]
     apart = np.maximum(
         np.abs(points[:, :1] - edges[:, 0]),
         np.abs(points[:, 1:] - edges[:, 1]),

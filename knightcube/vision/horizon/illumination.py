@@ -33,13 +33,13 @@ from knightcube.vision.horizon.limb_fit import MEAN_RADIUS, View, limb_residuals
 from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
 
 TWILIGHT = np.radians(12.0)
-"""Sun this far below the horizon: ground and air count as night."""
+"""Depression of the Sun (rad) beyond which ground and air count as night."""
 DAYLIGHT = np.radians(8.0)
-"""Sun this far above the horizon: ground and limb count as lit."""
+"""Elevation of the Sun (rad) beyond which ground and limb count as lit."""
 GLARE = np.radians(12.0)
-"""About the Sun, where stray light is as bright as the Earth."""
+"""Angle from the Sun (rad) within which stray light is as bright as the Earth."""
 _ATMOSPHERE = 60e3
-"""m: above it no air is as bright as the Earth."""
+"""Height (m) above which the air is darker than the Earth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +116,15 @@ def _circle(count: int) -> FloatArray:
 
 
 _SAMPLES = 8
-"""Of a row, on as many columns."""
+"""Number of sampled rows, and of sampled columns."""
 _DIRECTIONS = 2000
-"""That are tried: 4.5 deg apart."""
+"""Number of directions that are tried, 4.5 deg apart."""
 _STRAY = 0.03
-"""Chance of a sample that is bright in the sky or dark on sunlit ground."""
+"""Probability that a sample is bright in the sky or dark on sunlit ground."""
 _WEIGHT = 0.2
-"""Of a sample, whose errors are those of its neighbours, too."""
+"""Weight of a sample: its error is correlated with that of its neighbours."""
 _WIDEST = math.radians(30.0)
-"""rad an axis: wider spreads say nothing."""
+"""Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
 
 
@@ -253,14 +253,14 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""rad beside the limb: the air above it, and a degree of the attitude's error."""
+"""Angle beside the limb (rad) that is excluded: the air, and one degree of attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
 _STRAY_LIGHT = math.radians(25.0)
-"""rad: with the Sun closer to some sample its light may be in the whole picture."""
+"""Angle of a sample from the Sun (rad) within which stray light may cover the whole image."""
 _LEAST = 8
-"""Samples, of 64, that a judgement needs."""
+"""Least number of samples, of 64, that a decision needs."""
 _MOST = 0.6
-"""Share of them that is otherwise in no sound picture: a cloud's shadow, a sea, a ghost of the lens."""
+"""Share of contradicting samples that no good image has: cloud shadows, seas and lens ghosts cause fewer."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

@@ -169,10 +169,10 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 
 
 MOST_MISMATCH = 4.0
-"""Standard deviations by which a coarse sensor may disagree."""
+"""Largest disagreement with a coarse sensor, in standard deviations."""
 GUESS_SIGMA = math.radians(0.2)
-"""rad, of a nadir by the cone through the edges, before a limb is fitted: a Sun to 0.005 deg is no such
-measure of it (0.07 to 0.3 deg off in frames of flights)."""
+"""Error (rad) of a nadir by the cone through the edges, before the fit of a limb: 0.07 to 0.3 deg in frames
+of flights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -274,7 +274,7 @@ def _half_turn(axis: FloatArray, square: float) -> FloatArray:
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
-"""m: error of an altitude above the mean sphere that the Earth's flattening causes."""
+"""Error (m) of an altitude above the mean sphere, caused by the flattening of the Earth."""
 _TURNS = 24
 
 
@@ -340,7 +340,7 @@ def _above_sphere(altitude: float, sigma: float) -> Place:
 
 def initial_guess(
     candidate: ConeCandidate,
-    seen: Observation,
+    observation: Observation,
     place: Place | None,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
@@ -349,7 +349,7 @@ def initial_guess(
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))
         place = _above_sphere((MEAN_RADIUS + UNIT_DEPTH_HEIGHT) / sine - MEAN_RADIUS, UNKNOWN)
-    view, stand = _first_view(candidate, seen, place, knowledge)
+    view, stand = _first_view(candidate, observation, place, knowledge)
     return InitialGuess(place, view, stand, candidate.members)
 
 
@@ -362,7 +362,7 @@ def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
 
 def _first_view(
     candidate: ConeCandidate,
-    seen: Observation,
+    observation: Observation,
     place: Place,
     knowledge: HorizonKnowledge,
 ) -> tuple[View, Orientation]:
@@ -384,7 +384,7 @@ def _first_view(
         replace(view, rotation=turned(stand.rotation, candidate.direction, angle))
         for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
     ]
-    looks = [agreement(each, sun, seen.samples) for each in turns]
+    looks = [agreement(each, sun, observation.samples) for each in turns]
     best = int(
         np.argmin([look.stray * look.dark_samples + look.missing * look.lit_samples for look in looks])
     )

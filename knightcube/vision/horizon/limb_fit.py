@@ -25,7 +25,7 @@ from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 
 MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0
-"""m, 6,371,008.8 (WGS 84)."""
+"""Mean radius of the Earth (m), 6,371,008.8 (WGS 84)."""
 
 
 _IDENTITY: FloatArray = np.eye(3)
@@ -91,7 +91,7 @@ def mean_sphere() -> Ellipsoid:
 
 
 PARAMETERS = 5
-"""Small rotation of the camera (3, camera axes, rad), height of the limb (m), altitude (m)."""
+"""Number of parameters: small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
 LIMB_HEIGHT, ALTITUDE = 3, 4
 
 
@@ -213,17 +213,17 @@ _AFTER, _BEFORE = [1, 2, 0], [2, 0, 1]
 
 _MOST_STEPS = 10
 _LAST_STEP = 3e-5
-"""rad: an eightieth of a pixel, and the next step would be far smaller."""
+"""Step (rad) that ends the iteration: an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
-"""rad: a step that changes the gradients by less than a hundredth."""
+"""Step (rad) below which the gradients change by less than a hundredth."""
 _HUBER = 1.5
 _BEYOND = 5.0
 _MOST_ALIKE = 0.8
-"""Largest correlation of neighbours that is assumed."""
+"""Largest correlation between neighbouring residuals that is assumed."""
 _TO_SIGMA = 1.4826
-"""Of a normal distribution: standard deviation over the median of absolute values."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute value."""
 UNKNOWN = 1e9
-"""m: the spread of an unknown height."""
+"""Standard deviation (m) of an unknown height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

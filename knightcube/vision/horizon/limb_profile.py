@@ -23,18 +23,18 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 
 SCALE_HEIGHT = 8000.0
-"""m, of the lower air (US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
+"""Scale height of the lower air (m; US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
 VERTICAL_DEPTH = 0.097
-"""Of the whole air at 550 nm (Bucholtz 1995, Appl. Opt. 34, 2765, Table 3)."""
+"""Vertical optical depth of the whole air at 550 nm (Bucholtz 1995, Appl. Opt. 34, 2765, Table 3)."""
 UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
     VERTICAL_DEPTH * math.sqrt(2.0 * math.pi * SEMI_MAJOR_AXIS / SCALE_HEIGHT)
 )
 """m, 15.4 km: where the optical depth right through is one."""
 
 _LOWEST, _HIGHEST, _STEP = -320e3, 240e3, 500.0
-"""m, of the table."""
+"""Tangent heights of the table: first, last and step (m)."""
 _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
-"""m, standard deviations of blur, spaced evenly in their logarithm."""
+"""Standard deviations of blur in the table (m), spaced evenly in their logarithm, and their number."""
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
@@ -91,13 +91,13 @@ def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
 
 _FIT_STEPS = 2
 _OUTSIDE, _INSIDE = -8.0, 4.0
-"""px from the steepest place: the part of the profile that is fitted."""
+"""Ends of the part of the profile that is fitted, px from the steepest point."""
 _FLOOR, _SHARE = 0.02, 0.08
-"""Noise of a sample: of the limb's brightness, and of the sample's own."""
+"""Noise of a sample: fractions of the limb's brightness and of the sample's own brightness."""
 _FARTHEST = 2.0
-"""px from the steepest place: a limb farther away is rejected."""
+"""Largest distance (px) of the fitted limb from the steepest point."""
 _LEAST = 7
-"""Samples."""
+"""Least number of samples of a fit."""
 
 
 def fit_profiles(

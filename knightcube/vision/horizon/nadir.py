@@ -114,20 +114,20 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Cones are searched for beyond the range of an unknown altitude by this factor: three edges show it
-roughly."""
+"""Factor by which the search for cones exceeds the range of an unknown altitude: three edges are
+inaccurate."""
 _MOST_ALTITUDE = 3.0
-"""Standard deviations by which the fitted altitude may lie beyond that range."""
+"""Largest excess of the fitted altitude over that range, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 _RIVAL = 0.3
-"""Of the best horizon's edges: a second horizon with this share of its own is a rival."""
+"""Share of the best horizon's edges with which a second horizon, with edges of its own, is a rival."""
 _SAME = np.radians(1.0)
 _MOST_CHANCE = -6.0
-"""log10 of the number of cones that chance edges would fit as well: a horizon has fewer."""
+"""Largest log10 of the number of cones that chance edges would fit as well."""
 _BREADTH = 0.125, 2.0
-"""Breadth of a limb's edge over that of the air, least and largest."""
+"""Least and largest ratio of the breadth of an edge of the limb to that of the air."""
 _GAIN = 1.5
-"""Three times the lines must give this factor of the edges on a horizon, or it is rejected."""
+"""Least ratio of the edges on a horizon with three times the lines: fewer reject the horizon."""
 
 
 def find_nadir(
@@ -172,14 +172,14 @@ def find_nadir(
 class _Look:
     """One search: `levels` as in `ScanLines`, hypotheses, the best first; number of pixels read."""
 
-    seen: Observation
+    observation: Observation
     levels: tuple[float, float, float]
     hypotheses: list[Hypothesis]
     read: int
 
     def solution(self) -> HorizonSolution:
         """Return the result of this search."""
-        points, hypotheses = self.seen.edges.points, self.hypotheses
+        points, hypotheses = self.observation.edges.points, self.hypotheses
         if not hypotheses:
             return HorizonSolution(
                 HorizonStatus.NO_HORIZON,
@@ -208,9 +208,9 @@ def _look(
     access: PixelAccess, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
 ) -> _Look:
     edges, lines = find_edges(access, settings.edges)
-    seen = observe(edges, lines, camera)
-    hypotheses = _hypotheses(seen, place_of(knowledge, settings), knowledge, settings, camera)
-    return _Look(seen, lines.levels, hypotheses, lines.pixels)
+    observation = observe(edges, lines, camera)
+    hypotheses = _hypotheses(observation, place_of(knowledge, settings), knowledge, settings, camera)
+    return _Look(observation, lines.levels, hypotheses, lines.pixels)
 
 
 def _closer(
@@ -222,19 +222,21 @@ def _closer(
 ) -> _Look:
     """Return the best horizon of a look again, with more lines across it."""
     best = look.hypotheses[0]
-    points = look.seen.edges.points[best.members]
-    box = np.stack([points.min(axis=0) - look.seen.space, points.max(axis=0) + look.seen.space])
+    points = look.observation.edges.points[best.members]
+    box = np.stack([points.min(axis=0) - look.observation.space, points.max(axis=0) + look.observation.space])
     edges, lines = find_edges(access, settings.edges, Nearby(box, look.levels))
     # The first look's samples have already tested the whole picture's light.
-    seen = observe(edges, lines, camera, look.seen.samples)
-    members = near_limb(best.fit.view, seen, 2.0 * settings.tolerance)
+    observation = observe(edges, lines, camera, look.observation.samples)
+    members = near_limb(best.fit.view, observation, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
-    found = examine(again, seen, knowledge, settings, camera)
-    return _Look(seen, look.levels, [] if found is None or not _is_limb(found) else [found], lines.pixels)
+    found = examine(again, observation, knowledge, settings, camera)
+    return _Look(
+        observation, look.levels, [] if found is None or not _is_limb(found) else [found], lines.pixels
+    )
 
 
 def _hypotheses(
-    seen: Observation,
+    observation: Observation,
     place: Place | None,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
@@ -246,7 +248,7 @@ def _hypotheses(
         low, high = (cosine_at(altitude) for altitude in (least / _WIDER, most * _WIDER))
     else:
         low = high = place.cosine
-    free = np.ones(len(seen.edges), dtype=bool)
+    free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
     # Cones too small to rival an accepted horizon are skipped.
@@ -254,22 +256,22 @@ def _hypotheses(
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:
             break
-        cone = best_cone(seen.rays, free, (low, high), settings.tolerance, settings.tries)
+        cone = best_cone(observation.rays, free, (low, high), settings.tolerance, settings.tries)
         if cone is None or np.count_nonzero(cone.members & free) < enough:
             break
-        free = left_free(seen.rays, free, cone, settings.tolerance)
-        guess = initial_guess(cone, seen, place, knowledge, settings)
+        free = left_free(observation.rays, free, cone, settings.tolerance)
+        guess = initial_guess(cone, observation, place, knowledge, settings)
         if guess.orientation.mismatch > MOST_MISMATCH:
             contradicted.append(guess)
             continue
-        found = examine(guess, seen, knowledge, settings, camera)
+        found = examine(guess, observation, knowledge, settings, camera)
         if found is not None and _is_limb(found):
             sound.append(found)
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
         # Contradicted guesses are fitted only for the reason of the refusal.
-        fitted = (examine(each, seen, knowledge, settings, camera) for each in contradicted)
+        fitted = (examine(each, observation, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
 

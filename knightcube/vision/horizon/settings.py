@@ -17,7 +17,7 @@ from knightcube.errors import UsageError
 
 ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
 LEAST_ALTITUDE = 50e3
-"""m: lower down, within the air, no limb is visible."""
+"""Least altitude (m): within the air no limb is visible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

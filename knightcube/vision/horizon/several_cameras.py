@@ -32,15 +32,15 @@ from knightcube.vision.horizon.settings import (
 )
 
 _IMPROBABLE = 1e-6
-"""Chance by which two cameras' nadirs are not one."""
+"""Probability below which the nadirs of two cameras differ significantly."""
 _COMMON = 2.0
-"""A difference's variance over the sum of both, at most: unknown air shifts opposite limbs apart."""
+"""Largest ratio of a difference's variance to the sum of both: unknown air shifts opposite limbs apart."""
 _RIVAL = 0.3
-"""Of the edges: as many cameras with this share of them that say otherwise leave it ambiguous."""
+"""Share of the edges with which as many disagreeing cameras make the nadir ambiguous."""
 _UNKNOWN_TURN = 1.0
-"""rad."""
+"""Prior standard deviation of an unknown rotation about nadir (rad)."""
 _OWN_AIR = 400.0
-"""m: by which one picture's limb may lie higher than another's, by light and by what lies behind."""
+"""Standard deviation (m) of a limb's height in one image relative to another: light and background differ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,7 @@ def _for(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKnowledge
         attitude=None
         if rough is None
         else RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma),
-        sensed=tuple(replace(one, camera=camera.seen(one.camera)) for one in knowledge.sensed),
+        sensed=tuple(replace(one, camera=camera.in_camera(one.camera)) for one in knowledge.sensed),
     )
 
 

@@ -32,14 +32,14 @@ from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 
 _REACH = 5.0
-"""Point spreads about the object that are looked at."""
+"""Half size of an object's patch, in point spreads."""
 _STEP_PX = 0.7
 _ROUNDS, _SETTLED = 12, 1e-4
-"""Steps at most, and px of the last one."""
+"""Largest number of steps, and the step (px) that ends the iteration."""
 _EXTENT = 2.0
-"""px, how far the half extent may be from its first guess; a point's extent changes nothing else."""
+"""Largest change of the half extent from its first guess (px)."""
 STAR_SIGMA = 0.3
-"""Part of a star's light by which the catalogue's brightness, in another colour, may be off."""
+"""Relative error of a star's brightness by the catalogue, whose colour band differs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,15 +162,15 @@ def _path(middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
-"""Of a star's light by the catalogue: what is more is not its."""
+"""Largest brightness of a star as a multiple of that by the catalogue: the excess is not the star's."""
 _LEAST_SHARE = 0.15
-"""Of the light of the stars beside an object, that it must have: a star's image is known to about a tenth."""
+"""Least brightness of an object relative to the stars beside it: star images are known to about a tenth."""
 _APART = 1.0
-"""px from the nearest star, at least: nearer, a close pair is told from an object by nothing."""
+"""Least distance (px) from the nearest star: a closer object cannot be distinguished from a close pair."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
-"""From the median step between neighbouring pixels to their noise."""
+"""Ratio of the noise of a pixel to the median step between neighbouring pixels."""
 _MISFIT = 3.0
-"""Of the patch with the object: one that fits worse is a tangle of other things."""
+"""Largest chi-square per degree of freedom of the patch with the object."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,9 +270,9 @@ class Scene:
 
 
 _OFF_PLACE, _TOO_BRIGHT = 0.25, 0.2
-"""px and magnitudes by which a star's light is off the catalogue where something else may be in it."""
+"""Deviations of a star's light from the catalogue (px and magnitudes) beyond which it may hold an object."""
 _SAME = 1.0
-"""px between two fits that are of the same light."""
+"""Distance (px) within which two fits belong to the same light."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -71,7 +71,8 @@ class SunSettings:
 
 
 LINEAR = SunSettings(least_radius=math.radians(1.3), greatest_radius=math.radians(2.0))
-"""For a linear 8-bit camera, a white matt surface at 200 counts, its optics scattering 1 % of the light."""
+"""Settings for a linear 8-bit camera: a white matt surface has 200 counts, the optics scatter 1 % of the
+light."""
 
 
 class SunStatus(Enum):
@@ -138,9 +139,9 @@ class SunSolution:
 
 
 _ROUNDS = 3
-"""Most tracings of the rim, each from the centre that the last one found."""
+"""Largest number of tracings of the rim, each from the centre of the previous circle."""
 _NEAR = 0.5
-"""px: a centre this close to the start of its spokes needs no further tracing."""
+"""Distance (px) of the fitted centre from the origin of the spokes that ends the tracing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

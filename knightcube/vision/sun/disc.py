@@ -19,9 +19,9 @@ from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.camera.pixel_access import PixelAccess
 
 MOST_PATCHES = 4
-"""Patches that are examined, the largest first."""
+"""Largest number of patches that are examined, the largest first."""
 LEAST_PATCH = 3
-"""Pixels of a patch on the rows that are read: a chord of the Sun's disc, but not a hot pixel."""
+"""Least number of pixels of a patch on the rows that are read: a chord of the Sun's disc, not a hot pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +76,7 @@ def window(pixels: PixelAccess, middle: FloatArray, reach: float) -> tuple[Image
 
 SPOKES = 48
 _STEP = 0.5
-"""px along a spoke between samples."""
+"""Distance between samples along a spoke (px)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,13 +147,13 @@ LEAST_POINTS = 6
 
 _STEPS = 10
 _LAST_STEP = 1e-2
-"""Of a point's error: convergence is fast, further steps gain nothing."""
+"""Step that ends the iteration, as a fraction of a point's error."""
 _MOST_ALIKE = 0.9
-"""Largest correlation of neighbours' errors that is assumed."""
+"""Largest correlation between neighbours' errors that is assumed."""
 _TUKEY = 4.685
-"""Times the scale: 95 % efficient on Gaussian errors."""
+"""Cut-off of the biweight, in scales: 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Of the best consensus: a smaller circle with this share is preferred, as stray light enlarges the disc."""
+"""Share of the best consensus with which a smaller circle is preferred: stray light enlarges the disc."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -72,10 +72,10 @@ def cameras_by_sun(
 
 
 _CONTRADICTED = 5.0
-"""Standard deviations of the strings by which a camera's Sun may lie off theirs."""
+"""Largest distance between a camera's Sun and the coarse Sun, in standard deviations of the coarse Sun."""
 
 _CUT = np.radians(0.05)
-"""rad an axis, added for a disc that the frame's edge cuts: it is off by the same in frame after frame."""
+"""Systematic error per axis (rad) of a disc that the frame's edge cuts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

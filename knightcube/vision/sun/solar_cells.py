@@ -183,17 +183,17 @@ def _chi_square(freedom: int) -> float:
 
 
 TURNS = 180
-"""Turns about the field that are tried, two degrees apart."""
+"""Number of rotations about the field that are tried, two degrees apart."""
 IMPROBABLE = 1e-4
-"""Chance of currents by which a turn is impossible."""
+"""Probability of the currents below which a rotation is impossible."""
 MEMORY = 120.0
-"""s, for which an impossible turn stays impossible: the gyro drifts."""
+"""Time (s) for which an impossible rotation stays impossible: the gyro drifts."""
 MOST = 3.0
-"""By how many times a turn can fail to be possible."""
+"""Largest violation of the bound that is remembered, as a multiple of the bound."""
 CERTAIN = 5.0
-"""Sigmas of the claim from the attitude to the farthest possible turn."""
+"""Distance from the attitude to the farthest possible rotation, in standard deviations of the result."""
 COMMON = 0.02
-"""Share by which all strings differ from their peaks together: the Sun's distance, temperature."""
+"""Relative error that all strings have in common: the Sun's distance, temperature."""
 _STEP = 2.0 * math.pi / TURNS
 _ANGLES = _STEP * np.arange(TURNS)
 

@@ -168,7 +168,9 @@ def _methods(
     settings, first, lens = finder_settings(model), cameras[0], model.lens
     assert knowledge.position is not None
     altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS
-    seen = tuple(SensedDirection(first.seen(one.camera), one.inertial, one.sigma) for one in knowledge.sensed)
+    seen = tuple(
+        SensedDirection(first.in_camera(one.camera), one.inertial, one.sigma) for one in knowledge.sensed
+    )
     alone = HorizonKnowledge(position=knowledge.position, sun=knowledge.sun, sensed=seen)
 
     def default() -> FloatArray | None:
