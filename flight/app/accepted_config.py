@@ -114,7 +114,7 @@ def _named(folder: Path) -> list[tuple[int, Path, str]]:
 
 _CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
 _TRIES = 3
-"""To read: one failed access of a disk is no damage. What lasts longer is waited for by the start."""
+"""Attempts to read a file: a single failed disk access is not damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +187,7 @@ def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | N
 
 
 def _read_any(path: Path) -> bytes | None:
-    """Return what any kind of file gives, a bounded number of bytes: by hand one may fly a pipe."""
+    """Return a bounded number of bytes of any kind of file: a person may fly a pipe."""
     try:
         with path.open("rb") as file:
             return file.read(4 * LARGEST_FILE + 1)

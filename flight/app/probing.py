@@ -93,7 +93,7 @@ def _ask_unit(config: Config, stack: ExitStack) -> str:
 
 
 def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
-    """Wait for what a GPS receiver sends by itself, at least once a second."""
+    """Wait for the bytes that a GPS receiver sends by itself, at least once a second."""
     clock = SystemClock()
     port = PySerialPort(device, baud_rate, clock)
     stack.callback(port.close)

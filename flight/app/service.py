@@ -218,7 +218,7 @@ class FlownRelease:
 
 
 def _proven(path: Path) -> list[str]:
-    """Return the releases that were proven; none where the file is missing or damaged."""
+    """Return the proven releases; an empty list if the file is missing or damaged."""
     with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         kept: dict[str, Any] = json.loads(LinuxFiles().read(path) or b"")
         return [str(name) for name in kept["proven"]]

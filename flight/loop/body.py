@@ -199,7 +199,7 @@ class Brake(Protocol):
         """Return the command now: zero while the field is measured or the rate is not known."""
 
     def sent(self, currents: FloatArray) -> None:
-        """Take what went to the coils (3,) A instead of the command, where one of them is left out."""
+        """Accept the currents (3,) A that were sent, which differ from the command if a coil is excluded."""
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes now; None before it is known."""
@@ -304,11 +304,11 @@ class BodyView(Protocol):
 
 
 class WideCameraUse(Protocol):
-    """What a body does with the frames of its wide cameras."""
+    """The use of the wide cameras' frames by a body."""
 
     @property
     def needed(self) -> bool:
-        """Whether the cameras are to be read often, as little else tells the attitude."""
+        """Whether the cameras are to be read often, because the attitude is poorly known."""
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
         """Return the worker's job for frames by their cameras' numbers."""

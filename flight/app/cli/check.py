@@ -23,7 +23,7 @@ FLOWN_S = 10.0
 
 @dataclass(slots=True)
 class CheckResult:
-    """What was found; `problems` would keep the flight from going well, none where it is ready."""
+    """The result of a check; an empty list of `problems` means ready to fly."""
 
     config: Config
     path: Path

@@ -16,7 +16,7 @@ _READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
 
 
 class _Outlet(io.FileIO):
-    """A file descriptor that discards what it is given once its reader is gone, or once it has complained."""
+    """A file descriptor that discards output once its reader is gone, or after its first error."""
 
     _lost = False
 

@@ -57,7 +57,7 @@ from knightcube.gnc.tracking.tracker import Track
 from knightcube.vision.sun.solar_cells import SolarStrings
 
 _BELOW = 0.8
-"""Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""
+"""Largest rate of a path, as a fraction of the rate at which the body is detumbled; the rest is a margin."""
 
 
 class SatelliteEstimation(BodyEstimation):
@@ -162,7 +162,7 @@ ORBIT = BodyKind(pointing_job.run, make)
 
 
 def _disturbed(filter_: OrbitFilter) -> Callable[[], tuple[FloatArray, FloatArray]]:
-    """Return what gives the estimated sizes (9,) N m of the torques and the residual dipole (3,) A m^2."""
+    """Return a function that gives the estimated torque sizes (9,) N m and the residual dipole (3,) A m^2."""
     return lambda: (filter_.torque_sizes, filter_.residual_dipole)
 
 
@@ -229,7 +229,7 @@ def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
 
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
-    """Return what the configuration says of the noises of the filter's states."""
+    """Return the configured noises of the filter's states."""
     section, rate_hz = config.estimation, config.executive.control_rate_hz
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
@@ -241,14 +241,14 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
 
 
 def _utc(services: Services) -> float:
-    """Return UTC, s, as the host has it: with it what was learned ages."""
+    """Return the host's UTC, s, from which the age of learned states follows."""
     return services.clock.utc_ns() / SECOND_NS
 
 
 def _filter(
     config: OrbitConfig, environment: OrbitEnvironment, learned: Mapping[str, Learned], utc: float
 ) -> tuple[OrbitFilter, list[str]]:
-    """Return the filter, and why parts of what was learned were rejected."""
+    """Return the filter, and why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
     slow, problems = start_from(learned, filter_settings(config), section.changed, utc)
     settings = OrbitFilterSettings(
@@ -279,7 +279,7 @@ def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironmen
 
 
 def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionBrake | None:
-    """Return what turns the pointing axis to the Sun in SAFE; None without strings."""
+    """Return the brake that turns the pointing axis to the Sun in SAFE; None without solar cells."""
     section, craft = config.solar_strings, config.craft
     if section is None:
         return None
@@ -290,7 +290,7 @@ def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionBrake | No
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:
-    """Return the configured two-line elements. Raises ConfigError for lines that are none."""
+    """Return the configured two-line elements. Raises ConfigError for malformed lines."""
     if config.elements is None:
         return None
     try:
@@ -326,7 +326,7 @@ def _coil_watch(config: OrbitConfig) -> CoilWatch:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia, dipole = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
     settle_ns = round(config.detumble.settle * SECOND_NS)
-    # A sixteenth of the testbed's field: the same torque takes longer to be felt.
+    # The field is a sixteenth of the testbed's: the same torque takes longer to be measurable.
     response = ResponseSettings(
         inertia,
         dipole,

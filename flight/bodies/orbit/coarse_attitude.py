@@ -47,24 +47,24 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 from knightcube.vision.sun.solar_cells import FieldAndStrings, Sky, SolarStrings, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Between readings that are judged: more often they say nothing new."""
+"""Interval (ns) between readings that are judged: their errors are correlated over shorter times."""
 OVERHEAD_ALBEDO = 0.2
 """Light of an Earth lit from overhead, over the Sun's: an albedo of 0.3, two thirds of half the sky."""
 CLOUDS = 0.5
-"""By which share the Earth's light varies."""
+"""Relative variation of the Earth's light."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Readings in a row that are the same to the last bit: their noise never is."""
+"""Identical readings in a row that show a fault: noise makes intact readings differ."""
 SUNLIT = 0.99
-"""Share of the Sun's disc from which the strings are expected to see it."""
+"""Visible fraction of the Sun's disc from which the cells are expected to measure it."""
 CONTRADICTED = 3
 """Attitudes or rounds in a row that contradict an estimate that is not fine: the filter starts again."""
 GATE = 30.7
 """Chi-square of three axes (1e-6) from which an attitude contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
-"""rad, of the turn about the field, from which the filter starts."""
+"""Largest standard deviation (rad) of the rotation about the field with which the filter starts."""
 STRENGTH_SIGMA = 5.0
-"""Sigmas by which the field may be stronger or weaker than its model says."""
+"""Sigmas by which the field's strength may differ from its model."""
 
 
 class CoarseSunFeed:
@@ -86,7 +86,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Take a reading; return what it shows to be wrong, empty for nothing, None where not judged."""
+        """Accept a reading; return the fault that it shows, empty for none, None if it was not judged."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
@@ -155,16 +155,16 @@ def _sky(around: Around, sun: FloatArray) -> Sky:
 
 
 DIRECTIONS_START_SIGMA = math.radians(15.0)
-"""rad, of the worst axis, to which an attitude starts the filter: less says where the Earth is, no more."""
+"""Largest standard deviation (rad) of the worst axis with which an attitude starts the filter."""
 NEEDED_SIGMA = math.radians(0.05)
-"""rad, of the worst axis, beyond which directions of 0.01 to 0.04 deg are worth their work."""
+"""Standard deviation (rad) of the worst axis above which directions of 0.01 to 0.04 deg are useful."""
 ROUGH_SIGMA = 0.3
-"""rad, to which an estimate helps to find the horizon."""
+"""Largest standard deviation (rad) of an estimate that helps to find the horizon."""
 IMPROBABLE = 1e-6
-"""Chance by which directions do not make one attitude."""
+"""Probability of rejecting directions that belong to one attitude."""
 STRINGS_AGE_NS = 2 * SECOND_NS
 FIELD_SIGMA = 0.03
-"""rad, at least, of the field's direction where the horizon is looked for."""
+"""Lower bound (rad) of the standard deviation of the field's direction in the search for the horizon."""
 
 
 class WideFeed:
@@ -179,7 +179,7 @@ class WideFeed:
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
-        """`lens_error` rad an axis is what calibration leaves; `sun` has the strings' newest reading.
+        """`lens_error` rad of an axis remains after calibration; `sun` has the newest reading of the cells.
 
         `response` of all cameras to light; None: linear.
         """
@@ -201,7 +201,7 @@ class WideFeed:
         return not dark or self._filter.knowledge is Knowledge.LOST
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
-        """Return the worker's job for frames of one instant, with what is known of their time."""
+        """Return the worker's job for frames of one instant, with the prior knowledge at that time."""
         times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
         time_ns = sum(times) // len(times)
         pixels = {number: frame.pixels for number, frame in frames.items()}
@@ -282,7 +282,7 @@ class WideFeed:
             return None
 
     def _known(self, time_ns: int) -> HorizonKnowledge:
-        """Return what is known of place, Sun, field and attitude at a time, in body axes."""
+        """Return the prior knowledge of position, Sun, field and attitude at a time."""
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return HorizonKnowledge()
@@ -323,7 +323,7 @@ def _is_of_strings(sun: MeasuredDirection | None) -> bool:
 
 
 def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a direction's departure (2,) from an attitude (3, 3), its covariance and the claim's (2, 2)."""
+    """Return a direction's departure (2,) from an attitude (3, 3), and the covariances (2, 2) of both."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
     # A turn e moves the direction d by d x e.
@@ -332,14 +332,14 @@ def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArr
 
 
 def _contradicts(sight: Sight, turn: FloatArray, claim: FloatArray) -> bool:
-    """Return whether a direction and an attitude with its claim (3, 3) exclude one another."""
+    """Return whether a direction contradicts an attitude (3, 3) with its covariance (3, 3)."""
     off, own, known = _spread(sight, turn, claim)
     behind = float(sight.observed @ turn @ sight.reference) < 0.0
     return behind or float(off @ np.linalg.solve(own + known, off)) > chi_square.bound(IMPROBABLE, 2)
 
 
 def _says_more(sight: Sight, claim: FloatArray) -> bool:
-    """Return whether a direction is known better across some axis than the claim (3, 3) has it."""
+    """Return whether a direction is more accurate than an attitude's covariance (3, 3) about some axis."""
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T
     known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T

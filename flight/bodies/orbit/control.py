@@ -53,7 +53,7 @@ class FieldBrake:
             self.detumbler.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now: zero where the magnetometer is stuck."""
+        """Return the command now: zero if the magnetometer is stuck."""
         dipole = self.detumbler.dipole(now_ns)
         if self._field_check.stuck:
             dipole = np.zeros(3)
@@ -61,7 +61,7 @@ class FieldBrake:
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:
-        """Let the rate follow the currents (3,) A that flow: a coil that is left out turns nothing."""
+        """Propagate the rate with the currents (3,) A that flow: an excluded coil makes no torque."""
         self.detumbler.acts(currents * self._dipole_per_ampere)
 
     def field(self, now_ns: int) -> FloatArray | None:
@@ -72,7 +72,7 @@ class FieldBrake:
 def expected_field(
     filter_: OrbitFilter, environment: OrbitEnvironment, instants: FloatArray
 ) -> Callable[[int], FloatArray | None]:
-    """Return what gives the field (n, 3) T at `instants` (n,) s after a time, in the body axes of then.
+    """Return a function of time that gives the field (n, 3) T at `instants` (n,) s later, body axes of then.
 
     It gives None while attitude or orbit are not known.
     """
@@ -134,7 +134,7 @@ class SunAcquisitionBrake:
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:
-        """Take what went to the coils (3,) A."""
+        """Accept the currents (3,) A that were sent to the coils."""
         self._seeker.acts(currents * self._dipole_per_ampere)
 
     def field(self, now_ns: int) -> FloatArray | None:
@@ -191,7 +191,7 @@ class PointingTracker:
         dipole = found.dipole
         if not reference.paths.led(found.turn, rate, reference.time_ns):
             dipole = damping_dipole(self._inertia, rate, field) - residual
-        # The mean over the window is what was asked for.
+        # The mean over the window equals the requested dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         largest = float(np.abs(dipole).max())
         saturated = largest > self._limit

@@ -1,8 +1,8 @@
-"""What surrounds the satellite by belief: its place, the field, the Sun and the shadow at any time.
+"""The estimated orbit environment: position, magnetic field, Sun and shadow at any time.
 
-The place is that of the newest GPS fix, carried on; without one, of two-line elements. The environment are
-predicted for some 20 s at once (2 ms) and interpolated between. Long predictions, of a revolution, belong
-into a worker: 0.3 ms for each 10 s.
+The position is propagated from the newest GPS fix or, without a fix, from two-line elements. The environment
+is predicted for some 20 s at once (2 ms) and interpolated. Predictions of a revolution belong into a worker:
+they take 0.3 ms for each 10 s.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from knightcube.astro.earth.sun import DAY, earth_velocity
 from knightcube.gnc.estimation.free_motion import Around
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
-"""s, of the short prediction, after and before the time that it was made for."""
+"""Span (s) of the short prediction, after and before the time for which it is made."""
 GPS_DELAY_NS = 100_000_000
 """From an epoch of the receiver to the first byte of its report; 0.2 s at most."""
 GATE, LEAST_GATE = 5.0, 5e3
-"""Sigmas by which a fix may differ from what is known, and m that are always allowed."""
+"""Sigmas by which a fix may differ from the known orbit, and difference (m) that is always allowed."""
 CONTRADICTED = 30
-"""Fixes in a row that contradict the last accepted one: then that one was wrong."""
+"""Fixes in a row that contradict the last accepted fix, after which that fix counts as wrong."""
 TIME_GATE_NS = SECOND_NS // 2
-"""By which the receiver's time may go on otherwise than the clock: the craft flies 4 km meanwhile."""
+"""Largest step (ns) of the receiver's time relative to the clock; the craft flies 4 km in this time."""
 _UNIX_EPOCH = 2_440_587.5
 _SHORTEST = 1.0
 
 
 class OrbitEnvironment:
-    """Owns the knowledge of the orbit. `refused` counts the fixes that contradict what is known."""
+    """Owns the knowledge of the orbit. `refused` counts the fixes that contradict it."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
         """`elements`: known before the flight; None: nothing is known until the first fix."""
@@ -112,15 +112,7 @@ class OrbitEnvironment:
         date = float(terrestrial_time(self.julian_date(now_ns)))
         return np.asarray(earth_velocity(date) + near.velocity_at(times)[0])
 
-    def ephemeris(self, now_ns: int, seconds: float) -> Ephemeris | None:
-        """Return a prediction of `seconds` s from now on, 0.3 ms for each 10 s; None where none is possible.
-
-        `seconds_into` gives its time of the clock's.
-        """
-        state = self.state(now_ns)
-        return None if state is None else _predicted(state, seconds)
-
-    def seconds_into(self, ephemeris: Ephemeris, now_ns: int) -> float:
+    def _seconds_into(self, ephemeris: Ephemeris, now_ns: int) -> float:
         """Return the time, s, of `ephemeris` at a time of the clock."""
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
@@ -136,15 +128,15 @@ class OrbitEnvironment:
     def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
         """Return the short prediction and the time (1,) s in it, made again near its end."""
         near = self._near
-        seconds = math.inf if near is None else self.seconds_into(near, now_ns)
+        seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
             state = self._state(self.julian_date(now_ns) - BEHIND / DAY)
             near = self._near = None if state is None else _predicted(state, BEHIND + AHEAD)
-            seconds = BEHIND if near is None else self.seconds_into(near, now_ns)
+            seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])
 
     def _is_out_of_time(self, offset_ns: int) -> bool:
-        """Return whether the receiver's time stands or jumps; a lasting jump is believed after a while."""
+        """Return whether the receiver's time stands or jumps; a lasting jump is accepted after a while."""
         last_offset_ns, self._newest_offset_ns = self._newest_offset_ns, offset_ns
         if last_offset_ns is not None and abs(offset_ns - last_offset_ns) > TIME_GATE_NS:
             return True

@@ -64,7 +64,7 @@ class StuckFieldCheck:
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer is not believed, empty while it is; `refused` fields in a row were."""
+        """Return why the magnetometer is rejected, empty while it is used; `refused` fields in a row were."""
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
         return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""
@@ -80,7 +80,7 @@ _NONE: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beginning:
-    """An estimate at the end of a step, and what all those carried on from it have in common.
+    """An estimate at the end of a step, and the terms that all its propagations share.
 
     Attributes:
         spread: (19, 19) the covariance in the loop's order.
@@ -100,7 +100,7 @@ class _Beginning:
 
 
 class EstimatePropagation:
-    """Carries estimates of a filter on; 0.03 ms each."""
+    """Propagates estimates of a filter; 0.03 ms each."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free
@@ -181,7 +181,7 @@ class OrbitFilter:
     """
 
     def __init__(self, settings: OrbitFilterSettings, around: Callable[[int], Around | None]) -> None:
-        """`around` returns what surrounds the satellite at a time of the clock; None while not known."""
+        """`around` returns the orbit environment at a time of the clock; None while it is not known."""
         self._settings = settings
         self._around = around
         self._replay = StepReplay(settings)
@@ -211,7 +211,7 @@ class OrbitFilter:
 
     @property
     def runs(self) -> bool:
-        """Whether it takes measurements: also while the attitude is not yet, or no longer, of use."""
+        """Whether the filter accepts measurements, also while the attitude is lost."""
         return self._free.started
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
@@ -241,7 +241,7 @@ class OrbitFilter:
 
     @property
     def field_doubt(self) -> str:
-        """Why the magnetometer is not believed; empty while it is."""
+        """Why the magnetometer is rejected; empty while it is used."""
         return self._field_check.text(self._replay.refused_fields)
 
     @property
@@ -257,7 +257,7 @@ class OrbitFilter:
 
     @property
     def slow(self) -> SlowStates:
-        """What is known of biases, dipole, torques and axes."""
+        """The states of biases, dipole, torques and axes."""
         return self._free.slow
 
     @property
@@ -292,8 +292,8 @@ class OrbitFilter:
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
         """Start from an attitude; return False where no step was taken at its time.
 
-        `doubted`: the estimate was contradicted, so what it claims to have learned is not that well known.
-        An attitude that is no number starts nothing.
+        `doubted`: the estimate was contradicted, so its learned states are less accurate than stated.
+        A non-finite attitude starts nothing.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
@@ -419,7 +419,7 @@ class OrbitFeed:
 
 ERRORS, SOURCES, LEARNED_AT = "attitude-errors", "attitude-torques", "learned-at"
 UNKNOWN_AGE = 86_400.0
-"""s: taken for an age that a clock that was put back denies, and the longest: then little is left anyway."""
+"""Largest age (s) of learned states, also used if the clock was set back."""
 
 
 def _places(*parts: slice) -> IntArray:
@@ -439,7 +439,7 @@ def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
 def start_from(
     learned: Mapping[str, Learned], settings: FreeFilterSettings, changed: float, utc: float
 ) -> tuple[SlowStates, list[str]]:
-    """Return the filter's prior at a time (UTC, s), and why what was learned was rejected.
+    """Return the filter's prior at a time (UTC, s), and why learned states were rejected.
 
     Since then a state may have changed by the part `changed` of its deviation at the start.
     """

@@ -43,7 +43,7 @@ class DipoleHistory:
         self._dipoles: list[Floats] = []
         self._sums: list[Floats] = []  # A m^2 ns: the integral until each time
         self.unknown_ns = -1
-        """Until when dipoles were not known; -1 if they always were."""
+        """Time (ns) until which dipoles were not known; -1 if they always were."""
 
     def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
         """Record the dipole A m^2 in force from `time_ns` on; in order of time."""
@@ -165,7 +165,7 @@ class OpenStep:
 
 
 FORGOTTEN_NS = 10_000_000_000
-"""After this time without a gyro that contradicts the commanded dipoles these are tried again."""
+"""Time (ns) without a contradicting gyro, after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _EYE: FloatArray = np.eye(3)
 
@@ -176,12 +176,12 @@ class OrbitFilterSettings:
 
     Attributes:
         inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
-        gyro_noise: rad/s of an axis of a sample. field_noise: T, likewise.
+        gyro_noise: rad/s of an axis of a sample. field_noise: T of an axis of a sample.
         unknown_psd: rad^2/s^3, density of the body's acceleration where no estimate has one.
         settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
         history_ns: how old a measurement may be.
         step_ns: the longest step.
-        slow: what an earlier boot learned of the slow states.
+        slow: the slow states that an earlier boot learned.
     """
 
     inertia: FloatArray
@@ -226,9 +226,9 @@ class StepReplay:
             self.take_on(len(self.steps) - 1)
 
     def follow_gyro(self) -> None:
-        """Take the last steps again with unknown dipoles where the gyro contradicts the commanded ones.
+        """Take the last steps again with unknown dipoles if the gyro contradicts the commanded dipoles.
 
-        What the coils did otherwise may have begun in the step before: its gyro shows only half of it.
+        The deviation may have begun in the step before, whose mean rate shows only half of it.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
@@ -243,7 +243,7 @@ class StepReplay:
             self.take_again(first)
 
     def doubt_since(self, since_ns: int) -> set[int]:
-        """Take the steps since then again with unknown dipoles; return what was used."""
+        """Take the steps since then again with unknown dipoles; return the measurements used."""
         steps = self.steps
         first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
         for k in range(first, len(steps)):
@@ -310,7 +310,7 @@ class StepReplay:
         return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
-        """Return to the beginning of step `first` and take it and the later ones; return what was used."""
+        """Return to the beginning of step `first`, take it and later steps; return the measurements used."""
         while first < len(self.steps) and self.steps[first].before is None:
             first += 1
         if first == len(self.steps):

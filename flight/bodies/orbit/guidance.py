@@ -215,13 +215,14 @@ class PointingTargets:
 
 
 EFFORT = 0.25
-"""Of the coils' limit: the dipole that costs as much as the error of pointing that costs one."""
+"""Dipole of unit cost, as a fraction of the coils' limit."""
 ROLL = math.radians(20.0)
-"""rad about the boresight that cost as much: the field has no corners that matter."""
+"""Roll error of unit cost, rad about the boresight: large, because the field's corners do not matter."""
 RATE = math.radians(1.0)
-"""rad/s off the object's that cost as much: a body that rolls fast blurs the stars at the field's edge."""
+"""Rate error of unit cost, rad/s: a body that rolls fast blurs the stars at the field's edge."""
 FORESIGHT = 30.0
-"""s ahead that an object is judged to leave the field; farther off a young track is not believed."""
+"""Prediction span (s) within which an object is reported to leave the field of view; longer predictions of a
+young track are not accurate enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,11 +272,13 @@ class ObjectAim:
                 text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
-                self._place = None  # looked for again where the body is by then, or where it was ordered
+                self._place = (
+                    None  # the search starts again at the body's attitude, or at the commanded direction
+                )
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job for the body's target, with what is pointed to where that is an object."""
+        """Return a job for the body's target; for an object, pointing to the search or the track."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -343,12 +346,12 @@ class ObjectAim:
 
 
 AGAIN_NS = 10_000_000_000
-"""After a plan that failed, or while no orbit is known, the next is asked for after this time."""
+"""Time (ns) until the next request after a failed plan, or while no orbit is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
-    """What the planner believes of the craft.
+    """The planner's model of the craft.
 
     `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action;
     `slew` is how slews are wanted.
@@ -373,7 +376,7 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
+        """`disturbed` returns the estimated torques (9,) N m and residual dipole (3,) A m^2."""
         self._craft, self._paths, self._environment = craft, paths, environment
         self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
@@ -445,7 +448,7 @@ class PointingPlanner:
     def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
         """Return how a slew to a goal is wanted; None for a body on a path to it.
 
-        A path leaves its goal for a time where it meets torques along the field: no reason for a slew.
+        A path leaves its goal for a time when it meets torques along the field; this requires no slew.
         """
         on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
         return None if on_path else replace(self._craft.slew, residual=residual)

@@ -1,4 +1,4 @@
-"""The testbed in a Helmholtz cage that plays an orbit's field: what the flight knows of it.
+"""The testbed in a Helmholtz cage that renders an orbit's field, as the flight predicts the field.
 
 The cage shows the body the field that a satellite on the orbit meets in its local frame: x along the flight,
 z down, y against the orbit's normal, which is the thread's axis. So the turn about the thread is the pitch of
@@ -114,7 +114,7 @@ def local_frame(position: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 class CageFilter(AttitudeFilter):
-    """The testbed's filter, told of the cage's field with each command."""
+    """The testbed's filter, which uses the cage's field of each command's time."""
 
     def __init__(
         self, cage: CageField, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None
@@ -141,7 +141,7 @@ class CageTracker:
         field: CageField,
         dipole: float,
     ) -> None:
-        """`inner` believes in the field of `plant`; `dipole` is n A of each coil, m^2."""
+        """`inner` assumes the field of `plant`; `dipole` is n A of each coil, m^2."""
         self._inner = inner
         self._read = reader.read
         self._plant = plant

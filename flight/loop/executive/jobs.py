@@ -78,7 +78,7 @@ class JobRunner(Protocol):
         """Return the results that have arrived. Never waits."""
 
     def news(self) -> list[WorkerNews]:
-        """Return what happened to the workers since the last call. Never waits."""
+        """Return the changes in the workers' lives since the last call. Never waits."""
 
     @property
     def borrowed_ns(self) -> int:

@@ -38,10 +38,10 @@ def settle() -> None:
 
 
 class Collector:
-    """Collects the garbage that was made since its last call, and exempts what is left from later calls.
+    """Collects the garbage that was made since its last call, and exempts the survivors from later calls.
 
     Call it every few seconds: windows of measurements hold tens of thousands of objects a minute old or less,
-    and looking at all of them takes 2 ms. The first call only exempts what the flight's start has made.
+    and looking at all of them takes 2 ms. The first call only exempts the objects of the flight's start.
     """
 
     def __init__(self) -> None:

@@ -40,7 +40,7 @@ _MOST_DIMENSIONS = 32
 
 
 def encode_values(value: Any) -> tuple[bytes, list[Array]]:
-    """Return the bytes of a value, and its arrays beside them. Raises FlightError for what is no value."""
+    """Return the bytes of a value, and its arrays beside them. Raises FlightError for other types."""
     arrays: list[Array] = []
     tree = _tree(value, arrays)
     try:
@@ -157,7 +157,7 @@ def _class(name: str) -> type:
 
 
 def _field_names(kind: Any) -> tuple[str, ...] | None:
-    """Return the names of what a dataclass or a named tuple holds; None for any other class."""
+    """Return the field names of a dataclass or a named tuple; None for any other class."""
     if dataclasses.is_dataclass(kind):
         return tuple(field.name for field in dataclasses.fields(kind))
     return kind._fields if issubclass(kind, tuple) and hasattr(kind, "_fields") else None
@@ -189,7 +189,7 @@ def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
-    """Do as `pack_trusted` for a reader who does not trust. Raises FlightError for what is no plain value."""
+    """Pack a value for a reader that does not trust the sender. Raises FlightError for other types."""
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 

@@ -87,8 +87,8 @@ _LEAST_CHANGE = 4.0e-3
 LARGEST_GAIN = 1.5
 """Largest gain, of either sign, that a coil and the described body can have."""
 _GAIN_PRIOR = 10.0
-_FELT, _SIGMAS = 0.7, 2.5
-"""A coil without torque has a gain that is lower than this by so many deviations."""
+_WEAK_GAIN, _SIGMAS = 0.7, 2.5
+"""Gain of a coil with little torque, and number of standard deviations by which the gain must be lower."""
 
 
 class CoilResponse:
@@ -201,7 +201,7 @@ class CoilResponse:
         return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
 
     def feeble_axes(self) -> list[int]:
-        """Return the axes whose torque the body did not feel, or felt reversed, in those fits."""
+        """Return the axes whose torque was missing or reversed in the last `persistence` fits."""
         return [axis for axis in range(3) if self._feeble_for[axis] >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
@@ -301,8 +301,8 @@ class CoilResponse:
         for number, (gain, sigma) in enumerate(pairs):
             judged = possible and abs(gain) <= LARGEST_GAIN
             wrong = judged and gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
-            unfelt = gain + _SIGMAS * sigma < _FELT and gain < settings.highest_feeble
-            feeble = wrong or (judged and sigma < settings.sure and unfelt)
+            weak = gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
+            feeble = wrong or (judged and sigma < settings.sure and weak)
             sound = judged and sigma < settings.sure and gain > settings.lowest_sound
             self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
             self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
@@ -313,7 +313,7 @@ _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 """A leg stuck high drives its coil continuously, in this direction."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
-"""After a false verdict, how long the monitor is not trusted where the motion is inconclusive."""
+"""Time (ns) after a false verdict during which the monitor is ignored if the motion is inconclusive."""
 
 
 class MotionWitness:

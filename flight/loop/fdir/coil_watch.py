@@ -20,7 +20,7 @@ explain the readings since then all name one axis; between axes that are not dri
 turn decides. A reversed coil is found from the angular acceleration (`flight.loop.fdir.coil_response`),
 which also distinguishes a wrong monitor from a broken coil; over longer bins it raises a suspicion where a
 current too small for the monitor makes no torque. Uncommanded current is handled faster, in every
-mode: `flight.loop.fdir.stuck_leg` brakes the axes at rest; during its search there is no other verdict.
+mode: `flight.loop.fdir.supply_current` brakes the axes at rest; during its search there is no other verdict.
 
 A reversed coil draws the current of a healthy one, so that the monitor cannot confirm the verdict, and in a
 tumble the motion depends on the inertia more than on the coils. A coil that looks reversed in a tumble is
@@ -41,16 +41,19 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.loop.fdir.coil_response import CoilResponse, MotionWitness, ResponseSettings
-from flight.loop.fdir.stuck_leg import NONE, Axes, BrakeProof, StuckLeg
 from flight.loop.fdir.supply_current import (
     ELECTRICAL,
     MEAN,
     NEWEST,
+    NONE,
+    Axes,
     Bounds,
+    BrakeProof,
     CoilCommands,
     CoilFault,
     Predicted,
     Sampling,
+    StuckLeg,
     fits,
     predict,
 )
@@ -248,7 +251,7 @@ class CoilWatch:
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
-        self._unfelt = ""  # which coil's torque the body does not feel
+        self._weak = ""  # which coil's torque is missing in the motion
         self._verdicts: dict[int, CoilVerdict] = {}
         self._rests: dict[int, tuple[int, str]] = {}  # of an axis that rests: since when, and why
         self._looked_ns = 0
@@ -286,7 +289,7 @@ class CoilWatch:
     @property
     def _unknown(self) -> str:
         """Why a coil may carry another current than its command."""
-        return self._leg.suspicion or self._strangeness or self._unfelt
+        return self._leg.suspicion or self._strangeness or self._weak
 
     @property
     def braked(self) -> Axes:
@@ -348,8 +351,8 @@ class CoilWatch:
         if response is self._slow:
             known = self._verdicts.keys() | self._rests.keys()
             axes = [axis for axis in response.feeble_axes() if axis not in known]
-            # Several at once: then rather the gyro or the field is wrong.
-            self._unfelt = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
+            # If several coils look weak at once, the gyro or the field is more likely wrong.
+            self._weak = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
 
     def _end_rests(self, now_ns: int, speed: float) -> None:
         """Try the resting axes again, on new evidence, once the body is slow or the rest has lasted long."""
@@ -364,7 +367,7 @@ class CoilWatch:
         self._fresh = 0
         self._leg.reset()
         self._reset()
-        self._unfelt = ""
+        self._weak = ""
         for response in self._responses:
             response.interrupted(now_ns)
 
@@ -412,7 +415,7 @@ class CoilWatch:
 
     @property
     def _known(self) -> dict[int, CoilFault]:
-        """The fault of each broken axis as the supply sees it: a braked axis draws no current."""
+        """The fault of each broken axis in the supply current: a braked axis draws no current."""
         return {
             axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
             for axis, verdict in self._verdicts.items()

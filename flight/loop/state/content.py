@@ -149,7 +149,7 @@ class BootRecord:
 
 @dataclass(frozen=True, slots=True)
 class Noted:
-    """What the loop has for the next write: the mode, what it learned, and the table of parameters."""
+    """The loop's values for the next write: the mode, the learned parameters, and the table of parameters."""
 
     mode: str
     learned: Mapping[str, Learned]
@@ -177,7 +177,7 @@ def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
 
 
 def _trusted(table: KeptTable) -> KeptTable:
-    """Return the table to fly after an unclean shutdown: the one before, where it is not proven."""
+    """Return the table to fly after an unclean shutdown: the previous table if this one is not proven."""
     if table.proven:
         return table
     return msgspec.structs.replace(table, values=table.before, before={}, proven=True)

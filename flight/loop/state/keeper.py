@@ -60,7 +60,7 @@ class StateKeeper:
 
     Attributes:
         record: the history of earlier boots.
-        learned: what earlier boots learned, by name.
+        learned: the parameters that earlier boots learned, by name.
         counted: whether this boot is on disk.
         table: the table of parameters to fly.
     """
@@ -102,7 +102,7 @@ class StateKeeper:
         self._ticker = clock.ticker("state", period_ns, self._write)
 
     def _report_changes(self, loaded: StoredState) -> None:
-        """Report what the begin of this boot made of the state that the last one left."""
+        """Report how the begin of this boot changed the stored state."""
         begun, report = self._begun, self._notices.report
         if loaded.learned and not begun.learned:
             text = (

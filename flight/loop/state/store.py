@@ -70,7 +70,7 @@ class LinuxFiles:
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
-        """Open an empty file for writing, replacing an old one, also one that is no regular file."""
+        """Open an empty file for writing, replacing an old one, also one that is not a regular file."""
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)

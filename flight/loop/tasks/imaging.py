@@ -237,7 +237,7 @@ class Imaging:
             self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
 
     def serve(self, now_ns: int) -> None:
-        """Start what is ordered and due; check the camera; pass a new frame to the worker."""
+        """Start a due exposure; check the camera; pass a new frame to the worker."""
         self._look_at_worker(now_ns)
         frame = self._poll(now_ns)
         age_ns = now_ns - self._last_frame_ns

@@ -232,7 +232,7 @@ class ModeControl:
             raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {_starts(body)}")
         self._crashed, self._too_many_crashes = 0, False
         self._commands = 0
-        self._seen_ns = 0
+        self._measured_ns = 0
         self._slow = HoldTimer(settings.low_for)
         self._arrived = HoldTimer(settings.modes.arrived_for)
         self._pointing = PointingWatch(settings.modes, body.control.targets, services.facts)
@@ -282,7 +282,7 @@ class ModeControl:
 
     def begin(self, now_ns: int, unclean_recent: int) -> None:
         """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
-        self._machine.since_ns = self._seen_ns = now_ns
+        self._machine.since_ns = self._measured_ns = now_ns
         self._crashed = unclean_recent
         self._too_many_crashes = unclean_recent >= self._settings.crash_limit
         self._record(Mode.BOOT, "begin", "", now_ns)
@@ -301,12 +301,12 @@ class ModeControl:
         `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
         the body is on its way.
         """
-        # A body that acquires its attitude can do without one: it sees while its rate is measured.
-        sees = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
-        self._seen_ns = now_ns if sees else self._seen_ns
+        # A body that acquires its attitude needs no estimate: a measured rate is enough.
+        measured = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
+        self._measured_ns = now_ns if measured else self._measured_ns
         if self.mode is Mode.BOOT:
-            self._boot(sees and coils_answer, now_ns)
-        blind = (now_ns - self._seen_ns) * 1e-9
+            self._boot(measured and coils_answer, now_ns)
+        blind = (now_ns - self._measured_ns) * 1e-9
         text = f"no estimate for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
@@ -415,7 +415,7 @@ class ModeControl:
         for timer in (self._slow, self._arrived, self._pointing, self._attitude):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
-            self._paths.release()  # an old path does not start where the body is now
+            self._paths.release()  # an old path does not start at the body's attitude
         if change.after is Mode.DETUMBLE:
             self._steering.begin_detumbling(now_ns)
         if change.after is Mode.SUN:

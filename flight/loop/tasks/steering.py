@@ -18,7 +18,7 @@ from flight.link import events
 from flight.loop.body import Body, Brake, CoilCommand, Steered, SteeringState
 from flight.loop.fdir import facts
 from flight.loop.fdir.coil_watch import CoilVerdict, CoilWatch
-from flight.loop.fdir.stuck_leg import NONE, Axes
+from flight.loop.fdir.supply_current import NONE, Axes
 from flight.loop.services import Services
 from flight.schema.sections import Modes
 from hal.interfaces.devices import CoilState, ImuReading, PowerMonitor, TorqueCoils

@@ -1,4 +1,4 @@
-"""Wide imaging: passes the frames of the wide cameras to a worker, and what it found to the body.
+"""Wide imaging: passes the frames of the wide cameras to a worker, and the results to the body.
 
 All are triggered together, and more often while the body needs them. Cameras that give no frame, or the same
 picture again, or pictures that a fine attitude denies, are reported. This runs once a second,
@@ -153,7 +153,7 @@ class WideImaging:
         self._services.facts.update(facts.WIDE_LOST, bool(old), now_ns, text)
 
     def _judge(self, found: HorizonCameraResult, now_ns: int) -> None:
-        """Report cameras whose pictures are not of what they must see."""
+        """Report cameras whose pictures contradict a fine attitude."""
         if found.false is None:
             return
         text = "all pictures are of what they must be"

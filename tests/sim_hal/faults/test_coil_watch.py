@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
-from flight.loop.fdir.stuck_leg import NONE, StuckLeg, Supplied
 from flight.loop.fdir.supply_current import (
     MEAN,
     NEWEST,
+    NONE,
     PLACE,
     Bounds,
     CoilFault,
+    StuckLeg,
+    Supplied,
     fits,
     predict,
     supply_currents,
