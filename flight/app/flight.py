@@ -43,7 +43,7 @@ def mission_zero(clock: Clock) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Judged:
-    """A request whose configuration, in the file that `chosen` names, was read and found right."""
+    """A request whose configuration was read from the file of `chosen`, and validated."""
 
     request: RunRequest
     chosen: Chosen
@@ -66,7 +66,7 @@ class _Opened:
 def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None = None) -> RunResult:
     """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device.
 
-    On a board the start is tried until it succeeds; then StoppedError, where a signal ends the attempts.
+    On a board the start is retried until it succeeds. Raises StoppedError if a signal ends the attempts.
     """
     with EndingSignals() as signals, ExitStack() as stack:
         opened = _start(request, signals, stack)
@@ -116,7 +116,7 @@ def _judge(request: RunRequest) -> _Judged:
 
 
 def _open(judged: _Judged, stack: ExitStack) -> _Opened:
-    """Open a flight. An archive keeps no folder of a run that did not come so far."""
+    """Open a flight. The run folder in an archive is removed if the opening fails."""
     chosen, text, config = judged.chosen, judged.text, judged.config
     stack.enter_context(placing(text, str(chosen.path)))
     request, earlier = begin_folder(judged.request, text, config)
@@ -137,7 +137,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
 
 @contextmanager
 def placing(text: str, name: str) -> Iterator[None]:
-    """Have a complaint about a value of the configuration say in which line of which file the value is."""
+    """Add file and line to configuration errors."""
     try:
         yield
     except UsageError as error:

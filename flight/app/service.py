@@ -176,7 +176,7 @@ class EndingSignals:
 NAME, NOTE = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE"
 TRIALS = "releases.json"
 PROVEN_NS = 60 * SECOND_NS
-"""After this flight time a release is proven: power cuts and crashes no longer count against it."""
+"""Flight time (ns) after which a release is proven: power cuts and crashes no longer count against it."""
 _KEPT = 4
 
 

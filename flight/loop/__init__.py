@@ -1,1 +1,1 @@
-"""The flight application once its devices are open: builds the rooms, lays the rate groups, runs, ends."""
+"""The loop of the flight application: tasks, fault detection, modes, stored state, and the executive."""

@@ -95,7 +95,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return purpose and module of each command; a flight that starts looks for no others."""
+    """Return purpose and module of each command; the start of a flight does not search for other packages."""
     own = {name: (purpose, f"{__name__}.{name}") for name, purpose in COMMANDS.items()}
     if words and words[0] in own:
         return own

@@ -49,7 +49,7 @@ from knightcube.vision.sun.solar_cells import FieldAndStrings, Sky, SolarStrings
 PERIOD_NS = 5 * SECOND_NS
 """Interval (ns) between readings that are judged: their errors are correlated over shorter times."""
 OVERHEAD_ALBEDO = 0.2
-"""Light of an Earth lit from overhead, over the Sun's: an albedo of 0.3, two thirds of half the sky."""
+"""Light of an Earth lit from overhead, relative to the Sun's, for an albedo of 0.3."""
 CLOUDS = 0.5
 """Relative variation of the Earth's light."""
 LEAST_ALBEDO = 0.02
@@ -193,7 +193,7 @@ class WideFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether the cameras are to be read often: in the shadow only while the attitude is lost."""
+        """Whether the cameras are to be read often; in the shadow only while the attitude is lost."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)

@@ -48,7 +48,7 @@ class FieldBrake:
         self.detumbler.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s at `time_ns`; a stuck field is ignored."""
         if self._field_check.accept(field):
             self.detumbler.sample(time_ns, field, rate)
 
@@ -89,7 +89,7 @@ def expected_field(
 
 
 class SunAcquisitionBrake:
-    """Commands the seeker's dipole and says whether it has a Sun; implements `flight.loop.body.Brake`."""
+    """Turns the body to the Sun, and reports whether a Sun is measured; implements `Brake` of the loop."""
 
     def __init__(
         self, seeker: SunAcquisition, strings: SolarStrings, dipole_per_ampere: float, log: EventLog
@@ -107,19 +107,19 @@ class SunAcquisitionBrake:
         self._seeker.begin(now_ns)
 
     def see(self, reading: StringReading) -> None:
-        """Accept a reading of the strings, whatever the mode."""
+        """Accept a reading of the solar cells, in any mode."""
         found = coarse_sun(reading.currents, self._strings)
         self._reason = found.reason
         if found.direction is not None:
             self._seeker.update_sun(reading.time_ns, found.direction)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s at `time_ns`; a stuck field is ignored."""
         if self._field_check.accept(field):
             self._seeker.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now; without a Sun it only holds the body still, by a stuck field nothing."""
+        """Return the command now: without a Sun only against the rotation; zero with a stuck field."""
         found = self._seeker.sun is not None
         if found is not self._found:
             self._found = found

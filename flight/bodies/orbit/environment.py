@@ -40,7 +40,7 @@ class OrbitEnvironment:
     """Owns the knowledge of the orbit. `refused` counts the fixes that contradict it."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
-        """`elements`: known before the flight; None: nothing is known until the first fix."""
+        """`elements` are known before the flight; with None, the orbit is unknown until the first fix."""
         self._elements = elements
         self._clock = clock
         self._fix: GpsFix | None = None

@@ -7,7 +7,7 @@ field the cage renders the two components normal to the thread, `scale` times as
 torque about the thread, and the thread bears the torque that it makes with a coil: its pair stays off.
 
 The field is the flight's own prediction (WMM along the elements), by UTC; the cage's control computer and
-the flight's agree on that. The coil on body x alone would be helpless wherever the field lies along it: the
+the flight's agree on that. The coil on body x alone has no torque where the field is parallel to it: the
 torque about the thread is made by the coils on x and z together, with the least current.
 """
 

@@ -280,7 +280,7 @@ def _moved(law: ThreadLaw, since: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TimedStep:
-    """From mission time `at` s on reach `q2` at `rate` rad/s."""
+    """A step: reach `q2` at `rate` rad/s, from mission time `at` s on."""
 
     at: float
     q2: float

@@ -25,8 +25,8 @@ def settle() -> None:
     """Set the thresholds, exempt all present objects from garbage collection, and stop collecting by itself.
 
     Call when all is built, and a `Collector` now and then: the flight makes no garbage that only a collection
-    finds, but a failure may. Collections come at a known time then, and look at what the flight has made
-    since, not at modules and tasks, which would take tens of ms of a control cycle.
+    finds, but a failure may. Collections then come at a known time, and examine only objects made since, not
+    modules and tasks, which would take tens of ms of a control cycle.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

@@ -38,7 +38,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Deaths in a row until the worker rests: at the growing intervals, 127.5 s."""
+"""Deaths in a row until the worker rests; with the growing intervals they take at least 127.5 s."""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
 """A worker that lived for so long has a new budget."""

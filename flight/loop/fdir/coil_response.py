@@ -56,8 +56,8 @@ class ResponseSettings:
         lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
             torque, and of a reversed one.
         memory_ns: how long the residual accelerations are kept.
-        settle_ns: how long the coils must have been at rest for the field to be the Earth's; None where
-            theirs is small beside it.
+        settle_ns: how long the coils must have been at rest for the field to be the Earth's; None if the
+            coils' field is small compared with the Earth's.
     """
 
     inertia: FloatArray

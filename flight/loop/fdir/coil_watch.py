@@ -253,7 +253,9 @@ class CoilWatch:
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._weak = ""  # which coil's torque is missing in the motion
         self._verdicts: dict[int, CoilVerdict] = {}
-        self._rests: dict[int, tuple[int, str]] = {}  # of an axis that rests: since when, and why
+        self._rests: dict[
+            int, tuple[int, str]
+        ] = {}  # by resting axis: time since which it rests, and the reason
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
         self._proof = BrakeProof()
@@ -272,7 +274,7 @@ class CoilWatch:
 
     @property
     def resting(self) -> BoolArray:
-        """(3,) which axes are not to be driven for now, because they look reversed in a tumble."""
+        """(3,) whether each axis is not to be driven for now, because it looks reversed in a tumble."""
         return np.array([axis in self._rests for axis in range(3)])
 
     @property

@@ -30,7 +30,7 @@ from knightcube.errors import FlightError
 THROTTLE_NS = 5_000_000_000
 
 Sink = Callable[[EventKind, int, int, str], None]
-"""Writes an event: kind, time in ns, how many of its kind were held back before it, text."""
+"""Writes an event; arguments: kind, time in ns, number of events of the kind held back before, text."""
 
 Reactor = Callable[[EventKind, int, str], None]
 """Carries out the reaction of an event: kind, time in ns, text."""
@@ -154,7 +154,7 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
     """Validate the table; raises FlightError naming the row.
 
-    `modes_of` returns the modes in which a reaction has an effect: a fact watched in none of them is useless.
+    `modes_of` returns the modes in which a reaction has an effect: facts watched in none have no effect.
     """
     seen: set[str] = set()
     for fact in facts:

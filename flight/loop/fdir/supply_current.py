@@ -67,7 +67,7 @@ class _Step(Enum):
 
 
 class StuckLeg:
-    """Searches for a stuck leg: processes conversions, requests rest and brakes, and returns an axis.
+    """Searches for a stuck leg: processes ADC samples, requests rest and brakes, and returns an axis.
 
     Attributes:
         brake: which bridges are to be braked now.

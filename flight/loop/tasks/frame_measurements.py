@@ -50,8 +50,8 @@ class ImagingSettings:
 
     Attributes:
         exposures: how long to expose at a rate.
-        fine_rest_ns: while the attitude is fine no exposure begins sooner after the last, but where
-        seeks: returns that an object is looked for.
+        fine_rest_ns: minimum time between exposures while the attitude is fine and no object is searched for.
+        seeks: returns whether an object is searched for.
         calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
         late_ns: age after the exposure from which a frame is late.
         max_rate: rad/s of the body, beyond which no exposure is begun.
