@@ -32,9 +32,10 @@ def test_every_kind_of_packet_that_came_has_its_file(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=30.0, hold=10.0, rate_hz=10.0)))
     files = export(run, tmp_path / "csv")
     kinds = {
-        "run", "control", "target", "plan", "streak", "stars", "event", "truth", "cycle_timing", "rate_group"
-    }  # fmt: skip
-    assert {path.stem for path in files} == kinds | {"job_timing"}
+        *("run", "control", "target", "plan", "streak", "stars", "event", "truth"),
+        *("cycle_timing", "rate_group", "job_timing", "housekeeping"),
+    }
+    assert {path.stem for path in files} == kinds
     assert sorted(files) == sorted((tmp_path / "csv").iterdir())
 
 
