@@ -19,8 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flight.link.files.entity import FOREIGN, SATELLITE
-from flight.link.files.packets import DOWN, UP, VERSION
-from flight.link.files.pdu import SEGMENT_BYTES
+from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UP
 from flight.link.process.lines import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS
@@ -207,7 +206,7 @@ def files(folder: Path, gateway: str, http_port: int, epoch: str, keys: Path = K
         down=DOWN_BUCKET,
     )
     before = HEADER_BYTES + SECONDARY_BYTES
-    header = f"{UP:04X}C0000000{VERSION:02X}" + "00" * (SECONDARY_BYTES - 1)
+    header = f"{UP:04X}C0000000{PACKET_VERSION:02X}" + "00" * (SECONDARY_BYTES - 1)
     return {
         "etc/yamcs.yaml": server,
         "etc/security.yaml": _SECURITY,

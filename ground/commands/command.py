@@ -13,10 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from flight.app.run_folder import utc_ns
-from flight.link.commands.codec import CommandPacker, command_of
+from flight.link.commands.codec import Command, CommandError, CommandPacker, Ping, Point, command_of, shown
 from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
-from flight.link.commands.errors import CommandError
-from flight.link.commands.values import Command, Ping, Point, shown
 from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.directives import Deletion, Listing, Play, Scheduled, Stop

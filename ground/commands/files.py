@@ -14,8 +14,7 @@ from typing import Any
 from flight.app.service import EndingSignals
 from flight.link.files.entity import Progress
 from flight.link.files.store import Store, files_folder
-from flight.link.process.directives import Directive
-from flight.link.process.file_directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
+from flight.link.process.directives import CancelFile, DeleteFile, Directive, ListFiles, SendFile, UseFile
 from flight.link.process.filing import KINDS, LISTING
 from flight.link.process.verification import Stage
 from flight.link.security.associations import COMMAND_SPIS

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from flight.app.run_folder import utc_ns
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Command, DumpParameters, LoadParameters, shown
+from flight.link.commands.codec import Command, CommandPacker, DumpParameters, LoadParameters, shown
 from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.link.process.verification import Stage
 from flight.link.security.associations import COMMAND_SPIS

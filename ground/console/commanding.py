@@ -8,8 +8,8 @@ from typing import Any
 
 from flight.app.run_folder import utc_ns
 from flight.link.commands import codec
+from flight.link.commands.codec import CommandError
 from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS
-from flight.link.commands.errors import CommandError
 from flight.link.parameters import FIELDS as PARAMETERS
 from flight.link.parameters import crc_of
 from flight.link.process import directives

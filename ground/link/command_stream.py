@@ -13,7 +13,7 @@ import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from flight.link.files.packets import UP, VERSION
+from flight.link.files.units import PACKET_VERSION, UP
 from flight.link.frames import telecommand
 from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
@@ -61,7 +61,7 @@ _FORMS = (
         _Form(layout.identifier.to_bytes(2, "big"), layout.length, layout.length, layout.packet.version)
         for layout in TELECOMMANDS.values()
     ),
-    _Form(UP.to_bytes(2, "big"), _SHORTEST_UNIT, _LONGEST_PACKET, VERSION),
+    _Form(UP.to_bytes(2, "big"), _SHORTEST_UNIT, _LONGEST_PACKET, PACKET_VERSION),
 )
 
 

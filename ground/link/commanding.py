@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from flight.app.run_folder import utc_ns
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.frames import telecommand
 from flight.link.process import directives
 from flight.link.process.directives import NewKey

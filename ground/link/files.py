@@ -11,11 +11,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flight.app.run_folder import utc_ns
-from flight.link.files.checksum import CRC32
 from flight.link.files.entity import GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
-from flight.link.files.packets import DOWN, UP, UnitPacker, is_unit, unit_of
-from flight.link.files.pdu import Metadata, PduError
 from flight.link.files.store import Store
+from flight.link.files.transfer import CRC32
+from flight.link.files.units import DOWN, UP, Metadata, PduError, UnitPacker, is_unit, unit_of
 from flight.link.frames import telecommand
 from flight.link.frames.telecommand import HEADER
 from flight.link.process import directives

@@ -18,8 +18,7 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 
 from flight.app.run_folder import utc_ns
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.process.lines import host_port
 from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16

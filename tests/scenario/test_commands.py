@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import ChangeMode, Clear, Command, Ping, Slew
+from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run

@@ -7,8 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import DumpParameters, LoadParameters
+from flight.link.commands.codec import CommandPacker, DumpParameters, LoadParameters
 from flight.link.parameters import FIELDS, KEYS, crc_of
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.scanner import decode

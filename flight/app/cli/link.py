@@ -16,11 +16,10 @@ from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
 from flight.app.service import StartRetry, StoppedError, retried_start
-from flight.link.process.archive_reader import LogFollower
-from flight.link.process.control_line import ControlLine
+from flight.link.process.downlink import LogFollower
 from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
 from flight.link.process.station import Station, StationSettings
-from flight.link.process.verification import Sent
+from flight.link.process.verification import ControlLine, Sent
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.schema.carried import config_path
 from flight.schema.errors import ConfigError

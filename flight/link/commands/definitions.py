@@ -1,8 +1,8 @@
 """The one table of telecommands: CCSDS space packets of type 1, made and read as telemetry is.
 
-`time_ns` of the secondary header is a number that the sender uses once, its UTC say: the very same packet is
-obeyed once, so that a datagram which a network brings twice does no harm. States and ranges of arguments are
-checked from this table, on the ground and on board; the words of `flight command` are made from it.
+`time_ns` of the secondary header is a number that the sender uses once, its UTC say: the very same packet
+is obeyed once, so that a datagram which a network brings twice does no harm. States and ranges of arguments
+are checked from this table, on the ground and on board; the words of `flight command` are made from it.
 """
 
 from __future__ import annotations

@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from flight.link.files.pdu import (
+from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
+from flight.link.files.transfer import Accept, Receiver, Sender, answer_to
+from flight.link.files.units import (
     Ack,
     Code,
     Condition,
@@ -23,14 +25,11 @@ from flight.link.files.pdu import (
     Finished,
     Metadata,
     Nak,
-    Status,
     Transaction,
+    TransactionStatus,
     pack,
     unpack,
 )
-from flight.link.files.receiver import Accept, Receiver
-from flight.link.files.sender import Sender, answer_to
-from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
 from knightcube.errors import UsageError
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
@@ -206,9 +205,9 @@ class Entity:
             match content:
                 case Eof(condition) if ended is not None:
                     said = Finished(ended.condition, ended.complete, ended.kept)
-                    return [Ack(Code.EOF, condition, Status.TERMINATED), said]
+                    return [Ack(Code.EOF, condition, TransactionStatus.TERMINATED), said]
                 case Eof(condition) if condition != Condition.NO_ERROR:
-                    return [Ack(Code.EOF, condition, Status.UNRECOGNIZED)]
+                    return [Ack(Code.EOF, condition, TransactionStatus.UNRECOGNIZED)]
                 case Metadata() | FileData() | Eof() if ended is None:
                     receiver = self._begin(Incoming(*key), now_ns)
                 case _:

@@ -17,7 +17,7 @@ from typing import Annotated, TypeVar
 import msgspec
 from msgspec import Meta
 
-from flight.link.files.pdu import HIGHEST_NUMBER, Transaction
+from flight.link.files.units import HIGHEST_NUMBER, Transaction
 from flight.link.regular_files import read_regular
 from knightcube.errors import FlightError, UsageError
 

@@ -1,8 +1,8 @@
 """Files of the satellite: what may be sent down, what may come up, and what becomes of it.
 
-Down goes what stands under `log/` (the flight's runs) and `received/`; up comes what has a kind. A file that
-came does nothing by itself: it stays until it is chosen by a command that has its SHA-256. Then it stands as
-`chosen/KIND/NAME`, alone of its kind, for the board to take (docs/fly/files.md).
+Down goes what stands under `log/` (the flight's runs) and `received/`; up comes what has a kind. A file
+that came does nothing by itself: it stays until it is chosen by a command that has its SHA-256. Then it
+stands as `chosen/KIND/NAME`, alone of its kind, for the board to take (docs/fly/files.md).
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.link.commands.errors import CommandError
-from flight.link.files.checksum import CRC32, MODULAR
+from flight.link.commands.codec import CommandError
 from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
-from flight.link.files.packets import DOWN, UnitPacker, unit_of
-from flight.link.files.pdu import Metadata, PduError
 from flight.link.files.store import FileError, Store, problem_of_name, write_whole
-from flight.link.process.file_directives import (
+from flight.link.files.transfer import CRC32, MODULAR
+from flight.link.files.units import DOWN, Metadata, PduError, UnitPacker, unit_of
+from flight.link.process.directives import (
     SEND_FILE,
     CancelFile,
     DeleteFile,

@@ -1,34 +1,37 @@
-"""The link process's own loop: frames in, commands over, telemetry down, fifty times a second.
+"""Main loop of the link process: receives frames, hands over commands and sends telemetry at 50 Hz.
 
-One thread, no waiting but for the next turn. A frame that is let in is used up before anything is done with
-it. The link keeps nothing but the counters: killed at any moment, it obeys no command twice.
+The loop runs in one thread and waits only for its next turn. The counter of an accepted frame is stored
+before its content is executed. The link stores nothing but these counters: killed at any moment, it
+executes no command twice.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from flight.link.commands import codec
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.errors import CommandError
-from flight.link.files.packets import UP, is_unit
+from flight.link.commands.codec import CommandError, CommandPacker
 from flight.link.files.store import files_folder
+from flight.link.files.units import UP, is_unit
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
-from flight.link.process.archive_reader import LogFollower, time_of
-from flight.link.process.control_line import ControlLine
 from flight.link.process.directives import Deletion, Directive, Listing, NewKey, Play, Scheduled, Stop
-from flight.link.process.downlink import Downlink
+from flight.link.process.downlink import Downlink, LogFollower, Playback, time_of
 from flight.link.process.filing import Filing, values_of
-from flight.link.process.key_change import change_key
 from flight.link.process.lines import Line
-from flight.link.process.playback import Playback
-from flight.link.process.scheduling import Scheduling
-from flight.link.process.timetable import Timetable
-from flight.link.process.verification import Report, Sent, Stage, Verification, report, request_of
+from flight.link.process.scheduling import Scheduling, Timetable
+from flight.link.process.verification import (
+    ControlLine,
+    Report,
+    Sent,
+    Stage,
+    Verification,
+    report,
+    request_of,
+)
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
@@ -36,6 +39,21 @@ from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import Packer, TelemetryError
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
+
+
+def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
+    """Change a key; return why not, empty when done."""
+    if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
+        return f"there is no SPI {change.spi}"
+    before = vault.read(change.spi)
+    if before is not None and change.generation != before.generation + 1:
+        return f"the key of SPI {change.spi} is of generation {before.generation}"
+    if change.spi in COMMAND_SPIS:
+        done = gate.replace_key(change.spi, change.generation, change.key)
+    else:
+        done = sealers[change.spi].replace_key(change.generation, change.key)
+    return "" if done else "the key could not be stored"
+
 
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
@@ -231,7 +249,7 @@ class Station:
             case Stop():
                 return [*self._playback.end("stopped"), done]
             case NewKey():
-                problem = change_key(directive, self._vault, self._gate, self._sealers)
+                problem = _change_key(directive, self._vault, self._gate, self._sealers)
                 return [replace(done, stage=Stage.FAILED, text=problem) if problem else done]
             case Scheduled() | Deletion() | Listing():
                 return self._scheduling.obey(directive, done, self._clock.utc_ns())

@@ -1,20 +1,25 @@
-"""What becomes of a command: accepted or refused, started, completed or failed (PUS service 1).
+"""Hand-over of commands to the control process, and verification of each command (PUS service 1).
 
-The control process answers a command when it has obeyed it. A command that ends in a mode is completed when
-the mode packet of the live telemetry shows that mode; it has failed once the mode is SAFE, or when another
-command takes its place. A slew is completed when it has arrived, and has failed in any other mode.
+A command is accepted or refused, started, and completed or failed. Each command is sent from a socket of
+its own, so that no answer can be assigned to another command. The control process answers a command when it
+has obeyed it. A command that ends in a mode is completed when the mode packet of the live telemetry shows
+that mode. It has failed if the mode becomes SAFE or if another command replaces it. A slew is completed
+when it has arrived, and has failed in any other mode.
 """
 
 from __future__ import annotations
 
+import socket
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
+from pathlib import Path
+from typing import Generic, NamedTuple, TypeVar
 
-from flight.link.commands.values import ChangeMode, Command, Point, Slew
+from flight.link.commands.codec import ChangeMode, Command, Point, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND, MODE
-from flight.link.telemetry.packets import LAYOUTS, to_text
+from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text
 from flight.link.telemetry.walk import walk
 
 _ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes)
@@ -137,3 +142,84 @@ class Verification:
         assert self._open is not None
         sent, self._open = self._open[0], None
         return [report(sent, stage, text)]
+
+
+AT_MOST = 8
+"""Commands that wait for their answers at once."""
+
+PATIENCE_NS = 5_000_000_000
+"""For the answer of a flight, whose command cycle is 0.1 s."""
+
+T = TypeVar("T")
+
+
+@dataclass(slots=True)
+class _Waiting(Generic[T]):
+    command: T
+    line: socket.socket
+    path: Path
+    until_ns: int
+
+
+class ControlLine(Generic[T]):
+    """The control process's command socket as seen from the link. T says which command it was."""
+
+    def __init__(self, target: Path, folder: Path) -> None:
+        """`folder` is for the answers: the control process must be able to enter it."""
+        self._target = str(target)
+        self._folder = folder
+        self._waiting: list[_Waiting[T]] = []
+        self._count = 0
+
+    def send(self, command: T, data: bytes, now_ns: int) -> str:
+        """Hand a command over; return why that failed, empty when it went. Never waits."""
+        if len(self._waiting) >= AT_MOST:
+            return f"{AT_MOST} commands wait for their answers already"
+        self._count += 1
+        path = self._folder / f"answer-{self._count}"
+        with ExitStack() as stack:
+            try:
+                line = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+                line.setblocking(False)
+                stack.callback(_remove, path)
+                path.unlink(missing_ok=True)
+                line.bind(str(path))
+                path.chmod(0o660)
+                line.sendto(data, self._target)
+            except OSError as error:
+                return f"no flight listens: {error.strerror or error}"
+            stack.pop_all()
+        self._waiting.append(_Waiting(command, line, path, now_ns + PATIENCE_NS))
+        return ""
+
+    def answers(self, now_ns: int) -> list[tuple[T, bytes]]:
+        """Return the answers that came, b"" for one that did not come in time."""
+        found, still = [], []
+        for waiting in self._waiting:
+            try:
+                data = waiting.line.recv(LONGEST_PACKET)
+            except OSError:
+                if now_ns < waiting.until_ns:
+                    still.append(waiting)
+                    continue
+                data = b""
+            self._end(waiting)
+            found.append((waiting.command, data))
+        self._waiting = still
+        return found
+
+    def close(self) -> None:
+        """Give up what waits."""
+        for waiting in self._waiting:
+            self._end(waiting)
+        self._waiting = []
+
+    def _end(self, waiting: _Waiting[T]) -> None:
+        waiting.line.close()
+        _remove(waiting.path)
+
+
+def _remove(path: Path) -> None:
+    """Remove the file of a socket; one that cannot be removed now is bound over later."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)

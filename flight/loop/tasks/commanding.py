@@ -18,19 +18,20 @@ import msgspec
 
 from flight.link import events
 from flight.link.commands.channel import Channel
-from flight.link.commands.codec import unpack
-from flight.link.commands.definitions import DUMP_PARAMETERS, PING
-from flight.link.commands.errors import CommandError, MalformedError
-from flight.link.commands.values import (
+from flight.link.commands.codec import (
     ChangeMode,
     Clear,
     Command,
+    CommandError,
     DumpParameters,
     LoadParameters,
+    MalformedError,
     Ping,
     Point,
     Slew,
+    unpack,
 )
+from flight.link.commands.definitions import DUMP_PARAMETERS, PING
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS

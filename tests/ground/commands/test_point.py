@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker, unpack
-from flight.link.commands.values import Point
+from flight.link.commands.codec import CommandPacker, Point, unpack
 from ground.commands import command
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic

@@ -15,8 +15,8 @@ from aiohttp import CookieJar, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
 from flight.link.commands import codec
+from flight.link.commands.codec import Command
 from flight.link.commands.definitions import COMMANDS
-from flight.link.commands.values import Command
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray

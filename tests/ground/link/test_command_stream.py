@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import ChangeMode, Ping
-from flight.link.files.packets import DOWN, UP, UnitPacker
-from flight.link.files.pdu import SEGMENT_BYTES
+from flight.link.commands.codec import ChangeMode, CommandPacker, Ping
+from flight.link.files.units import DOWN, SEGMENT_BYTES, UP, UnitPacker
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import HEADER_BYTES, Packer

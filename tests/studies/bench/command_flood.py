@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from flight.app.run_folder import utc_ns
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import CommandPacker, Ping
 from ground.commands.command import exchange
 from knightcube.errors import FlightError
 from tests.scenario.flights import CONFIG

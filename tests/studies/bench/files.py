@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.process.file_directives import SendFile
+from flight.link.process.directives import SendFile
 from tests.flight.link.process.filed_ends import FiledEnds
 
 _LOSSES = (0.0, 0.1, 0.3)

@@ -25,8 +25,7 @@ import numpy as np
 from flight.app.run_folder import utc_ns
 from flight.link.files.store import Store
 from flight.link.process import directives
-from flight.link.process.directives import Play
-from flight.link.process.file_directives import SendFile
+from flight.link.process.directives import Play, SendFile
 from flight.link.telemetry.link_definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.files import FileSession

@@ -24,13 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.commands.channel import open_unix
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.frames import telecommand, telemetry
-from flight.link.process.archive_reader import LogFollower
-from flight.link.process.control_line import ControlLine
+from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.verification import Sent
+from flight.link.process.verification import ControlLine, Sent
 from flight.link.security.associations import Vault
 from ground.link.keys import make_keys
 from ground.link.terminal import Terminal, TerminalSettings

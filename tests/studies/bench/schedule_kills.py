@@ -21,14 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.commands.channel import DatagramChannel, open_unix
-from flight.link.commands.codec import unpack
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import Ping, unpack
 from flight.link.modes import Mode
-from flight.link.process.archive_reader import LogFollower
-from flight.link.process.control_line import ControlLine
+from flight.link.process.downlink import LogFollower
+from flight.link.process.scheduling import Timetable
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.timetable import Timetable
-from flight.link.process.verification import Sent
+from flight.link.process.verification import ControlLine, Sent
 from flight.link.security.associations import Vault
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.packets import Packer

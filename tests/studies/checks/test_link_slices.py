@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.process.timetable import Timetable
+from flight.link.process.scheduling import Timetable
 from flight.link.security.associations import Vault
 from ground.link.keys import make_keys
 from tests.studies.bench import schedule_kills

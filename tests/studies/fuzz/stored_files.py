@@ -22,7 +22,7 @@ import numpy as np
 from flight.app.accepted_config import FOLDER as FLOWN
 from flight.app.accepted_config import accepted_config, kept_configs, sum_file
 from flight.app.service import TRIALS, FlownRelease
-from flight.link.process.timetable import Timetable
+from flight.link.process.scheduling import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed
 from flight.loop.state.content import Learned, StoredState, UncleanShutdown

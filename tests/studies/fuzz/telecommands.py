@@ -10,17 +10,19 @@ from collections import Counter
 
 import numpy as np
 
-from flight.link.commands.codec import CommandPacker, check, unpack
-from flight.link.commands.errors import CommandError
-from flight.link.commands.values import (
+from flight.link.commands.codec import (
     ChangeMode,
     Clear,
     Command,
+    CommandError,
+    CommandPacker,
     DumpParameters,
     LoadParameters,
     Ping,
     Point,
     Slew,
+    check,
+    unpack,
 )
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.parameters import FIELDS

@@ -20,9 +20,8 @@ import pytest
 
 from flight.app.cli import main
 from flight.link.commands.channel import open_unix
-from flight.link.commands.codec import CommandPacker
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.commands.definitions import PING
-from flight.link.commands.values import Ping
 from flight.link.modes import Mode
 from flight.link.process.verification import Report, Request, Stage
 from flight.link.security.associations import Vault

@@ -18,8 +18,16 @@ import pytest
 
 from flight.app.cli import main
 from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
-from flight.link.commands.codec import IDENTIFIERS, LONGEST, CommandPacker, unpack
-from flight.link.commands.values import ChangeMode, Command, Ping, Slew
+from flight.link.commands.codec import (
+    IDENTIFIERS,
+    LONGEST,
+    ChangeMode,
+    Command,
+    CommandPacker,
+    Ping,
+    Slew,
+    unpack,
+)
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer

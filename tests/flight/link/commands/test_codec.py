@@ -10,19 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.link.commands.codec import CommandPacker, unpack
-from flight.link.commands.definitions import COMMANDS, LAYOUTS
-from flight.link.commands.errors import CommandError
-from flight.link.commands.values import (
+from flight.link.commands.codec import (
     ChangeMode,
     Clear,
     Command,
+    CommandError,
+    CommandPacker,
     DumpParameters,
     LoadParameters,
     Ping,
     Point,
     Slew,
+    unpack,
 )
+from flight.link.commands.definitions import COMMANDS, LAYOUTS
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY

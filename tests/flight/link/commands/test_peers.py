@@ -8,8 +8,7 @@ from ipaddress import IPv4Network
 import pytest
 
 from flight.link.commands.channel import open_udp
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.reader import parse

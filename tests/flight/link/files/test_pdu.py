@@ -31,8 +31,8 @@ from spacepackets.cfdp.pdu import (  # type: ignore[import-untyped]
 from spacepackets.cfdp.pdu.file_data import FileDataParams  # type: ignore[import-untyped]
 from spacepackets.util import ByteFieldU16, ByteFieldU32  # type: ignore[import-untyped]
 
-from flight.link.files.checksum import CRC32, MODULAR, FileSum
-from flight.link.files.pdu import (
+from flight.link.files.transfer import CRC32, MODULAR, FileSum
+from flight.link.files.units import (
     MOST_REQUESTS,
     SEGMENT_BYTES,
     Ack,
@@ -42,14 +42,18 @@ from flight.link.files.pdu import (
     Eof,
     FileData,
     Finished,
-    Kept,
     Metadata,
     Nak,
     PduError,
-    Status,
     Transaction,
     pack,
     unpack,
+)
+from flight.link.files.units import (
+    FileStatus as OurFileStatus,
+)
+from flight.link.files.units import (
+    TransactionStatus as OurTransactionStatus,
 )
 from flight.link.frames.telecommand import HEADER, LONGEST_FRAME
 from flight.link.security.sdls import OVERHEAD_BYTES
@@ -89,13 +93,13 @@ CASES: list[tuple[Content, bytes]] = [
     ),
     (Nak(0, 99, ((0, 0), (5, 9))), bytes(NakPdu(config(), 0, 99, [(0, 0), (5, 9)]).pack())),
     (
-        Ack(Code.EOF, 0, Status.ACTIVE),
+        Ack(Code.EOF, 0, OurTransactionStatus.ACTIVE),
         bytes(
             AckPdu(config(), DirectiveType.EOF_PDU, ConditionCode.NO_ERROR, TransactionStatus.ACTIVE).pack()
         ),
     ),
     (
-        Ack(Code.FINISHED, 5, Status.TERMINATED),
+        Ack(Code.FINISHED, 5, OurTransactionStatus.TERMINATED),
         bytes(
             AckPdu(
                 config(),
@@ -106,11 +110,11 @@ CASES: list[tuple[Content, bytes]] = [
         ),
     ),
     (
-        Finished(0, True, Kept.RETAINED),
+        Finished(0, True, OurFileStatus.RETAINED),
         bytes(finished(ConditionCode.NO_ERROR, DeliveryCode.DATA_COMPLETE, FileStatus.FILE_RETAINED).pack()),
     ),
     (
-        Finished(Condition.FILESTORE_REJECTION, False, Kept.REJECTED),
+        Finished(Condition.FILESTORE_REJECTION, False, OurFileStatus.REJECTED),
         bytes(
             finished(
                 ConditionCode.FILESTORE_REJECTION,

@@ -8,10 +8,9 @@ from typing import Any
 
 from flight.link.commands.channel import open_unix
 from flight.link.modes import Mode
-from flight.link.process.archive_reader import LogFollower
-from flight.link.process.control_line import ControlLine
+from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.verification import Report, Sent
+from flight.link.process.verification import ControlLine, Report, Sent
 from flight.link.security.associations import Vault
 from flight.link.telemetry.definitions import COMMAND, MODE
 from flight.link.telemetry.link_definitions import LINK, VERIFICATION

@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker
-from flight.link.commands.values import Ping
-from flight.link.files.packets import UP, UnitPacker
+from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.files.units import UP, UnitPacker
 from flight.link.process import directives, filing
+from flight.link.process.directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
 from flight.link.process.downlink import FILES, LIVE
-from flight.link.process.file_directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
 from flight.link.process.filing import LISTING
 from flight.link.telemetry.link_definitions import TRANSFER
 from flight.link.telemetry.packets import LAYOUTS

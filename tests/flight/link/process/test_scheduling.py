@@ -8,14 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import unpack
-from flight.link.commands.errors import CommandError
-from flight.link.commands.values import ChangeMode, Ping, Point, Slew
-from flight.link.commands.words import command_of_words
+from flight.link.commands.codec import ChangeMode, CommandError, Ping, Point, Slew, command_of_words, unpack
 from flight.link.modes import Mode
-from flight.link.process import directives, timetable
+from flight.link.process import directives, scheduling
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
-from flight.link.process.timetable import MOST_ENTRIES, Timetable, TimetableError
+from flight.link.process.scheduling import MOST_ENTRIES, Timetable, TimetableError
 from flight.link.security.associations import overwrite
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
@@ -147,7 +144,7 @@ def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
             raise KeyboardInterrupt
         return overwrite(path, data)
 
-    monkeypatch.setattr(timetable, "overwrite", until_killed)
+    monkeypatch.setattr(scheduling, "overwrite", until_killed)
     removed = False
     try:
         table.remove(1)
@@ -169,7 +166,7 @@ def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
     link.restart()
     link.turn()
     assert link.reports()[-1].text == "both copies of the schedule are lost: it is empty"
-    monkeypatch.setattr(timetable, "overwrite", lambda *_: False)
+    monkeypatch.setattr(scheduling, "overwrite", lambda *_: False)
     with pytest.raises(TimetableError, match="could not be stored"):
         Timetable(link.sky.folder).add(5, 1, 9, "ping 1")
 

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import CommandPacker, unpack
-from flight.link.commands.errors import CommandError
-from flight.link.commands.values import ChangeMode, Command, Ping, Slew
+from flight.link.commands.codec import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
 from flight.link.modes import Mode
 from flight.link.process import directives, station
 from flight.link.process.directives import NewKey, Play, Stop

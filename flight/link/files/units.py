@@ -1,7 +1,10 @@
-"""Protocol data units of CFDP, CCSDS 727.0-B-5, section 5: those of class 2, as values and as bytes.
+"""Units of CFDP (CCSDS 727.0-B-5, section 5) of class 2 as values and bytes, and the packets that carry them.
 
-A header (version 1, entities of 2 bytes, transaction numbers of 4, neither CRC nor large files: the frame
-that carries it is authenticated) and file data or a directive. Identifiers of other lengths are read too.
+A unit has a header (version 1, entities of 2 bytes, transaction numbers of 4 bytes) and file data or a
+directive. The header announces neither a CRC nor large files, because the frame that carries the unit is
+authenticated. Identifiers of other lengths are accepted. Each unit travels in a space packet of variable
+length with the header and time of all packets and a CRC of 16 bits; the tables of packets do not contain
+it.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES, UNSEGMENTED, crc16
 from knightcube.errors import FlightError
 
 SEGMENT_BYTES = 900
@@ -19,7 +23,7 @@ MOST_REQUESTS = 100
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
 _FIXED_BYTES = 4
-_VERSION = 0b001 << 5
+_PDU_VERSION = 0b001 << 5
 _FILE_DATA, _TO_SENDER, _UNACKNOWLEDGED, _CRC, _LARGE = 1 << 4, 1 << 3, 1 << 2, 1 << 1, 1
 _METADATA_OF_SEGMENT = 1 << 3
 _LENGTHS = (_ENTITY_BYTES - 1) << 4 | (_NUMBER_BYTES - 1)
@@ -51,7 +55,7 @@ class Code(IntEnum):
     NAK = 8
 
 
-class Status(IntEnum):
+class TransactionStatus(IntEnum):
     """The state of a transaction in an acknowledgement, table 5-8."""
 
     ACTIVE = 1
@@ -59,7 +63,7 @@ class Status(IntEnum):
     UNRECOGNIZED = 3
 
 
-class Kept(IntEnum):
+class FileStatus(IntEnum):
     """What became of a file, table 5-7."""
 
     DISCARDED = 0
@@ -141,14 +145,14 @@ def pack(transaction: Transaction, content: Content) -> bytes:
     body, kind = _body(transaction, content)
     if isinstance(content, Nak | Finished) or (isinstance(content, Ack) and content.code == Code.EOF):
         kind |= _TO_SENDER
-    header = struct.pack(">BHB", _VERSION | kind, len(body), _LENGTHS)
+    header = struct.pack(">BHB", _PDU_VERSION | kind, len(body), _LENGTHS)
     names = struct.pack(">HIH", transaction.source, transaction.number, transaction.destination)
     return header + names + body
 
 
 def unpack(data: bytes) -> tuple[Transaction, Content]:
     """Return the unit at the beginning of `data`. Raises PduError."""
-    if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _VERSION:
+    if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
         raise PduError("no unit of version 1 of CFDP")
     if data[0] & (_UNACKNOWLEDGED | _CRC | _LARGE):
         raise PduError("a unit of class 1, with a CRC, or of a large file")
@@ -233,3 +237,44 @@ def _fault(condition: int, entity: int) -> bytes:
     if condition == Condition.NO_ERROR:
         return b""
     return bytes((_FAULT_LOCATION, _ENTITY_BYTES)) + entity.to_bytes(_ENTITY_BYTES, "big")
+
+
+DOWN = 0x0973
+"""First 16 bits of a packet with a unit for the ground: telemetry, APID 0x173."""
+UP = 0x1A28
+"""First 16 bits of one for the satellite: telecommand, APID 0x228."""
+PACKET_VERSION = 1
+
+_PACKET_HEADERS = struct.Struct(">HHHBq")
+_MODULUS = 1 << 14
+
+
+class UnitPacker:
+    """Makes the packets of one direction, and counts them."""
+
+    def __init__(self, identifier: int) -> None:
+        """Make packets that begin with `identifier`, `DOWN` or `UP`."""
+        self._identifier = identifier
+        self._count = 0
+
+    def pack(self, unit: bytes, time_ns: int) -> bytes:
+        """Return the packet of a unit."""
+        length = SECONDARY_BYTES + len(unit) + CRC_BYTES - 1
+        body = (
+            _PACKET_HEADERS.pack(self._identifier, UNSEGMENTED | self._count, length, PACKET_VERSION, time_ns)
+            + unit
+        )
+        self._count = (self._count + 1) % _MODULUS
+        return body + crc16(body).to_bytes(CRC_BYTES, "big")
+
+
+def is_unit(packet: bytes, identifier: int) -> bool:
+    """Return whether a packet is one of `DOWN`, or of `UP`."""
+    return int.from_bytes(packet[:2], "big") == identifier
+
+
+def unit_of(packet: bytes) -> bytes:
+    """Return the unit that a packet carries; empty where the packet is damaged."""
+    stated = int.from_bytes(packet[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
+    known = len(packet) == stated and packet[HEADER_BYTES : HEADER_BYTES + 1] == bytes((PACKET_VERSION,))
+    return packet[HEADER_BYTES + SECONDARY_BYTES : -CRC_BYTES] if known and crc16(packet) == 0 else b""
