@@ -1,6 +1,6 @@
 """Bounded reading of regular files.
 
-Opening a FIFO in place of a file would never return, and reading a sparse file would fill the memory.
+Opening a FIFO at the path of a file would block, and reading a sparse file would exhaust the memory.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 def read_regular(path: Path, most: int) -> bytes | None:
-    """Return a file's content of at most `most` bytes, None when there is no such file.
+    """Return the content of a file of at most `most` bytes, None if the file does not exist.
 
-    Kind and size are checked before anything is read. Raises OSError for a longer file, and for a path that
-    is no regular file.
+    Type and size are checked before reading. Raises OSError for a longer file and for a path that is not a
+    regular file.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)

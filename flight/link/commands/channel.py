@@ -30,15 +30,15 @@ _LOAD_WORD, _LOAD_HALF, _AND, _EQUAL, _RETURN = 0x20, 0x28, 0x54, 0x15, 0x06
 _DROP, _WHOLE = (_RETURN, 0, 0, 0), (_RETURN, 0, 0, 0xFFFF)
 
 _Instruction = tuple[int, int, int, int]
-"""Operation, instructions to skip if it holds and if it does not, operand."""
+"""Operation, instructions to skip if the condition is true and if it is false, and operand."""
 
 
 def _filter_datagrams(
     bound: socket.socket, identifiers: Sequence[int], peers: Sequence[IPv4Network] | None = None
 ) -> None:
-    """Let a socket receive only datagrams that begin with one of `identifiers`, from `peers` where given.
+    """Let a socket receive only datagrams that begin with one of `identifiers`, from `peers` if given.
 
-    Where the kernel refuses the filter the socket receives everything, and its reader has to look.
+    If the kernel refuses the filter, the socket receives all datagrams, and its reader must check them.
     """
     start = _UDP_HEADER_BYTES if bound.family == socket.AF_INET else 0
     left = len(identifiers)
@@ -57,32 +57,32 @@ def _filter_datagrams(
 
 
 AT_MOST = 16
-"""Datagrams taken at once: a flood costs its senders, not the loop."""
+"""Maximum number of datagrams read per call, so that a flood does not delay the loop."""
 
 _LOOK_EVERY = 10
-"""Polls between two looks whether the socket's file is there: a second, in flight."""
+"""Polls between two checks that the socket's file exists: one second in flight."""
 
 
 class Channel(Protocol):
-    """A source of datagrams, each with whom to answer."""
+    """Source of datagrams, each with the address for its answer."""
 
     name: str
 
     def poll(self) -> list[tuple[bytes, Any]]:
-        """Return what has come, oldest first. Never waits, never raises."""
+        """Return the received datagrams, oldest first. Never waits, never raises."""
 
     def news(self) -> str:
         """Return what happened to the channel since the last call, empty when nothing did."""
 
     def answer(self, data: bytes, sender: Any) -> None:
-        """Answer if there is somebody; whoever does not listen has no answer. Never waits, never raises."""
+        """Answer a sender that has an address and listens. Never waits, never raises."""
 
     def close(self) -> None:
         """Close. Safe to call twice."""
 
 
 class DatagramChannel:
-    """A bound datagram socket. One with a file is bound again when the file is gone."""
+    """Bound datagram socket. A UNIX socket whose file was removed is bound again."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class DatagramChannel:
         path: Path | None = None,
         peers: Sequence[IPv4Network] | None = None,
     ) -> None:
-        """Take a bound socket; `path` is removed at the end, only `peers` are listened to where given."""
+        """Use a bound socket; remove `path` at the end, and ignore senders outside `peers` if given."""
         self.name = name
         self._socket = bound
         self._path = path
@@ -103,7 +103,7 @@ class DatagramChannel:
         self._file = _identity(path)
 
     def poll(self) -> list[tuple[bytes, Any]]:
-        """Return what has come, oldest first; of a datagram too long for a command, enough to refuse it."""
+        """Return the received datagrams, oldest first, cut to one byte more than the longest command."""
         self._polls += 1
         if self._path is not None and not self._closed and self._polls % _LOOK_EVERY == 0:
             self._look(self._path)
@@ -111,7 +111,7 @@ class DatagramChannel:
         for _ in range(AT_MOST):
             try:
                 data, sender = self._socket.recvfrom(LONGEST + 1)
-            except OSError:  # nothing there, or a sender that is gone
+            except OSError:  # no datagram waits, or ICMP reports that an earlier answer found no listener
                 break
             if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
                 found.append((data, sender))
@@ -129,7 +129,7 @@ class DatagramChannel:
                 self._socket.sendto(data, sender)
 
     def close(self) -> None:
-        """Close, and remove the socket's file unless another stands there."""
+        """Close the socket and remove its file, unless another socket has replaced the file."""
         self._socket.close()
         self._closed = True
         if self._path is not None and self._file is not None and _identity(self._path) == self._file:
@@ -137,7 +137,7 @@ class DatagramChannel:
                 self._path.unlink()
 
     def _look(self, path: Path) -> None:
-        """Bind the socket again when its file is gone or another stands there; try again at the next look."""
+        """Bind the socket again if its file was removed or replaced; retry at the next check."""
         if self._file is not None and _identity(path) == self._file:
             return
         try:
@@ -156,7 +156,7 @@ class DatagramChannel:
 def open_unix(path: Path) -> DatagramChannel:
     """Bind a UNIX datagram socket that owner and group may write to. Raises UsageError.
 
-    The file of a flight that is gone is replaced; anything else that stands there is not touched.
+    A stale socket file, to which no process listens, is replaced; any other file is left unchanged.
     """
     try:
         bound = _bound_unix(path)
@@ -189,7 +189,7 @@ def _bound_unix(path: Path) -> socket.socket:
 
 
 def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
-    """Bind a UDP socket to HOST:PORT; only `peers` are listened to where given. Raises UsageError."""
+    """Bind a UDP socket to HOST:PORT; ignore senders outside `peers` if given. Raises UsageError."""
     host, _, port = address.rpartition(":")
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -202,7 +202,7 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
 
 
 def _identity(path: Path | None) -> tuple[int, int] | None:
-    """Return the device and inode of a file, None when it is not there."""
+    """Return the device and inode of a file, None if it does not exist."""
     try:
         found = os.lstat(path) if path is not None else None
     except OSError:
@@ -211,7 +211,7 @@ def _identity(path: Path | None) -> tuple[int, int] | None:
 
 
 def _is_served(path: Path) -> bool:
-    """Return whether a process listens at a socket's file."""
+    """Return whether a process listens to a socket file."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(str(path))

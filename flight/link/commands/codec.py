@@ -27,11 +27,14 @@ from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, Po
 
 
 class CommandError(FlightError):
-    """Bytes or values that are no command; says why."""
+    """Raised for bytes or values that are not a valid command; the text states the reason."""
 
 
 class MalformedError(CommandError):
-    """Bytes that are no packet of a command: never answered, so that two flights cannot answer each other."""
+    """Raised for bytes that are not a command packet.
+
+    Such bytes are never answered, so that two flights cannot answer each other without end.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,7 @@ class Ping:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"ping {self.number}"
 
 
@@ -61,7 +64,7 @@ class ChangeMode:
 
     @property
     def packet(self) -> Packet:
-        """The packet that carries it: the abort has one of its own."""
+        """The packet of the command: SAFE has its own packet."""
         return SAFE if self.mode is Mode.SAFE else MODE
 
     @property
@@ -71,7 +74,7 @@ class ChangeMode:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"mode {self.mode.label}" + (f": {shown(self.reason)}" if self.reason else "")
 
 
@@ -89,7 +92,7 @@ class Slew:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"slew to q2 {self.q2:+.4f}" if math.isfinite(self.q2) else "slew"
 
 
@@ -107,7 +110,7 @@ class Clear:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"clear {shown(self.event)}"
 
 
@@ -130,13 +133,13 @@ class Point:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"point {self.target.text}"
 
 
 @dataclass(frozen=True, slots=True)
 class LoadParameters:
-    """Fly another table of parameters, `values` in its order, in place of the one whose CRC is `replaced`."""
+    """Replace the table of parameters whose CRC is `replaced` by `values`, in the order of the table."""
 
     replaced: int
     values: tuple[float, ...]
@@ -155,7 +158,7 @@ class LoadParameters:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return f"load-parameters {crc_of(self.values):08x} in place of {self.replaced:08x}"
 
 
@@ -172,7 +175,7 @@ class DumpParameters:
 
     @property
     def text(self) -> str:
-        """The command in words that print."""
+        """The command as printable text."""
         return "dump-parameters"
 
 
@@ -180,13 +183,13 @@ Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParame
 
 
 def shown(text: str) -> str:
-    """Return a text with its control characters, and others that do not print, as escapes."""
+    """Return a text in which characters that do not print are replaced by escapes."""
     escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     return "".join(escaped)
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
+    """Return the target of a packet's fields; a roll of NaN means a free roll. Raises CommandError."""
     goal = Goal(number)
     try:
         counts = NUMBERS.get(goal, (0,))
@@ -199,7 +202,7 @@ def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
 
 
 def _table(fields: Mapping[str, Any]) -> LoadParameters:
-    """Return the table in a packet's fields. Raises CommandError unless its CRC is that of its values."""
+    """Return the table in a packet's fields. Raises CommandError if its CRC is wrong."""
     values = tuple(fields[field.name] for field in FIELDS)
     if fields["crc"] != crc_of(values):
         raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
@@ -216,19 +219,19 @@ MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
     LOAD_PARAMETERS.name: _table,
     DUMP_PARAMETERS.name: lambda _: DumpParameters(),
 }
-"""Makes the command of a packet's fields, by the packet's name."""
+"""Functions that make a command from the fields of a packet, by packet name."""
 
 
 LONGEST = max(layout.length for layout in LAYOUTS.values())
-"""Bytes of the longest command; longer packets are refused."""
+"""Length (bytes) of the longest command; longer packets are refused."""
 
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 IDENTIFIERS = tuple(_BY_IDENTIFIER)
-"""The first 16 bits of a command: one of these."""
+"""First 16 bits of all command packets."""
 
 
 def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
-    """Return the command of a packet's fields by name. Raises CommandError for values that are none."""
+    """Return the command of a packet's fields. Raises CommandError for values outside the table."""
     check(packet, fields)
     return MAKERS[packet.name](fields)
 
@@ -248,13 +251,13 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
 
 
 class CommandPacker:
-    """Makes the packets of commands, and counts them."""
+    """Makes the packets of commands with their sequence counts."""
 
     def __init__(self) -> None:
         self._packer = Packer(LAYOUTS)
 
     def pack(self, command: Command, utc_ns: int) -> bytes:
-        """Return the bytes of a command sent at `utc_ns`. Raises CommandError for values that are none."""
+        """Return the packet of a command. Raises CommandError for values outside the table."""
         check(command.packet, command.fields)
         try:
             return self._packer.pack(command.packet, utc_ns, command.fields)
@@ -263,9 +266,9 @@ class CommandPacker:
 
 
 def unpack(data: bytes) -> Command:
-    """Return the command that `data` is, all of it.
+    """Return the command in a packet.
 
-    Raises MalformedError for bytes that are no packet of a command, CommandError for values that are none.
+    Raises MalformedError for bytes that are not a command packet and CommandError for invalid values.
     """
     if len(data) < HEADER_BYTES:
         raise MalformedError(f"{len(data)} bytes are no packet")
@@ -288,9 +291,11 @@ def unpack(data: bytes) -> Command:
 
 
 def command_of_words(text: str) -> Command:
-    """Return the command of a line of words.
+    """Return the command of a line such as `slew 0.2`, `mode hold`, `safe end of pass` or `point sun`.
 
-    Raises CommandError, also for a number that its field does not hold.
+    A line is the name of the command, then each field in order, in the units of the table; labels stand for
+    states. Missing numbers at the end are NaN, and a text field takes the rest of the line. Raises
+    CommandError, also for a number outside the range of its field.
     """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:

@@ -1,7 +1,8 @@
-"""One end of all transfers: a CFDP entity of class 2. Its owner asks it for units when there is rate for one.
+"""CFDP entity of class 2: one end of all file transfers.
 
-Nothing here waits or has a clock; what must outlive the process stands in the store. Replies come first,
-then the transfers in turn.
+The owner requests a unit whenever the line has room for one. Replies come first, then units of the
+transfers in turn. An entity never waits and has no clock. The store holds the state that survives a restart
+of the process.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from flight.link.files.units import (
 from knightcube.errors import UsageError
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
-"""Entities: the satellite, our ground, and a ground station of others (`ground.yamcs`)."""
+"""Entity numbers of the satellite, of our ground station and of a foreign one (`ground.yamcs`)."""
 MOST_OPEN = 8
-"""Transfers of each direction at once."""
+"""Maximum number of open transfers in each direction."""
 LONGEST_FILE = (1 << 32) - 1
 _KEEP_NS = 1_000_000_000
 _MOST_REPLIES = 64
 
 
 class Origin(NamedTuple):
-    """On whose command a file is sent: SPI and counter of its frame, packet and sequence; zeros: none."""
+    """Command that caused a transfer: SPI and counter of its frame, packet and sequence; zeros for none."""
 
     spi: int = 0
     counter: int = 0
@@ -55,7 +56,7 @@ NOBODY = Origin()
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How a transfer stands; `condition` is None while it is open, and `said` the words of its end."""
+    """Progress of a transfer; `condition` is None while it is open, and `said` is the text about its end."""
 
     outgoing: bool
     source: int
@@ -69,15 +70,15 @@ class Progress:
 
 
 class Entity:
-    """The transfers of one end. For one thread.
+    """Transfers of one end of the link. Not thread-safe.
 
     Attributes:
-        number: its own.
-        ended: transfers that ended since the owner looked; the owner empties it.
+        number: number of this entity.
+        ended: transfers that have ended; the owner removes them.
     """
 
     def __init__(self, number: int, store: Store, accept: Accept, most: int, now_ns: int) -> None:
-        """Go on with what is open in the store. No file of more than `most` bytes is taken."""
+        """Continue the open transfers of the store; a file of more than `most` bytes is rejected."""
         self.number = number
         self.ended: deque[Progress] = deque(maxlen=_MOST_REPLIES)
         self._store, self._accept, self._most = store, accept, most
@@ -93,16 +94,16 @@ class Entity:
         self._kept_ns = now_ns
 
     def transfers(self) -> list[Progress]:
-        """Return how each open transfer stands."""
+        """Return the progress of each open transfer."""
         return [*map(_of_sender, self._out.values()), *map(_of_receiver, self._in.values())]
 
     def send(
         self, path: Path, name: str, destination: int, kind: int, utc_ns: int, now_ns: int, origin: Origin
     ) -> Progress:
-        """Begin to send a file as it is now, or go on with it. Raises FileError.
+        """Begin or continue to send a file with a checksum of type `kind`. Raises FileError.
 
-        `kind` is the type of its checksum. Where its transfer is open already it is said again, so that the
-        other end asks for what it lacks.
+        If the transfer of the file is already open, metadata and EOF are sent again, so that the other end
+        requests its missing ranges.
         """
         try:
             facts = path.stat()
@@ -134,7 +135,7 @@ class Entity:
         return _of_sender(self._out[number])
 
     def cancel(self, source: int, number: int) -> None:
-        """End a transfer of either direction. Raises FileError where there is none."""
+        """Cancel a transfer of either direction. Raises FileError if there is no such transfer."""
         if source == self.number and number in self._out:
             self._out[number].cancel()
         elif (source, number) in self._in:
@@ -143,7 +144,7 @@ class Entity:
             raise FileError(f"no transfer {number} of entity {source} is open")
 
     def take(self, unit: bytes, now_ns: int) -> None:
-        """Take a unit that came. Raises PduError, FileError; a unit of others' transfers is left alone."""
+        """Process a received unit; units for other entities are ignored. Raises PduError, FileError."""
         transaction, content = unpack(unit)
         if transaction.source == self.number:
             replies = self._take_as_sender(transaction, content, now_ns)
@@ -155,7 +156,7 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next unit to send, None when there is none now."""
+        """Return the next unit to send, None if none is due."""
         if self._replies:
             return self._replies.popleft()
         for _ in range(len(self._out) + len(self._in)):
@@ -171,14 +172,14 @@ class Entity:
         return None
 
     def keep(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Make durable what came, once a second. Raises FileError."""
+        """Make received data durable once a second. Raises FileError."""
         if at_once or now_ns - self._kept_ns >= _KEEP_NS:
             self._kept_ns = now_ns
             for receiver in self._in.values():
                 receiver.keep()
 
     def close(self, now_ns: int) -> None:
-        """Keep what came, and close its files. Raises FileError."""
+        """Make received data durable and close the files. Raises FileError."""
         try:
             self.keep(now_ns, at_once=True)
         finally:
@@ -192,7 +193,7 @@ class Entity:
         match content:
             case Finished():
                 return [answer_to(content)]
-            case Nak():  # of a transfer that is not known any more: its receiver must not wait for it
+            case Nak():  # for an unknown transfer, so that its receiver stops waiting
                 return [Eof(Condition.CANCELLED, 0, 0)]
             case _:
                 return []
@@ -215,7 +216,7 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Take a new transfer in; where there are too many the one that was silent longest is given up."""
+        """Open an incoming transfer; beyond the maximum number, cancel the one that was silent longest."""
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
             stalest.stop(Condition.CANCELLED, "given up for a newer one")
@@ -241,7 +242,7 @@ class Entity:
         return Transaction(side.record.source, side.record.number, self.number)
 
     def _clear(self) -> None:
-        """Let go of what has ended."""
+        """Remove the transfers that have ended."""
         for sender in [sender for sender in self._out.values() if sender.condition is not None]:
             del self._out[sender.record.number]
             self._store.remove(sender.record)
@@ -257,7 +258,7 @@ class Entity:
 
 
 def open_entity(number: int, folder: Path, accept: Accept, most: int, now_ns: int) -> Entity:
-    """Return the entity of a folder. Raises UsageError where it cannot be written to."""
+    """Return the entity of a folder. Raises UsageError if the folder cannot be written."""
     try:
         return Entity(number, Store(folder), accept, most, now_ns)
     except FileError as error:

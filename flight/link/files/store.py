@@ -1,6 +1,6 @@
-"""What outlives a process: records of open transfers, the last number, the last endings, and files that came.
+"""Durable state of file transfers: records of open transfers, last number, last endings, received files.
 
-A record is replaced as a whole (written beside, synced, renamed), so a crash leaves the old one or the new.
+A record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new record.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from flight.link.regular_files import read_regular
 from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
-"""Bytes of a file's name, with the zero that ends it in a command."""
+"""Maximum length (bytes) of a file name, including the zero at its end in a command."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _MOST_PARTS = 4
 _KEPT_ENDINGS = 64
 _FREE_BYTES = 64 << 20
-"""Of the disk, which no file that comes may take."""
+"""Free disk space (bytes) that received files must not use."""
 _LONGEST_RECORD = 4 << 20
-"""Bytes; the record of a file of 64 MiB of which every other unit is missing has less than 1 MB."""
+"""Maximum length (bytes) of a record. A file of 64 MiB without every second unit needs less than 1 MB."""
 
 _Entity = Annotated[int, Meta(ge=0, le=(1 << 16) - 1)]
 _Long = Annotated[int, Meta(ge=0, le=HIGHEST_NUMBER)]
@@ -38,11 +38,11 @@ T = TypeVar("T")
 
 
 class FileError(FlightError):
-    """A file or transfer that cannot be; says why."""
+    """Raised if a file or transfer is not possible; the text states the reason."""
 
 
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file that is sent: from `path` as `name`; `origin` says on whose command."""
+    """Outgoing transfer of the file `path` under `name`; `origin` identifies its command."""
 
     number: _Long
     destination: _Entity
@@ -56,7 +56,7 @@ class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file that comes: what is known of it, what of it is on disk, and how it ended."""
+    """Incoming transfer: its metadata and EOF as received, the ranges on disk, and its end."""
 
     source: _Entity
     number: _Long
@@ -69,7 +69,7 @@ class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How an incoming transfer ended: answered again when its sender asks again."""
+    """End of an incoming transfer, which answers repeated units of its sender."""
 
     source: _Entity
     number: _Long
@@ -84,7 +84,7 @@ class _Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def problem_of_name(name: str) -> str:
-    """Return why a name must not stand for a file, empty when it may; no such name leaves its folder."""
+    """Return why a file name is not allowed, or an empty text; no allowed name leaves its folder."""
     parts = name.split("/")
     if len(name.encode()) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
         return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"
@@ -94,12 +94,12 @@ def problem_of_name(name: str) -> str:
 
 
 def files_folder(keys: Path) -> Path:
-    """Return where an end of the link keeps its files: beside its keys."""
+    """Return the folder of the files of one end of the link, beside its folder of keys."""
     return keys.absolute().parent / "files"
 
 
 class Store:
-    """The folder of one entity, which one process has.
+    """Folder of one entity, which only one process may use.
 
     Attributes:
         received: the folder of the files that came.
@@ -108,7 +108,7 @@ class Store:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Make the folder where it is not there. Raises UsageError."""
+        """Create the folder if it does not exist. Raises UsageError."""
         self._folder = folder / "transfers"
         self.received = folder / "received"
         try:
@@ -121,7 +121,7 @@ class Store:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Keep a second process from this folder. Raises UsageError where there is one."""
+        """Lock the folder against a second process. Raises UsageError if another process has locked it."""
         file = os.open(self._folder / "owner", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -134,21 +134,21 @@ class Store:
             os.close(file)
 
     def new_number(self, utc_ns: int) -> int:
-        """Reserve a number, durably; beyond all given ones also where the record of them is lost."""
+        """Reserve a number durably, above all earlier numbers even if their record was lost."""
         self._write_numbers(max(self.last + 1, utc_ns // 10**9) & HIGHEST_NUMBER or 1, self.endings)
         return self.last
 
     def add_ending(self, ending: Ending) -> None:
-        """Remember how a transfer ended."""
+        """Store the end of a transfer."""
         self._write_numbers(self.last, (*self.endings, ending)[-_KEPT_ENDINGS:])
 
     def outgoing(self) -> list[Outgoing]:
-        """Return the open transfers out; damaged records are none."""
+        """Return the open outgoing transfers; damaged records are ignored."""
         found = (_read(path, Outgoing) for path in sorted(self._folder.glob("out-*.json")))
         return [record for record in found if record is not None]
 
     def incoming(self) -> list[Incoming]:
-        """Return the open transfers in."""
+        """Return the open incoming transfers; damaged records are ignored."""
         found = (_read(path, Incoming) for path in sorted(self._folder.glob("in-*.json")))
         return [record for record in found if record is not None]
 
@@ -157,18 +157,18 @@ class Store:
         write_whole(self._path(record), msgspec.json.encode(record))
 
     def remove(self, record: Outgoing | Incoming) -> None:
-        """Remove a record and, of an incoming file, what came."""
+        """Remove a record and, for an incoming transfer, the received data."""
         with suppress(OSError):
             self._path(record).unlink(missing_ok=True)
             if isinstance(record, Incoming):
                 self.part(record).unlink(missing_ok=True)
 
     def part(self, record: Incoming) -> Path:
-        """Return where the bytes of an incoming file stand until it is whole."""
+        """Return the path of the data of an incoming file until it is complete."""
         return self._path(record).with_suffix(".part")
 
     def place(self, record: Incoming) -> None:
-        """Put a whole file where its name says. Raises FileError."""
+        """Move a complete file to the path of its name. Raises FileError."""
         assert record.name is not None
         target = self.received / record.name
         try:
@@ -179,7 +179,7 @@ class Store:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
 
     def room(self) -> int:
-        """Return how many bytes a file that comes may have for the disk's sake."""
+        """Return the free disk space (bytes) for a received file."""
         return max(0, shutil.disk_usage(self._folder).free - _FREE_BYTES)
 
     def _path(self, record: Outgoing | Incoming) -> Path:
@@ -198,7 +198,7 @@ def transaction_of(ending: Ending | Incoming, destination: int) -> Transaction:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file, durably. Raises FileError."""
+    """Replace a file durably. Raises FileError."""
     beside = path.with_name(path.name + "~")
     try:
         with beside.open("wb") as file:
@@ -220,7 +220,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _read(path: Path, shape: type[T]) -> T | None:
-    """Return a record, None for none or a damaged one."""
+    """Return a record, None if it is missing or damaged."""
     try:
         data = read_regular(path, _LONGEST_RECORD)
         return None if data is None else msgspec.json.decode(data, type=shape)

@@ -41,15 +41,15 @@ _PORTION = 1 << 20
 
 
 class FileSum:
-    """Sums up the first `size` bytes of a file, a portion at each `step`."""
+    """Checksum (CCSDS 727.0-B-5, 4.2.5) of the first `size` bytes of a file, one portion per `step`."""
 
     def __init__(self, path: Path, kind: int, size: int) -> None:
-        """`kind` is one of `TYPES`."""
+        """Begin a checksum of type `kind`, one of `TYPES`."""
         self._path, self._kind, self._left = path, kind, size
         self._at = self._value = 0
 
     def step(self) -> int | None:
-        """Read a portion; return the sum when all is read, else None. Raises OSError."""
+        """Read a portion; return the checksum after the last portion, else None. Raises OSError."""
         if self._left:
             with self._path.open("rb") as file:
                 file.seek(self._at)
@@ -63,7 +63,7 @@ class FileSum:
 
 
 def add(kind: int, value: int, data: bytes) -> int:
-    """Return the sum `value` gone on with over `data`; all pieces but the last are whole words."""
+    """Return the checksum `value` continued over `data`; all pieces except the last are whole words."""
     if kind == CRC32:
         return zlib.crc32(data, value)
     words = np.frombuffer(data + bytes(-len(data) % 4), dtype=">u4")
@@ -71,7 +71,7 @@ def add(kind: int, value: int, data: bytes) -> int:
 
 
 class Ranges:
-    """A set of bytes of a file."""
+    """Set of bytes of a file, stored as sorted, disjoint, half-open ranges."""
 
     def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
         self._begins: list[int] = []
@@ -84,21 +84,21 @@ class Ranges:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """The stretches, in order."""
+        """The ranges (begin, end), in order."""
         return list(zip(self._begins, self._ends, strict=True))
 
     @property
     def total(self) -> int:
-        """How many bytes are in it."""
+        """Number of bytes in the set."""
         return sum(self._ends) - sum(self._begins)
 
     @property
     def end(self) -> int:
-        """The end of the last stretch, 0 of none."""
+        """End of the last range, 0 for an empty set."""
         return self._ends[-1] if self._ends else 0
 
     def add(self, begin: int, end: int) -> None:
-        """Add a stretch; what it touches becomes one with it."""
+        """Add a range and merge it with adjacent ranges."""
         if begin >= end:
             return
         first = bisect_left(self._ends, begin)
@@ -108,7 +108,7 @@ class Ranges:
         self._begins[first:last], self._ends[first:last] = [begin], [end]
 
     def take(self, most: int) -> tuple[int, int]:
-        """Remove and return the first stretch, of `most` bytes at most. Raises IndexError when empty."""
+        """Remove and return the first range, at most `most` bytes. Raises IndexError if the set is empty."""
         begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
         self._begins[0] = end
         if end == self._ends[0]:
@@ -116,7 +116,7 @@ class Ranges:
         return begin, end
 
     def gaps(self, size: int) -> list[tuple[int, int]]:
-        """Return the stretches of 0 to `size` that are not in it."""
+        """Return the ranges of 0 to `size` that are not in the set."""
         edges = [0, *(edge for pair in self.pairs for edge in pair), size]
         between = [(edges[i], min(edges[i + 1], size)) for i in range(0, len(edges), 2)]
         return [(begin, end) for begin, end in between if begin < end]
@@ -127,10 +127,12 @@ _LONGEST_NS = 60_000_000_000
 
 
 class Timer:
-    """Due after each silence of a period, which doubles after a few.
+    """Retry timer: due after each silent period, which doubles after a few retries.
+
+    The other end may be out of sight for long, so that retries become rare.
 
     Attributes:
-        times: how often was asked since the other end was heard.
+        times: number of retries since the last unit of the other end.
     """
 
     def __init__(self, period_ns: int, now_ns: int) -> None:
@@ -139,39 +141,43 @@ class Timer:
         self.times = 0
 
     def due(self, now_ns: int) -> bool:
-        """Return whether it is time to ask again."""
+        """Return whether a retry is due."""
         longer = self._period_ns << max(0, min(self.times - _SOON + 1, 16))
         return now_ns - self._since_ns >= min(max(self._period_ns, _LONGEST_NS), longer)
 
     def asked(self, now_ns: int) -> None:
-        """Begin another silence."""
+        """Count a retry and begin the next period."""
         self._since_ns = now_ns
         self.times += 1
 
     def heard(self, now_ns: int) -> None:
-        """Take note that the other end is there."""
+        """Reset the timer after a unit of the other end."""
         self._since_ns = now_ns
         self.times = 0
 
 
 ASK_NS = 5_000_000_000
 _EOF_TRIES = 20
-"""To say that a transfer is cancelled."""
+"""Maximum number of EOF units that announce a cancelled transfer."""
 
 
 class Sender:
-    """One file on its way out.
+    """Source side of one transfer.
+
+    The file is sent once, then the ranges that the other end requests, until it has the whole file. A sender
+    never gives up, because the other end may be out of sight. After a restart it sends only metadata and EOF,
+    and the other end requests the missing ranges. The checksum is computed in portions while data are sent.
 
     Attributes:
-        record: what is on disk of it.
-        condition: how it ended, None while it is open.
-        said: the words of its end.
+        record: stored state of the transfer.
+        condition: condition code of its end, None while it is open.
+        said: text about its end.
     """
 
     def __init__(
         self, source: int, record: Outgoing, save: Callable[[Outgoing], None], now_ns: int, *, fresh: bool
     ) -> None:
-        """Begin to send; without `fresh` only say that all was sent."""
+        """Begin a transfer; without `fresh`, continue it by sending metadata and EOF only."""
         self.record = record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
@@ -188,22 +194,22 @@ class Sender:
 
     @property
     def sent(self) -> int:
-        """How many bytes do not wait to be sent."""
+        """Number of bytes that do not wait to be sent."""
         return self.record.size - self._wanted.total
 
     def again(self) -> None:
-        """Say again what is sent: whoever asked for the file has perhaps lost what it knew."""
+        """Send metadata and EOF again, because the receiver may have lost its state."""
         self._metadata_due = self._end_due = True
         self._acknowledged = False
 
     def cancel(self, condition: Condition = Condition.CANCELLED, why: str = "cancelled") -> None:
-        """Send no more, and say so."""
+        """Cancel the transfer and announce it to the other end."""
         self._stopped, self.said = condition, why
         self._wanted = Ranges()
         self._metadata_due, self._end_due, self._acknowledged = False, True, False
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Take what the other end says; return what is to be answered at once."""
+        """Process content of the other end; return the immediate answers."""
         self._timer.heard(now_ns)
         match content:
             case Nak(gaps=gaps) if self._stopped is None:
@@ -225,7 +231,7 @@ class Sender:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return what is to be sent now, None for nothing."""
+        """Return the next content to send, None if none is due."""
         self._go_on_summing()
         if self._metadata_due:
             self._metadata_due = False
@@ -272,7 +278,7 @@ class Sender:
 
 
 def answer_to(finished: Finished) -> Ack:
-    """Return what a Finished is acknowledged by; also that of a transfer which is closed here."""
+    """Return the acknowledgement of a Finished, also for a transfer that is already closed."""
     return Ack(Code.FINISHED, finished.condition, 2)
 
 
@@ -287,23 +293,23 @@ LACK_NS = 2_000_000_000
 SILENT_NS = 10_000_000_000
 FINISHED_NS = 5_000_000_000
 _FINISHED_TRIES = 20
-"""To say that a file is whole; who asks later is answered then."""
+"""Maximum number of Finished units without acknowledgement; later requests are still answered."""
 
 Accept = Callable[[Metadata], str]
-"""Returns why a file must not come, empty when it may."""
+"""Function that returns why a file is rejected, or an empty text if it is accepted."""
 
 
 class Receiver:
-    """One file on its way in.
+    """Destination side of one transfer: stores data, requests missing ranges and checks the file.
 
     Attributes:
-        record: what is known of it; on disk as of the last `keep`.
-        closed: whether the other end knows how it ended, or does not ask any more.
-        said: the words of its end.
+        record: state of the transfer, stored by `keep`.
+        closed: whether the other end has acknowledged the end of the transfer or no longer answers.
+        said: text about its end.
     """
 
     def __init__(self, store: Store, record: Incoming, accept: Accept, most: int, now_ns: int) -> None:
-        """Begin, or go on with what is on disk; no file of more than `most` bytes is taken."""
+        """Begin a transfer or continue a stored one; a file of more than `most` bytes is rejected."""
         self.record = record
         self.closed = False
         self.said = ""
@@ -322,12 +328,12 @@ class Receiver:
 
     @property
     def came(self) -> int:
-        """How many bytes of the file are there."""
+        """Number of received bytes of the file."""
         whole = self.record.finished is not None and self.record.finished[1]
         return self.record.size if whole else self._ranges.total
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Take what the sender says; return what is to be answered at once."""
+        """Process content of the sender; return the immediate answers."""
         self.heard_ns = now_ns
         self._lack.heard(now_ns)
         self._silence.heard(now_ns)
@@ -345,7 +351,7 @@ class Receiver:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return what is to be sent now, None for nothing."""
+        """Return the next content to send, None if none is due."""
         if self.record.finished is not None:
             return self._say_finished(now_ns)
         if self._whole():
@@ -358,7 +364,7 @@ class Receiver:
         return self._naks.popleft() if self._naks else None
 
     def keep(self) -> None:
-        """Make what came durable, then the record of it. Raises FileError."""
+        """Make received data durable, then the record of it. Raises FileError."""
         if not self._dirty:
             return
         if self._file >= 0:
@@ -375,7 +381,7 @@ class Receiver:
         self._file = -1
 
     def stop(self, condition: int, why: str) -> None:
-        """Take no more of the file."""
+        """End the transfer and reject further data."""
         kept = FileStatus.REJECTED if condition == Condition.FILESTORE_REJECTION else FileStatus.DISCARDED
         self._conclude(condition, complete=False, kept=kept, why=why)
 
@@ -412,7 +418,7 @@ class Receiver:
         self._dirty = True
 
     def _end(self, eof: Eof, now_ns: int) -> list[Content]:
-        """Acknowledge an EOF; at the first, begin to ask for what lacks."""
+        """Acknowledge an EOF; after the first EOF, begin to request missing ranges."""
         if self.record.finished is None:
             if eof.condition != Condition.NO_ERROR:
                 self.stop(eof.condition, "the sender has cancelled it")
@@ -439,7 +445,7 @@ class Receiver:
     def _go_on_checking(self) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
-        # Of what came before the metadata nobody knew yet where the file ends.
+        # Data that came before the metadata could not be compared with the size of the file.
         if size != self.record.size or self._ranges.end > size:
             self.stop(Condition.SIZE_ERROR, f"bytes up to {self._ranges.end}, {size} by its end")
             return
@@ -468,7 +474,7 @@ class Receiver:
 
     def _place(self) -> None:
         try:
-            self.keep()  # before the file is placed: after a kill between the two it is placed then
+            self.keep()  # before the file is placed, so that a killed process places it at its next start
             self.close()
             self._store.place(self.record)
         except FileError as error:

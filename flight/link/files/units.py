@@ -17,9 +17,9 @@ from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYT
 from knightcube.errors import FlightError
 
 SEGMENT_BYTES = 900
-"""Of a file in one unit: with its headers it fits into a telecommand frame."""
+"""File data (bytes) in one unit, so that the unit fits into a telecommand frame."""
 MOST_REQUESTS = 100
-"""Gaps in one NAK, for the same reason."""
+"""Maximum number of gaps in one NAK, so that it fits into a telecommand frame."""
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
 _FIXED_BYTES = 4
@@ -32,7 +32,7 @@ _MOST_NAME_BYTES = 255
 
 
 class PduError(FlightError):
-    """Bytes that are no unit of class 2; says why."""
+    """Raised for bytes that are not a unit of class 2; the text states the reason."""
 
 
 class Condition(IntEnum):
@@ -64,7 +64,7 @@ class TransactionStatus(IntEnum):
 
 
 class FileStatus(IntEnum):
-    """What became of a file, table 5-7."""
+    """File status, table 5-7."""
 
     DISCARDED = 0
     REJECTED = 1
@@ -73,7 +73,7 @@ class FileStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Transaction:
-    """What identifies a transfer: the entity that sends the file, its number there, and who receives."""
+    """Identification of a transfer: source entity, its transaction number, and destination entity."""
 
     source: int
     number: int
@@ -82,7 +82,7 @@ class Transaction:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What is sent: bytes, the names at both ends, and the type of checksum."""
+    """Size (bytes) of a file, its names at both ends, and the type of its checksum."""
 
     size: int
     source_name: str
@@ -92,7 +92,7 @@ class Metadata:
 
 @dataclass(frozen=True, slots=True)
 class FileData:
-    """A piece of the file."""
+    """Segment of the file."""
 
     offset: int
     data: bytes
@@ -100,7 +100,7 @@ class FileData:
 
 @dataclass(frozen=True, slots=True)
 class Eof:
-    """All was sent once, or why no more comes."""
+    """End of file: all data were sent once, or the condition that ended the transfer."""
 
     condition: int
     checksum: int
@@ -109,7 +109,7 @@ class Eof:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """Gaps (begin, end); (0, 0) stands for the metadata."""
+    """Request for missing ranges (begin, end); (0, 0) requests the metadata."""
 
     begin: int
     end: int
@@ -118,7 +118,7 @@ class Nak:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """The receiver has done with the file."""
+    """Report of the receiver that the transfer has ended."""
 
     condition: int
     complete: bool
@@ -127,7 +127,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Acknowledges an EOF or a Finished."""
+    """Acknowledgement of an EOF or a Finished."""
 
     code: int
     condition: int
@@ -180,7 +180,7 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
 
 
 def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
-    """Return what follows the header, and the header's bit of the kind."""
+    """Return the bytes after the header, and the bit of the header for file data."""
     match content:
         case FileData(offset, data):
             return _LONG.pack(offset) + data, _FILE_DATA
@@ -233,16 +233,16 @@ def _name(text: str) -> bytes:
 
 
 def _fault(condition: int, entity: int) -> bytes:
-    """Return the TLV that says who found the fault; none where there is none."""
+    """Return the TLV of the entity that found a fault, empty without a fault."""
     if condition == Condition.NO_ERROR:
         return b""
     return bytes((_FAULT_LOCATION, _ENTITY_BYTES)) + entity.to_bytes(_ENTITY_BYTES, "big")
 
 
 DOWN = 0x0973
-"""First 16 bits of a packet with a unit for the ground: telemetry, APID 0x173."""
+"""First 16 bits of a packet that carries a unit to the ground: telemetry, APID 0x173."""
 UP = 0x1A28
-"""First 16 bits of one for the satellite: telecommand, APID 0x228."""
+"""First 16 bits of a packet that carries a unit to the satellite: telecommand, APID 0x228."""
 PACKET_VERSION = 1
 
 _PACKET_HEADERS = struct.Struct(">HHHBq")
@@ -250,7 +250,7 @@ _MODULUS = 1 << 14
 
 
 class UnitPacker:
-    """Makes the packets of one direction, and counts them."""
+    """Makes the packets of one direction with their sequence counts."""
 
     def __init__(self, identifier: int) -> None:
         """Make packets that begin with `identifier`, `DOWN` or `UP`."""
@@ -269,12 +269,12 @@ class UnitPacker:
 
 
 def is_unit(packet: bytes, identifier: int) -> bool:
-    """Return whether a packet is one of `DOWN`, or of `UP`."""
+    """Return whether a packet begins with `identifier`, `DOWN` or `UP`."""
     return int.from_bytes(packet[:2], "big") == identifier
 
 
 def unit_of(packet: bytes) -> bytes:
-    """Return the unit that a packet carries; empty where the packet is damaged."""
+    """Return the unit in a packet, empty if the packet is damaged."""
     stated = int.from_bytes(packet[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
     known = len(packet) == stated and packet[HEADER_BYTES : HEADER_BYTES + 1] == bytes((PACKET_VERSION,))
     return packet[HEADER_BYTES + SECONDARY_BYTES : -CRC_BYTES] if known and crc16(packet) == 0 else b""

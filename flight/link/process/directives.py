@@ -142,7 +142,7 @@ _FILE_PACKET_OF: dict[type[Any], Packet] = {
 
 
 def _file_fields(directive: FileDirective) -> dict[str, Any]:
-    """Return the fields of a directive's packet. Raises CommandError for values that are none."""
+    """Return the fields of a directive's packet. Raises CommandError for values that do not fit."""
     fields: dict[str, Any] = {name: getattr(directive, name) for name in type(directive).__slots__}
     if isinstance(directive, UseFile):
         fields["sum"] = list(directive.sum)
@@ -230,7 +230,7 @@ _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Play back what run `run` (0: the newest) recorded from `begin` to `end` s of mission time."""
+    """Play back run `run` (0: the newest run) from `begin` to `end` (mission time, s)."""
 
     run: int
     begin: float
@@ -310,7 +310,7 @@ def name_of(directive: Directive) -> str:
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
-    """Return the packet of a directive. Raises CommandError for values that are none."""
+    """Return the packet of a directive. Raises CommandError for values that do not fit."""
     try:
         return Packer(LAYOUTS).pack(_PACKETS[type(directive)], utc_ns, _fields(directive))
     except TelemetryError as error:
@@ -334,7 +334,7 @@ def _fields(directive: Directive) -> dict[str, Any]:
 
 
 def unpack(data: bytes) -> Directive | None:
-    """Return the directive that `data` is, None for a packet of another kind. Raises CommandError."""
+    """Return the directive in a packet, None for a packet of another type. Raises CommandError."""
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
     if layout is None:
         return None

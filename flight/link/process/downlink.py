@@ -29,9 +29,9 @@ _STEM = "flight"
 _CHUNK = 1 << 16
 _LOOK_BACK = 1 << 14
 _LOOKS = 25
-"""After this many reads that found nothing the reader looks for a new segment or run."""
+"""Number of reads without new data after which the reader looks for a new segment or run."""
 _UNORDERED_NS = 5_000_000_000
-"""Packets of several rate groups stand in the log nearly in order of time."""
+"""Largest time (ns) by which packets of different rate groups are out of order in the log."""
 _TIME = struct.Struct(">q")
 
 
@@ -41,7 +41,7 @@ def time_of(packet: bytes) -> int:
 
 
 class _PacketStream:
-    """Whole packets of bytes that come in pieces."""
+    """Splits a stream of bytes into whole packets."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -63,7 +63,7 @@ class LogFollower:
     """
 
     def __init__(self, place: Path) -> None:
-        """Begin near the end of the newest run under `place`; it may come later."""
+        """Begin near the end of the newest run under `place`; the run may be created later."""
         self.place = place
         self._run: Path | None = None
         self._path: Path | None = None
@@ -71,17 +71,17 @@ class LogFollower:
         self._stream = _PacketStream()
         self._idle = 0
         self.label = b""
-        """The packet that says what is flown, empty while it is not known."""
+        """Packet `run` of the followed run, empty while no run was found."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:
-        """Return the folder of a run of the archive, of the newest for 0; None where there is none."""
+        """Return the folder of a run, of the newest run for 0; None if there is no such run."""
         if number == 0:
             return self._run
         return next((run for run in _runs(self.place) if int(run.name.partition("-")[2]) == number), None)
 
     def new(self) -> list[bytes]:
-        """Return the packets that came since the last call, 64 kB of them at most."""
+        """Return the packets written since the last call, at most 64 kB."""
         data = b"" if self._path is None else _read(self._path, self._offset)
         self._offset += len(data)
         self._idle = 0 if data else self._idle + 1
@@ -91,7 +91,7 @@ class LogFollower:
         return self._stream.add(data) if data else []
 
     def _go_on(self) -> None:
-        """Turn to the next segment, or to a newer run, where there is one."""
+        """Continue with the next segment or a newer run, if there is one."""
         if self._path is not None:
             number = _number(self._path)
             later = [path for path in _segments(self._path.parent) if _number(path) > number]
@@ -118,7 +118,7 @@ class LogFollower:
 
 
 def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
-    """Yield the packets of a run from `begin` to `end` s of mission time; b"" is a break."""
+    """Yield the packets of a run from `begin` to `end` (mission time, s); b"" marks a pause."""
     begin_ns, end_ns = begin * 1e9, end * 1e9
     for path in _segments_from(folder, begin_ns):
         stream, offset = _PacketStream(), 0
@@ -132,7 +132,7 @@ def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
 
 
 def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
-    """Return the segments from the one on in which a time may stand."""
+    """Return the segments from the first one that can contain packets of a time (ns) or later."""
     segments = _segments(folder)
     while len(segments) > 1:
         first = _PacketStream().add(_read(segments[1], 0)[: 2 * LONGEST_PACKET])
@@ -143,7 +143,7 @@ def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
 
 
 def _runs(archive: Path) -> list[Path]:
-    """Return the folders of an archive's runs, none of an archive that cannot be read now."""
+    """Return the folders of an archive's runs, or an empty list if the archive cannot be read."""
     try:
         return find_runs(archive)
     except OSError:
@@ -151,7 +151,7 @@ def _runs(archive: Path) -> list[Path]:
 
 
 def _segments(folder: Path) -> list[Path]:
-    """Return the segments of a run's flight log, none of a folder that cannot be read now."""
+    """Return the segments of a run's flight log, or an empty list if the folder cannot be read."""
     try:
         return find_segments(folder, _STEM)
     except OSError:
@@ -164,7 +164,7 @@ def _number(path: Path) -> int:
 
 
 def _read(path: Path, offset: int) -> bytes:
-    """Return at most 64 kB of a file; nothing of one that is gone or cannot be read now, nor of a FIFO."""
+    """Return at most 64 kB of a file, or nothing if it is missing, unreadable or a FIFO."""
     try:
         with open(path, "rb", opener=_at_once) as file:
             file.seek(offset)
@@ -174,12 +174,12 @@ def _read(path: Path, offset: int) -> bytes:
 
 
 def _at_once(path: str, flags: int) -> int:
-    """Open a file without waiting, as a FIFO in its place would."""
+    """Open a file without blocking, even if the path is a FIFO."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
 LIVE, PLAYBACK, FILES = 0, 1, 2
-"""Virtual channels."""
+"""Virtual channels of live telemetry, playback and files."""
 
 LEAST_FRAME = HEADER.size + OVERHEAD_BYTES + CRC_BYTES + 64
 
@@ -187,24 +187,24 @@ _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
 }
-"""Kinds of which each packet counts."""
+"""Packet types that must never be thinned."""
 
 _BURST_S = 0.1
 _WAITING_S = 0.5
 _URGENT = 256
-"""Reports that wait; a newer one displaces the oldest."""
+"""Maximum number of waiting reports; a newer report displaces the oldest."""
 _FLUSH_NS = 200_000_000
 
 
 class LiveQueue:
-    """Packets that wait for the rate.
+    """Queue of live packets that wait for the rate of the line.
 
     Attributes:
-        thinned: packets that newer ones have replaced.
+        thinned: number of packets that were replaced by a newer packet of their type.
     """
 
     def __init__(self, room: float) -> None:
-        """Beyond `room` bytes only the newest packet of each periodic kind waits."""
+        """Create a queue that keeps only the newest packet of each periodic type beyond `room` bytes."""
         self._room = room
         self._waiting: deque[bytes] = deque()
         self._bytes = 0
@@ -212,7 +212,7 @@ class LiveQueue:
         self.thinned = 0
 
     def add(self, packet: bytes) -> None:
-        """Have a packet wait."""
+        """Add a packet to the queue."""
         kind, room = packet[:2], self._room * (4 if packet[:2] in _SINGLE else 1)
         if self._bytes + len(packet) <= room and (kind in _SINGLE or not self._newest):
             self._waiting.append(packet)
@@ -222,7 +222,7 @@ class LiveQueue:
             self._newest[kind] = packet
 
     def take(self) -> bytes | None:
-        """Return the next packet, None when none waits."""
+        """Return the next packet, None if the queue is empty."""
         if self._waiting:
             packet = self._waiting.popleft()
             self._bytes -= len(packet)
@@ -231,20 +231,20 @@ class LiveQueue:
 
 
 class Downlink:
-    """Makes telemetry frames at a line's rate.
+    """Makes telemetry frames at the rate of the line.
 
     Attributes:
         sent: frames made.
-        displaced: reports that waited for the rate when newer ones took their room.
+        displaced: waiting reports that were dropped for newer reports.
         played_ns: mission time that the playback has reached.
     """
 
     def __init__(
         self, spacecraft: int, frame_bytes: int, rate: float, seal: Seal, files: Callable[[], bytes | None]
     ) -> None:
-        """`rate` is in bytes/s of frames; `frame_bytes` is the length of each.
+        """Make frames of `frame_bytes` bytes at `rate` bytes/s.
 
-        `files` returns the next packet of a file's transfer when there is rate for it, None for none.
+        `files` returns the next packet of the file transfers, or None if there is none.
         """
         room = frame_bytes - HEADER.size - OVERHEAD_BYTES - CRC_BYTES
         master = MasterCount()
@@ -266,29 +266,29 @@ class Downlink:
 
     @property
     def thinned(self) -> int:
-        """Live packets left out."""
+        """Number of live packets that were thinned."""
         return self._queue.thinned
 
     @property
     def playing(self) -> bool:
-        """Whether the archive is played back."""
+        """Whether a playback is running."""
         return self._source is not None
 
     def report(self, packet: bytes) -> None:
-        """Send a packet before all others."""
+        """Queue a packet to be sent before all other packets."""
         self.displaced += len(self._urgent) == _URGENT
         self._urgent.append(packet)
 
     def live(self, packet: bytes) -> None:
-        """Send a packet of the flight as it is now."""
+        """Queue a packet of live telemetry."""
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Send the packets of `source` with the rate that is left over; b"" of it is a break."""
+        """Send the packets of `source` at the remaining rate; an item b"" marks a pause."""
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:
-        """Return the frames that are due. Raises FlightError where none can be protected."""
+        """Return the frames that are due. Raises FlightError if no frame can be protected."""
         before = now_ns if self._credit_ns is None else self._credit_ns
         most = max(2.0 * self._frame_bytes, self._rate * _BURST_S)
         self._credit = min(most, self._credit + self._rate * (now_ns - before) * 1e-9)
@@ -340,7 +340,7 @@ class Downlink:
 
 
 class Playback:
-    """At most one stretch at a time goes down."""
+    """Playback of recorded packets, one time interval at a time."""
 
     def __init__(self, downlink: Downlink, log: LogFollower) -> None:
         self._downlink = downlink
@@ -348,7 +348,7 @@ class Playback:
         self._done: Report | None = None
 
     def begin(self, play: Play, done: Report) -> list[Report]:
-        """Begin a playback, at whose end `done` is reported; return the reports of now."""
+        """Begin a playback and return the reports due now; `done` is reported at its end."""
         folder = self._log.folder(play.run)
         if folder is None:
             return [replace(done, stage=Stage.FAILED, text=f"there is no run {play.run}")]
@@ -358,14 +358,14 @@ class Playback:
         return [*reports, replace(done, stage=Stage.STARTED)]
 
     def end(self, reason: str) -> list[Report]:
-        """End the playback; return the report of one that went on."""
+        """End the playback; return the report of the interrupted playback, if any."""
         reports = [] if self._done is None else [replace(self._done, stage=Stage.FAILED, text=reason)]
         self._done = None
         self._downlink.play(None)
         return reports
 
     def turn(self) -> list[Report]:
-        """Return the report of a playback that is all down."""
+        """Return the report of a playback that was sent completely."""
         if self._done is None or self._downlink.playing:
             return []
         done, self._done = self._done, None

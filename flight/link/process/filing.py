@@ -1,8 +1,8 @@
-"""Files of the satellite: what may be sent down, what may come up, and what becomes of it.
+"""Files on board: which files may be sent or received, and the selection of a received file.
 
-Down goes what stands under `log/` (the flight's runs) and `received/`; up comes what has a kind. A file
-that came does nothing by itself: it stays until it is chosen by a command that has its SHA-256. Then it
-stands as `chosen/KIND/NAME`, alone of its kind, for the board to take (docs/fly/files.md).
+Files under `log/` (the runs of the flight) and `received/` can be sent down. A file that comes up belongs
+to one of `KINDS`. A received file has no effect until a command with its SHA-256 selects it. The board then
+uses it as `chosen/KIND/NAME`, the only file of its kind (docs/fly/files.md).
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from flight.link.process.verification import Report, Request, Stage
 from knightcube.errors import UsageError
 
 KINDS = ("configuration", "elements", "catalogue", "release")
-"""Folders of the files that come up."""
+"""Kinds of files that the satellite receives, and their folders."""
 LARGEST_UP = 64 << 20
-"""Bytes of a file that comes up."""
+"""Maximum size (bytes) of a received file."""
 MOST_RECEIVED = 256 << 20
-"""Bytes of all that came up and was not deleted."""
+"""Maximum size (bytes) of all received files."""
 LISTING = "listing.json"
 _PORTION = 1 << 20
 
 
 class Filing:
-    """Executes what is commanded of files, and owns their transfers. For one thread."""
+    """Executes the commands for files and owns the file transfers. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
         """`folder` holds transfers and received files, `log` the flight's runs. Raises UsageError."""
@@ -60,14 +60,14 @@ class Filing:
             raise UsageError(str(error)) from error
 
     def take(self, packet: bytes, now_ns: int) -> None:
-        """Take a unit of a transfer. Raises CommandError for bytes that are none, or if the disk fails."""
+        """Process a received unit. Raises CommandError for an invalid unit or if the disk fails."""
         try:
             self._entity.take(unit_of(packet), now_ns)
         except (PduError, FileError, OSError) as error:
             raise CommandError(str(error)) from error
 
     def packet(self, now_ns: int, time_ns: int) -> bytes | None:
-        """Return the next packet of a transfer to send down, at mission time `time_ns`; None for none now."""
+        """Return the next packet to send down at mission time `time_ns`, None if none is due."""
         try:
             unit = self._entity.unit(now_ns)
         except (FileError, OSError) as error:
@@ -76,7 +76,7 @@ class Filing:
         return None if unit is None else self._units.pack(unit, time_ns)
 
     def turn(self, now_ns: int) -> list[Report]:
-        """Go on with what takes time; return what is to be reported of it."""
+        """Continue long operations for one step, and return their reports."""
         try:
             self._entity.keep(now_ns)
             self._problem = ""
@@ -89,7 +89,7 @@ class Filing:
         return reports
 
     def status(self) -> list[Progress]:
-        """Return how the open transfers stand."""
+        """Return the progress of all open transfers."""
         return self._entity.transfers()
 
     def ended(self) -> Iterator[tuple[Progress, Report | None]]:
@@ -105,7 +105,7 @@ class Filing:
             yield one, report
 
     def obey(self, directive: FileDirective, done: Report, utc_ns: int, now_ns: int) -> list[Report]:
-        """Execute a directive; `done` is the report of its completion. Return the reports of now."""
+        """Execute a directive and return the reports due now; `done` is the report of its completion."""
         try:
             match directive:
                 case ListFiles(entity=entity, under=under):
@@ -125,20 +125,22 @@ class Filing:
         return [done]
 
     def close(self, now_ns: int) -> None:
-        """Keep what came. Raises FileError."""
+        """Store the received data. Raises FileError."""
         self._entity.close(now_ns)
 
     def _send(
         self, path: Path, name: str, entity: int, done: Report, utc_ns: int, now_ns: int
     ) -> list[Report]:
         origin = Origin(done.spi, done.counter, *done.request)
-        kind = MODULAR if entity == FOREIGN else CRC32  # all know the first, the second finds more
+        kind = (
+            MODULAR if entity == FOREIGN else CRC32
+        )  # every implementation knows the first; the second detects more errors
         one = self._entity.send(path, name, entity, kind, utc_ns, now_ns, origin)
         text = f"{name}: {one.size} bytes, transfer {one.number}"
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the file of a name. Raises FileError; neither name nor link leads out of the two folders."""
+        """Return the file of a name. Raises FileError, also if a link leads out of the two folders."""
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
@@ -154,7 +156,7 @@ class Filing:
         return self._path(name)
 
     def _may_come(self, metadata: Metadata) -> str:
-        """Return why a file must not come up, empty when it may."""
+        """Return why an incoming file is rejected, or an empty text if it is accepted."""
         kind, _, rest = metadata.name.partition("/")
         if kind not in KINDS or not rest or "/" in rest:
             return f"{metadata.name}: names are KIND/NAME, KIND one of {', '.join(KINDS)}"
@@ -164,7 +166,7 @@ class Filing:
         return ""
 
     def _write_listing(self, under: str) -> Path:
-        """Write the list of files, by name. Raises FileError."""
+        """Write the list of files, sorted by name. Raises FileError."""
         files = []
         for name, root in self._roots.items():
             for path in root.rglob("*"):
@@ -179,7 +181,7 @@ class Filing:
         return path
 
     def _choosing(self, path: Path, name: str, wanted: bytes) -> Iterator[str | None]:
-        """Check a file in portions and choose it: yields None until the end, then why not, or empty."""
+        """Check and select a file in steps: yield None after each step, then the problem or an empty text."""
         digest = hashlib.sha256()
         kind, _, own = name.removeprefix("received/").partition("/")
         with path.open("rb") as file:

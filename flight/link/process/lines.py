@@ -1,4 +1,4 @@
-"""The lines that carry frames: UDP, TCP and serial. Nothing here waits, and floods are taken in portions."""
+"""Lines that carry frames: UDP, TCP and serial. No call waits, and a flood of frames is read in portions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.interfaces.wires import SerialPort
 from knightcube.errors import UsageError
 
 AT_MOST = 512
-"""Frames taken of a line at once: a flood costs its senders, not the telemetry."""
+"""Maximum number of frames read from a line per call, so that a flood does not delay the telemetry."""
 
 _BUFFER = 1 << 20
 _HEARD_NS = 60_000_000_000
@@ -25,30 +25,33 @@ _PIECE = 1 << 14
 
 
 class Line(Protocol):
-    """A way to the ground."""
+    """Interface of a line to the ground."""
 
     name: str
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the frames that came, each with its sender, oldest first. Never raises."""
+        """Return the received frames, each with its sender, oldest first. Never raises."""
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Take note that an authentic frame came from a sender."""
+        """Record that an authentic frame came from a sender."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames to whoever listens. Never raises."""
+        """Send frames to all listeners. Never raises."""
 
     def close(self) -> None:
         """Close. Safe to call twice."""
 
 
 class UdpLine:
-    """A frame in each datagram; telemetry goes to a fixed address and for a minute to authentic senders."""
+    """UDP line with one frame per datagram.
+
+    Telemetry is sent to the fixed address and, for a minute, to each sender of an authentic frame.
+    """
 
     def __init__(
         self, address: str, to: str | None = None, peers: Sequence[IPv4Network] | None = None
     ) -> None:
-        """Bind HOST:PORT; only `peers` are listened to where given. Raises UsageError."""
+        """Bind HOST:PORT; if `peers` is given, frames of other senders are ignored. Raises UsageError."""
         self.name = f"UDP {address}"
         self._peers = peers
         self._fixed = None if to is None else host_port(to)
@@ -68,7 +71,7 @@ class UdpLine:
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the datagrams that came, cut where they are longer than a frame can be."""
+        """Return the received datagrams, cut to one byte more than the longest frame."""
         found = []
         for _ in range(AT_MOST):
             try:
@@ -100,10 +103,10 @@ class UdpLine:
 
 
 class TcpLine:
-    """A stream of marked frames to and from each of a few connections; the oldest gives way to a fifth."""
+    """TCP server with a stream of marked frames per connection; a fifth connection replaces the oldest."""
 
     def __init__(self, address: str, peers: Sequence[IPv4Network] | None = None) -> None:
-        """Listen at HOST:PORT; only `peers` may connect where given. Raises UsageError."""
+        """Listen at HOST:PORT; if `peers` is given, only they may connect. Raises UsageError."""
         self.name = f"TCP {address}"
         self._peers = peers
         self._connections: dict[socket.socket, tuple[FrameStream, bytearray]] = {}
@@ -119,7 +122,7 @@ class TcpLine:
         return int(self._listener.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the frames that came of each connection."""
+        """Return the frames received from all connections."""
         self._accept()
         found: list[tuple[bytes, Any]] = []
         for connection, (stream, _) in list(self._connections.items()):
@@ -136,10 +139,10 @@ class TcpLine:
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing: who is connected has the telemetry."""
+        """Do nothing, because each connection receives the telemetry."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send to all; who does not read is disconnected."""
+        """Send frames to all connections, and close a connection that does not read them."""
         marked = b"".join(SYNC + frame for frame in frames)
         for connection, (_, unsent) in list(self._connections.items()):
             unsent.extend(marked)
@@ -154,7 +157,7 @@ class TcpLine:
                 self._drop(connection)
 
     def close(self) -> None:
-        """Close all."""
+        """Close all connections and the listening socket."""
         for connection in list(self._connections):
             self._drop(connection)
         self._listener.close()
@@ -179,7 +182,7 @@ class TcpLine:
 
 
 class SerialLine:
-    """A stream of marked frames on a serial port, as a radio or a modem takes it."""
+    """Stream of marked frames on a serial port, to a radio or a modem."""
 
     def __init__(self, name: str, port: SerialPort) -> None:
         """Take an open port, which reopens by itself."""
@@ -188,7 +191,7 @@ class SerialLine:
         self._stream = telecommand_stream()
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the frames that came; none of a port that is lost."""
+        """Return the received frames, or an empty list if the port is lost."""
         try:
             pieces = self._port.receive()
         except DeviceError:
@@ -196,10 +199,10 @@ class SerialLine:
         return [(frame, None) for _, data in pieces for frame in self._stream.add(data)]
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing: a serial line has one other end."""
+        """Do nothing, because a serial line has only one other end."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send marked frames; those that a lost port does not take are lost."""
+        """Send marked frames; frames are lost while the port is lost."""
         with contextlib.suppress(DeviceError):
             if frames:
                 self._port.send(b"".join(SYNC + frame for frame in frames))
@@ -210,6 +213,6 @@ class SerialLine:
 
 
 def host_port(address: str) -> tuple[str, int]:
-    """Return host and port of HOST:PORT, whose form was checked before."""
+    """Return host and port of HOST:PORT. The caller has checked the form."""
     host, _, port = address.rpartition(":")
     return host, int(port)

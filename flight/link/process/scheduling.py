@@ -32,18 +32,18 @@ from knightcube.errors import FlightError
 
 MOST_ENTRIES = 32
 HIGHEST = 2**63 - 1
-"""Largest number that a copy may hold; as a UTC in ns it is in the year 2262."""
+"""Largest number in a stored copy; as a UTC in ns it is in the year 2262."""
 _LONGEST_FILE = 1 << 16
 
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
 
 
 class TimetableError(FlightError):
-    """An entry that cannot be added, found or removed; says why."""
+    """Raised if an entry cannot be added, found or removed; the text states the reason."""
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A command in words that is due at a UTC, ns since 1970; SPI and counter are those it came with."""
+    """Command in words that is due at a UTC (ns since 1970), with SPI and counter of its frame."""
 
     number: _Count
     at_ns: _Count
@@ -53,7 +53,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One file: the version that is higher counts; `last` is the highest number given."""
+    """Content of one file. The copy with the higher version is valid; `last` is the last assigned number."""
 
     version: _Count = 0
     last: _Count = 0
@@ -67,10 +67,10 @@ class _Read:
 
 
 class Timetable:
-    """The entries of a folder, which one process has."""
+    """Stored entries of a folder, which only one process may use."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the newer good copy; `lost` says whether there were copies and none was good."""
+        """Read the newest valid copy; `lost` is set if copies exist but none is valid."""
         self._folder = folder
         read = [self._read(copy) for copy in COPIES]
         good = [one.copy for one in read if one.copy is not None]
@@ -79,11 +79,11 @@ class Timetable:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """All entries, the next due first."""
+        """All entries in the order in which they are due."""
         return tuple(sorted(self._now.entries, key=lambda entry: (entry.at_ns, entry.number)))
 
     def add(self, at_ns: int, spi: int, counter: int, command: str) -> Entry:
-        """Add an entry, durably. Raises TimetableError."""
+        """Add an entry and store it durably. Raises TimetableError."""
         if len(self._now.entries) >= MOST_ENTRIES:
             raise TimetableError(f"{MOST_ENTRIES} commands are scheduled already: delete one")
         entry = Entry(self._now.last + 1, at_ns, spi, counter, command)
@@ -91,14 +91,14 @@ class Timetable:
         return entry
 
     def remove(self, number: int) -> None:
-        """Remove an entry, durably; 0 removes all. Raises TimetableError."""
+        """Remove an entry durably; 0 removes all entries. Raises TimetableError."""
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
             raise TimetableError(f"no command is scheduled under {number}")
         self._store(left, self._now.last)
 
     def forget(self, number: int) -> None:
-        """Remove an entry from memory alone, where the disk takes nothing."""
+        """Remove an entry from memory only, if the disk cannot be written."""
         left = tuple(entry for entry in self._now.entries if entry.number != number)
         self._now = msgspec.structs.replace(self._now, entries=left)
 
@@ -126,7 +126,7 @@ def _encode(copy: _Copy) -> bytes:
 
 
 def _decode(data: bytes) -> _Copy | None:
-    """Return a copy, None for anything that `_encode` does not produce."""
+    """Return a decoded copy, or None for bytes that `_encode` does not produce."""
     line, end, crc = data.partition(b"\n")
     if crc != b"%08x\n" % zlib.crc32(line + end):
         return None
@@ -137,7 +137,7 @@ def _decode(data: bytes) -> _Copy | None:
 
 
 LATEST_NS = 10 * SECOND_NS
-"""So late a command is still executed."""
+"""Maximum delay (ns) after which a command is still executed."""
 
 _WITH_MODE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big"): LAYOUTS[packet.name] for packet in (MODE, HEALTH)
@@ -145,14 +145,14 @@ _WITH_MODE = {
 
 
 class Scheduling:
-    """The timetable of a link process. Times are UTC, ns since 1970."""
+    """Executes the timetable of a link process. Times are UTC, ns since 1970."""
 
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
         self._mode: int | None = None
 
     def beginning(self) -> list[Report]:
-        """Return what is to be reported at the start."""
+        """Return the reports due at the start of the process."""
         text = "both copies of the schedule are lost: it is empty"
         return [Report(0, 0, Stage.FAILED, SCHEDULE.name, text)] if self._timetable.lost else []
 
@@ -163,7 +163,7 @@ class Scheduling:
             self._mode = int(layout.array(packet)[0]["mode"])
 
     def obey(self, directive: Scheduled | Deletion | Listing, done: Report, utc_ns: int) -> list[Report]:
-        """Execute a directive; `done` is the report of its completion. Return all reports."""
+        """Execute a directive and return all its reports; `done` is the report of its completion."""
         try:
             match directive:
                 case Scheduled():
@@ -179,7 +179,7 @@ class Scheduling:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
 
     def due(self, utc_ns: int) -> Iterator[Report | Sent]:
-        """Yield each command that is due, removed durably before: to be handed over, or why it is not."""
+        """Yield each due command, or the report why it is not executed. It is removed durably before."""
         for entry in self._timetable.entries:
             unknown = self._mode is None and utc_ns - entry.at_ns <= LATEST_NS
             if entry.at_ns > utc_ns or unknown:
@@ -187,7 +187,9 @@ class Scheduling:
             problem = self._problem(entry, utc_ns)
             try:
                 self._timetable.remove(entry.number)
-            except TimetableError as error:  # it might be executed again after a restart
+            except (
+                TimetableError
+            ) as error:  # the entry is still on disk and could be executed again after a restart
                 problem = str(error)
                 self._timetable.forget(entry.number)
             if problem:
@@ -197,7 +199,7 @@ class Scheduling:
                 yield Sent(entry.spi, entry.counter, command_of_words(entry.command))
 
     def _problem(self, entry: Entry, utc_ns: int) -> str:
-        """Return why a command that is due must not be executed, empty when it may be."""
+        """Return why a due command must not be executed, or an empty text if it may be."""
         if utc_ns - entry.at_ns > LATEST_NS:
             return f"it is {_utc(utc_ns)}"
         if self._mode == Mode.SAFE:
@@ -230,7 +232,7 @@ def utc_of(text: str) -> int:
 
 
 def text_of(entry: Entry) -> str:
-    """Return an entry in words."""
+    """Return the text of an entry: its number, UTC and command."""
     return f"{entry.number}: {_utc(entry.at_ns)} {entry.command}"
 
 

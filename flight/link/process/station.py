@@ -42,7 +42,7 @@ from knightcube.errors import FlightError
 
 
 def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change a key; return why not, empty when done."""
+    """Change a key; return the problem, or an empty text on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
     before = vault.read(change.spi)
@@ -57,17 +57,17 @@ def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, 
 
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
-"""While frames come: a socket of Linux's usual size holds 50 ms of ten thousand a second."""
+"""Period (ns) while frames arrive. A Linux socket buffers 50 ms of 10,000 frames/s."""
 _LABEL_NS = 10 * SECOND_NS
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
 _HIGHEST_REPORTED = 2**63 - 1
-"""Largest counter, and largest mission time, that a packet holds. A frame's counter may have 96 bits."""
+"""Largest counter and mission time in a packet. The counter of a frame has up to 96 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class StationSettings:
-    """What the link is set to: spacecraft identifier, bytes of each frame, bytes/s of all."""
+    """Settings of the link: spacecraft identifier, length of a frame (bytes), and rate (bytes/s)."""
 
     spacecraft: int
     frame_bytes: int
@@ -75,7 +75,7 @@ class StationSettings:
 
 
 class Station:
-    """The satellite's end of the link."""
+    """Satellite end of the link."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Station:
         log: LogFollower,
         clock: Clock,
     ) -> None:
-        """Take open lines; the caller closes them."""
+        """Use open lines, which the caller closes."""
         self._vault = vault
         self._lines = lines
         self._control = control
@@ -131,7 +131,7 @@ class Station:
         complain: Callable[[str], object],
         alive: Callable[[], object],
     ) -> None:
-        """Turn until `ended` returns true.
+        """Run until `ended` returns true.
 
         `complain` is called once for each problem with sending, and once a second at most while reports are
         lost. `alive` is called once a second while the loop turns, also within a turn that takes many frames.
@@ -152,7 +152,7 @@ class Station:
         self._filing.close(self._clock.now_ns())
 
     def turn(self) -> bool:
-        """Take what came, send what is due; return whether anything came."""
+        """Process received frames and send due frames; return whether any frame was received."""
         now_ns, before = self._clock.now_ns(), self._received
         for line in self._lines:
             for frame, sender in line.receive():
@@ -175,7 +175,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # no counter: commands still come, a new key makes an end of that
+        except FlightError as error:  # no counter is free; a command can still set a new key
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
@@ -222,7 +222,7 @@ class Station:
             self._report(report(sent, Stage.FAILED, problem))
 
     def _execute_due(self, now_ns: int) -> None:
-        """Hand over the scheduled commands that are due, or report why not."""
+        """Hand over the due scheduled commands, or report why they are not executed."""
         utc_ns = self._clock.utc_ns()
         for due in self._scheduling.due(utc_ns):
             if isinstance(due, Sent):
@@ -242,7 +242,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Directive, done: Report) -> list[Report]:
-        """Execute a directive, of whose completion `done` is the report; return the reports of now."""
+        """Execute a directive and return the reports due now; `done` is the report of its completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)
@@ -297,7 +297,7 @@ class Station:
             self._send(TRANSFER, values_of(progress))
 
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
-        """Send a packet of the link; one whose values do not fit is counted and lost."""
+        """Send a packet of the link; a packet whose values do not fit is counted and dropped."""
         try:
             self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
         except TelemetryError as error:
@@ -308,22 +308,22 @@ class Station:
         return self._filing.packet(self._clock.now_ns(), self._time_ns())
 
     def _time_ns(self) -> int:
-        """Return the mission time, at most what a packet holds: a damaged log may state any."""
+        """Return the mission time (ns), limited to the range of the packets' field."""
         return min(self._mission_ns + self._clock.now_ns() - self._mission_at_ns, _HIGHEST_REPORTED)
 
 
 def _nothing() -> None:
-    """No-op: nobody watches the loop."""
+    """Do nothing, until a watcher of the loop is set."""
 
 
 class _Few:
-    """Lets a few reports a second pass: of a flood of repeated frames not each is reported."""
+    """Rate limit of the reports of refused frames, so that a flood of repeated frames causes few reports."""
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
 
     def fits(self, now_ns: int) -> bool:
-        """Return whether one more fits into the second that ends now, and count it then."""
+        """Return whether the limit of the last second allows another report, and count the report if so."""
         fits = len(self._times) < _REFUSALS_A_SECOND or now_ns - self._times[0] > SECOND_NS
         if fits:
             self._times.append(now_ns)
@@ -331,7 +331,7 @@ class _Few:
 
 
 def _security(gate: Gate, vault: Vault) -> dict[str, Any]:
-    """Return what the link packet says of frames and associations."""
+    """Return the fields of the link packet about frames and security associations."""
     known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
     gates = [gate.association(spi) for spi in COMMAND_SPIS]
     return {

@@ -26,7 +26,7 @@ _ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes)
 
 
 class Stage(IntEnum):
-    """The values of the verification packet."""
+    """Stage of a command; the numbers are those of the verification packet."""
 
     ACCEPTED = 1
     REFUSED = 2
@@ -36,23 +36,23 @@ class Stage(IntEnum):
 
     @property
     def final(self) -> bool:
-        """Whether nothing follows."""
+        """Whether this is the last stage of a command."""
         return self in {Stage.REFUSED, Stage.COMPLETED, Stage.FAILED}
 
 
 class Request(NamedTuple):
-    """How whoever sent a packet knows it: its first 16 bits and its sequence count."""
+    """Identification of a command packet for its sender: the first 16 bits and the sequence count."""
 
     packet: int
     sequence: int
 
 
 UNREAD = Request(0, 0)
-"""Of a frame whose packet was not read."""
+"""Request of a frame whose packet was not read."""
 
 
 def request_of(packet: bytes) -> Request:
-    """Return what identifies a command's packet."""
+    """Return the identification of a command packet."""
     return Request(int.from_bytes(packet[:2], "big"), int.from_bytes(packet[2:4], "big") & 0x3FFF)
 
 
@@ -79,12 +79,12 @@ class Report:
 
 
 def report(sent: Sent, stage: Stage, text: str) -> Report:
-    """Return the report of a stage."""
+    """Return the report that a command has reached a stage."""
     return Report(sent.spi, sent.counter, stage, sent.command.packet.name, text, sent.request)
 
 
 def final_mode(command: Command) -> Mode | None:
-    """Return the mode in which a command is completed, None for one that is completed at once."""
+    """Return the mode in which a command is completed, None if it is completed at once."""
     match command:
         case ChangeMode(mode):
             return mode
@@ -97,13 +97,13 @@ def final_mode(command: Command) -> Mode | None:
 
 
 class Verification:
-    """Follows the commands that were handed over."""
+    """Follows the stages of commands that were handed over."""
 
     def __init__(self) -> None:
         self._open: tuple[Sent, Mode, int] | None = None  # with the mode it ends in, and since when
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
-        """Return the reports of the control process's answer, b"" when none came."""
+        """Return the reports for an answer of the control process; b"" stands for a missing answer."""
         found = [answer[begin:end] for layout, begin, end in walk(answer) if layout.packet is COMMAND]
         if not found:
             return [report(sent, Stage.FAILED, "the flight did not answer")]
@@ -123,7 +123,7 @@ class Verification:
         return reports
 
     def followed(self, packet: bytes) -> list[Report]:
-        """Return the reports of a packet of live telemetry."""
+        """Return the reports that a packet of live telemetry causes."""
         layout = LAYOUTS[MODE.name]
         if self._open is None or packet[:2] != layout.identifier.to_bytes(2, "big"):
             return []
@@ -145,10 +145,10 @@ class Verification:
 
 
 AT_MOST = 8
-"""Commands that wait for their answers at once."""
+"""Maximum number of commands that wait for an answer."""
 
 PATIENCE_NS = 5_000_000_000
-"""For the answer of a flight, whose command cycle is 0.1 s."""
+"""Timeout (ns) for an answer of the control process, whose command cycle is 0.1 s."""
 
 T = TypeVar("T")
 
@@ -162,17 +162,17 @@ class _Waiting(Generic[T]):
 
 
 class ControlLine(Generic[T]):
-    """The control process's command socket as seen from the link. T says which command it was."""
+    """Client of the command socket of the control process. T identifies a command to the caller."""
 
     def __init__(self, target: Path, folder: Path) -> None:
-        """`folder` is for the answers: the control process must be able to enter it."""
+        """Create the sockets for answers in `folder`, which the control process must be able to enter."""
         self._target = str(target)
         self._folder = folder
         self._waiting: list[_Waiting[T]] = []
         self._count = 0
 
     def send(self, command: T, data: bytes, now_ns: int) -> str:
-        """Hand a command over; return why that failed, empty when it went. Never waits."""
+        """Hand over a command without waiting; return the problem, or an empty text on success."""
         if len(self._waiting) >= AT_MOST:
             return f"{AT_MOST} commands wait for their answers already"
         self._count += 1
@@ -193,7 +193,7 @@ class ControlLine(Generic[T]):
         return ""
 
     def answers(self, now_ns: int) -> list[tuple[T, bytes]]:
-        """Return the answers that came, b"" for one that did not come in time."""
+        """Return the received answers; b"" stands for an answer that timed out."""
         found, still = [], []
         for waiting in self._waiting:
             try:
@@ -209,7 +209,7 @@ class ControlLine(Generic[T]):
         return found
 
     def close(self) -> None:
-        """Give up what waits."""
+        """Stop waiting for all answers."""
         for waiting in self._waiting:
             self._end(waiting)
         self._waiting = []
@@ -220,6 +220,6 @@ class ControlLine(Generic[T]):
 
 
 def _remove(path: Path) -> None:
-    """Remove the file of a socket; one that cannot be removed now is bound over later."""
+    """Remove the file of a socket; `send` later removes a file that cannot be removed now."""
     with suppress(OSError):
         path.unlink(missing_ok=True)

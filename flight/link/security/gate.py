@@ -1,8 +1,8 @@
-"""The gate of the link: which frames are let in, each once, and the counters of those that go out.
+"""Authentication of received frames with replay protection, and protection of sent frames.
 
-Checks follow each other from cheap to dear: CRC, spacecraft, SPI, MAC, counter. A frame that fails changes
-nothing but the count of its cause. A counter is durable before the frame's data is handed on, so that no
-crash lets a frame in twice.
+The checks run from cheap to expensive: CRC, spacecraft, SPI, MAC, counter. A frame that fails a check
+changes only the count of refusals for that cause. The counter of a frame is durable before its data are
+used, so that a crash cannot lead to a second acceptance of the frame.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from flight.link.telemetry.packets import crc16
 from knightcube.errors import FlightError
 
 WINDOW = 65_536
-"""How far ahead of the highest accepted counter a command's may be; telemetry shows that counter."""
+"""Largest lead of a command's counter over the highest accepted counter, which telemetry shows."""
 
 NEXT = "next"
-"""Behind an SPI in a name: its next key, which the other end may have taken already."""
+"""Suffix of the name of an SPI's next key, which the other end may already use."""
 
 
 class Refusal(Enum):
-    """Why a frame is not let in."""
+    """Cause of the refusal of a frame."""
 
     CRC = "its CRC is wrong"
     HEADER = "it is no frame of this spacecraft"
@@ -42,7 +42,7 @@ class Refusal(Enum):
 
 
 class RefusedError(FlightError):
-    """A frame that is not let in; `counter` is that of an authentic frame, else None."""
+    """Raised for a refused frame; `counter` is the counter of an authentic frame, else None."""
 
     def __init__(self, cause: Refusal, spi: int = 0, counter: int | None = None) -> None:
         super().__init__(cause.value)
@@ -53,7 +53,7 @@ class RefusedError(FlightError):
 
 @dataclass(frozen=True, slots=True)
 class Admitted:
-    """The data of a frame that was let in."""
+    """Data of an accepted frame."""
 
     spi: int
     counter: int
@@ -62,15 +62,15 @@ class Admitted:
 
 
 Parse = Callable[[bytes], tuple[bytes, bytes]]
-"""A frame with a right CRC to its header and protected rest; raises FrameError."""
+"""Function that splits a frame of valid CRC into its header and protected rest; raises FrameError."""
 
 
 class Gate:
-    """Lets frames of one direction in.
+    """Authenticates frames of one direction and rejects replays.
 
     Attributes:
-        refused: frames by cause.
-        admitted: frames let in.
+        refused: number of refused frames by cause.
+        admitted: number of accepted frames.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class Gate:
         window: int = WINDOW,
         store_every: int = 1,
     ) -> None:
-        """Let frames of `spis` in; a copy that is lost is made again from the other.
+        """Accept frames of `spis`; a lost copy of an association is restored from the other copy.
 
-        `store_every` above 1, for telemetry on the ground, makes only each such counter durable.
+        With `store_every` above 1, for telemetry on the ground, only every such counter is made durable.
         """
         self._vault = vault
         self._parse = parse
@@ -101,11 +101,11 @@ class Gate:
         self.admitted = 0
 
     def association(self, spi: int) -> Association | None:
-        """Return the association of an SPI as it is now; None when both copies are lost."""
+        """Return the current association of an SPI, None if both copies are lost."""
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:
-        """Return the data of a frame, which is then used up. Raises RefusedError."""
+        """Return the data of a frame, whose repetition is refused from now on. Raises RefusedError."""
         try:
             admitted = self._admit(frame)
         except RefusedError as error:
@@ -115,7 +115,7 @@ class Gate:
         return admitted
 
     def replace_key(self, spi: int, generation: int, key: bytes) -> bool:
-        """Change the key of an SPI, its counter back to 0; return whether that is durable."""
+        """Change the key of an SPI and reset its counter to 0; return whether the change is durable."""
         changed = Association(spi, generation, 0, key)
         if self._vault.write(changed) == 0:
             return False
@@ -124,7 +124,7 @@ class Gate:
         return True
 
     def close(self) -> None:
-        """Make the counters durable that are not."""
+        """Make all counters durable."""
         for entry in self._open.values():
             if entry is not None and entry.unused > self._stored[entry.spi]:
                 self._vault.advance(entry)
@@ -157,7 +157,7 @@ class Gate:
         return Admitted(spi, counter, header, data)
 
     def _read_again(self, spi: int) -> Association:
-        """Return an association that the disk did not give before. Raises RefusedError if it is lost."""
+        """Read an association that could not be read before. Raises RefusedError if it is lost."""
         entry = self._vault.read(spi)
         if entry is None:
             raise RefusedError(Refusal.LOST, spi)
@@ -171,7 +171,7 @@ class Gate:
         return known
 
     def _by_next_key(self, spi: int, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return association and data of a frame under the next key: the other end has taken that key."""
+        """Return association and data of a frame under the next key, if the other end already uses it."""
         following = self._vault.read(f"{spi}-{NEXT}") if self._store_every > 1 else None
         if following is not None:
             data = unprotect(following.cipher, header, self._mask, protected)
@@ -183,12 +183,12 @@ class Gate:
 
 
 class Sealer:
-    """Protects what is sent under one SPI; each counter is reserved on disk before its frame is made."""
+    """Protects sent frames under one SPI; each counter is reserved on disk before its frame is made."""
 
     def __init__(self, vault: Vault, name: int | str, mask: bytes, block: int = 1) -> None:
-        """Take the SPI, or the name of its next key. `block` counters are reserved at once.
+        """Use the SPI, or the name of its next key, and reserve `block` counters at a time.
 
-        Those that a crash leaves over are never used.
+        Counters that are reserved but unused at a crash are never used.
         """
         self._vault = vault
         self._name = name
@@ -200,14 +200,14 @@ class Sealer:
         self._cipher: AESGCM | None = None
 
     def replace_key(self, generation: int, key: bytes) -> bool:
-        """Change the key, the counter back to 0; return whether that is durable."""
+        """Change the key and reset the counter to 0; return whether the change is durable."""
         if self._vault.write(Association(self._spi, generation, 0, key)) == 0:
             return False
         self._next = self._end = 0
         return True
 
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
-        """Return a protected frame without CRC, and its counter. Raises FlightError without a counter."""
+        """Return a protected frame without CRC, and its counter. Raises FlightError if no counter is free."""
         if self._next == self._end:
             self._reserve()
         assert self._cipher is not None
