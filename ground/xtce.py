@@ -18,9 +18,9 @@ from flight.link.commands.definitions import LAYOUTS as COMMANDS
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY
 from flight.link.process.verification import Stage
+from flight.link.telemetry.definitions import STAGES
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
-from flight.link.telemetry.states import STAGES
 
 SPACE = "KnightCube"
 TELECOMMANDS = {**COMMANDS, **{name: layout for name, layout in DIRECTIVES.items() if name != NEW_KEY.name}}

@@ -6,8 +6,7 @@ import tempfile
 from pathlib import Path
 
 from flight.link.telemetry.definitions import THERMAL
-from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import FlightLog, Recorder
 from ground.documentation import markdown
 from ground.export import export
 from ground.telemetry.reader import read_run

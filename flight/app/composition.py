@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.commands.channel import Channel
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import Recorder
 from flight.loop.body import PLANNER, Body, BodyKind, Planner
 from flight.loop.executive.jobs import JobRunner, Worker
 from flight.loop.fdir.facts import EventLog, Facts, Streams, streams_of

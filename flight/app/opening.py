@@ -17,8 +17,7 @@ from flight.app.devices import open_devices
 from flight.app.run_folder import open_log
 from flight.link import events
 from flight.link.commands.channel import Channel, open_udp, open_unix
-from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import FlightLog, Recorder
 from flight.loop.executive import memory
 from flight.loop.executive.jobs import JobResult, JobRunner, LockStepRunner
 from flight.loop.executive.worker_processes import ProcessRunner

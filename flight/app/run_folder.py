@@ -8,9 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flight.app.request import RunRequest
-from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs
+from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs, open_segment
 from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import SECOND_NS, Rig

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from flight import __version__
 from flight.link.events import EventKind, Severity
 from flight.link.telemetry.definitions import RUN
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import Recorder
 from flight.loop.fdir.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Facts
 from flight.schema.sections import Config
 from hal.interfaces.devices import CoilState

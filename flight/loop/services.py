@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import Recorder
 from flight.loop.executive.jobs import JobRunner
 from flight.loop.fdir.facts import EventLog, Facts, Streams
 from hal.interfaces.devices import (

@@ -14,12 +14,11 @@ import numpy as np
 
 from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import Command, CommandPacker, DumpParameters, LoadParameters, shown
-from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.link.process.verification import Stage
 from flight.link.security.associations import COMMAND_SPIS
-from flight.link.telemetry.definitions import COMMAND, PARAMETERS
-from flight.link.telemetry.link_definitions import VERIFICATION
+from flight.link.telemetry.definitions import COMMAND, PARAMETERS, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, to_text
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.schema.document import read_document, read_text, to_yaml
 from ground.commands.command import exchange
 from ground.link.options import add_link_options, terminal_of

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any
 
 from flight.link.telemetry.archive import find_runs
-from flight.link.telemetry.states import STREAMS as STREAM_STATES
+from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from ground.commands.options import positive
 from ground.watch.plain import PlainLines, attitude_text, event_line, state_line
 from ground.watch.socket import answers

@@ -10,11 +10,11 @@ from flight.app.run_folder import utc_ns
 from flight.link.commands import codec
 from flight.link.commands.codec import CommandError
 from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS
-from flight.link.parameters import FIELDS as PARAMETERS
-from flight.link.parameters import crc_of
 from flight.link.process import directives
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import Layout, Packer, TelemetryError
+from flight.link.telemetry.parameters import FIELDS as PARAMETERS
+from flight.link.telemetry.parameters import crc_of
 from ground.commands.command import exchange
 from ground.console.instant import values
 from ground.telemetry.scanner import decode

@@ -12,7 +12,7 @@ from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.process.directives import LIST
 from flight.link.process.downlink import LIVE
 from flight.link.process.verification import Report, Stage
-from flight.link.telemetry.link_definitions import VERIFICATION
+from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import PacketArray
 from ground.console.commanding import Object
 from ground.link.commanding import obeyed

@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeVar
 
 from aiohttp import WSMsgType, web
 
-from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
+from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.access import Access, foreign
 from ground.console.commanding import Commanding

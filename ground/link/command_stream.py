@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from flight.link.files.units import PACKET_VERSION, UP
 from flight.link.frames import telecommand
-from flight.link.security.sdls import OVERHEAD_BYTES
+from flight.link.security.associations import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import FlightError

@@ -20,8 +20,8 @@ from flight.link.frames.telecommand import HEADER
 from flight.link.process import directives
 from flight.link.process.directives import Directive
 from flight.link.process.verification import Report, Stage
-from flight.link.security.sdls import OVERHEAD_BYTES
-from flight.link.telemetry.link_definitions import TRANSFER, VERIFICATION
+from flight.link.security.associations import OVERHEAD_BYTES
+from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from ground.link.terminal import Terminal, report_of
 from knightcube.errors import FlightError

@@ -20,7 +20,7 @@ from ipaddress import IPv4Address
 from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.process.lines import host_port
-from flight.link.telemetry.link_definitions import VERIFICATION
+from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
 from ground.link.command_stream import CommandStream, StreamError
 from ground.link.terminal import Terminal, report_of

@@ -19,10 +19,9 @@ from flight.link.frames.stream import SYNC, FrameStream, telemetry_stream
 from flight.link.frames.telemetry import PacketAssembler
 from flight.link.process.lines import host_port
 from flight.link.process.verification import Report, Request, Stage
-from flight.link.security.associations import TELEMETRY_SPIS, Vault
+from flight.link.security.associations import OVERHEAD_BYTES, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Gate, RefusedError, Sealer
-from flight.link.security.sdls import OVERHEAD_BYTES
-from flight.link.telemetry.link_definitions import VERIFICATION
+from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from flight.schema.sections import Link
 from knightcube.errors import FlightError, UsageError

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from flight.link.telemetry.states import SEVERITIES
+from flight.link.telemetry.definitions import SEVERITIES
 from ground.report.performance import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
 
 Object = dict[str, Any]

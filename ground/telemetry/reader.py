@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from flight.link.telemetry.segments import find_segments
 from ground.telemetry.scanner import ScanResult, scan
 from knightcube.errors import UsageError
 

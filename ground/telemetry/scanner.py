@@ -13,8 +13,9 @@ from flight.link.telemetry.packets import (
     Layout,
     PacketArray,
     TelemetryError,
+    truncated_bytes,
+    walk,
 )
-from flight.link.telemetry.walk import truncated_bytes, walk
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from flight.link.telemetry.definitions import SEVERITIES, STEERING
+from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.states import SEVERITIES, STEERING
-from flight.link.telemetry.states import STREAMS as STREAM_STATES
 from ground.watch.plain import attitude_text
 from ground.watch.view import STREAMS, View, named, printable
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from flight.link.telemetry.definitions import SEVERITIES, STEERING
 from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.states import SEVERITIES, STEERING
 from ground.watch.view import Event, View, named
 
 _LATEST = 1e15  # s: beyond it a time is damage, not a moment of a flight

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
+from flight.link.telemetry.definitions import MODES
 from flight.link.telemetry.form import States
 from flight.link.telemetry.packets import PacketArray, to_text
-from flight.link.telemetry.states import MODES
 from knightcube.astro.quaternion import angle_between
 
 STREAMS = ("imu", "field", "coils", "power", "camera")

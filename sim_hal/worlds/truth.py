@@ -6,8 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from flight.link.telemetry.definitions import TRUTH
-from flight.link.telemetry.orbit_definitions import ORBIT_TRUTH
+from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUTH
 from flight.link.telemetry.packets import Packer
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds.surroundings import CAUSES, OrbitingWorld, OrbitTruth

@@ -11,7 +11,7 @@ from flight.link.commands.definitions import COMMANDS
 from flight.link.events import Severity
 from flight.link.process.directives import DIRECTIVES, NEW_KEY
 from flight.link.process.verification import Stage
-from flight.link.telemetry import states
+from flight.link.telemetry import definitions
 from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
@@ -96,12 +96,12 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
 
 def test_the_states_of_the_table_are_those_of_the_code() -> None:
     """What the link cannot import: states that the loop and the bodies number."""
-    assert tuple((int(state), state.name.lower()) for state in SteeringState) == states.STEERING
+    assert tuple((int(state), state.name.lower()) for state in SteeringState) == definitions.STEERING
     streams = tuple((int(state), state.name.lower().replace("_", "-")) for state in StreamState)
-    assert streams == states.STREAMS
-    assert tuple((int(stage), stage.name.lower()) for stage in Stage) == states.STAGES
-    assert tuple((i, level.value) for i, level in enumerate(LEVELS)) == states.KNOWLEDGE
-    assert tuple((i, fact.name) for i, fact in enumerate(FACTS)) == states.FACTS
+    assert streams == definitions.STREAMS
+    assert tuple((int(stage), stage.name.lower()) for stage in Stage) == definitions.STAGES
+    assert tuple((i, level.value) for i, level in enumerate(LEVELS)) == definitions.KNOWLEDGE
+    assert tuple((i, fact.name) for i, fact in enumerate(FACTS)) == definitions.FACTS
     grave = {fact.name: fact.begins.severity is Severity.FAULT for fact in FACTS}
-    named = dict(states.FACTS)
-    assert {named[bit]: level == "fault" for bit, level in states.FACT_ALARMS} == grave
+    named = dict(definitions.FACTS)
+    assert {named[bit]: level == "fault" for bit, level in definitions.FACT_ALARMS} == grave

@@ -10,8 +10,8 @@ import pytest
 
 from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.executive import RateGroup
 from flight.loop.fdir.facts import FACTS
 from flight.schema import reader as configuration

@@ -8,8 +8,8 @@ import msgspec
 import pytest
 
 from flight.link.commands.codec import CommandPacker, DumpParameters, LoadParameters
-from flight.link.parameters import FIELDS, KEYS, crc_of
 from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from ground.telemetry.scanner import decode
 from tests.scenario.flights import event_names
 from tests.scenario.mode_flights import commanded

@@ -12,7 +12,7 @@ from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.orbit_definitions import NAVIGATION, SPIN
+from flight.link.telemetry.definitions import NAVIGATION, SPIN
 from flight.loop.body import ControlOutput, Target
 from flight.loop.fdir import facts
 from flight.loop.services import Services

@@ -19,9 +19,9 @@ from flight.link.commands.definitions import (
     SLEW,
 )
 from flight.link.modes import Mode
-from flight.link.parameters import FIELDS, KEYS, crc_of
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 

@@ -8,9 +8,9 @@ are checked from this table, on the ground and on board; the words of `flight co
 from __future__ import annotations
 
 from flight.link.modes import COMMANDABLE, Mode
-from flight.link.parameters import FIELDS as PARAMETERS
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Layout, compile_layouts
+from flight.link.telemetry.parameters import FIELDS as PARAMETERS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal
 

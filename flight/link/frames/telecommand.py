@@ -1,7 +1,7 @@
 """Telecommand transfer frames, CCSDS 232.0-B-4: a header of 5 bytes, one space packet, a CRC of 2.
 
 All are of type BD (bypass, data): neither acknowledged nor sent again by the frame layer. The security of
-CCSDS 355.0-B stands between header and CRC (`flight.link.security.sdls`). There is no segment header.
+CCSDS 355.0-B stands between header and CRC (`flight.link.security.associations`). There is no segment header.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The header of 6 bytes has a first header pointer: where in the data the first packet begins that begins there.
 So a reader that lost a frame finds the next packet. Gaps are filled with idle packets. Security as of
-`flight.link.security.sdls`; there is no operational control field.
+`flight.link.security.associations`; there is no operational control field.
 """
 
 from __future__ import annotations

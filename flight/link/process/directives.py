@@ -8,7 +8,7 @@ from typing import Any
 from flight.link.commands.codec import CommandError
 from flight.link.files.entity import FOREIGN, GROUND
 from flight.link.files.store import LONGEST_NAME
-from flight.link.security.sdls import KEY_BYTES
+from flight.link.security.associations import KEY_BYTES
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,

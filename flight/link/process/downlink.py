@@ -18,12 +18,10 @@ from pathlib import Path
 from flight.link.frames.telemetry import HEADER, MasterCount, Seal, TelemetryFramer
 from flight.link.process.directives import Play
 from flight.link.process.verification import Report, Stage
-from flight.link.security.sdls import OVERHEAD_BYTES
-from flight.link.telemetry.archive import find_runs
+from flight.link.security.associations import OVERHEAD_BYTES
+from flight.link.telemetry.archive import find_runs, find_segments
 from flight.link.telemetry.definitions import COMMAND, EVENT, MODE, PLAN, RUN, STARS, STREAK, TARGET
-from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, LONGEST_PACKET
-from flight.link.telemetry.segments import find_segments
-from flight.link.telemetry.walk import walk
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, LONGEST_PACKET, walk
 
 _STEM = "flight"
 _CHUNK = 1 << 16

@@ -34,8 +34,8 @@ from flight.link.process.verification import (
 )
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
+from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.form import Packet
-from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import Packer, TelemetryError
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError

@@ -19,8 +19,7 @@ from typing import Generic, NamedTuple, TypeVar
 from flight.link.commands.codec import ChangeMode, Command, Point, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND, MODE
-from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text
-from flight.link.telemetry.walk import walk
+from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
 
 _ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes)
 

@@ -1,9 +1,13 @@
-"""Security associations on disk: key and counter of each SPI in two copies, replaced in place and synced.
+"""Security associations of the link, stored on disk, and the protection of frames under their keys.
 
-A copy is a record of fixed size that ends in its CRC-32. Both are written each time, one after the other,
-over the bytes that they have: that needs no room on a full disk, and a crash tears one copy at most. The
-newer copy counts; it has the later key or the higher counter. A folder holds the associations of one end of
-the link. Only its owner may read the files, and a key leaves them for the cipher alone.
+Frames follow CCSDS 355.0-B-2 with AES-256-GCM in both directions: security header (SPI 2 bytes, IV 12
+bytes), ciphertext, MAC (16 bytes). The IV is the frame's counter, which is used only once under a key. The
+MAC covers the virtual channel, the SPI and the data; the IV is the nonce. Yamcs covers the same bits.
+
+Key and counter of each SPI are stored in two copies. A copy is a record of fixed size that ends in its
+CRC-32. Both copies are overwritten in place, one after the other: this needs no space on a full disk, and a
+crash damages one copy at most. The newer copy is valid; it has the later key or the higher counter. A
+folder holds the associations of one end of the link, and only its owner may read the files.
 """
 
 from __future__ import annotations
@@ -18,12 +22,52 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flight.link.regular_files import read_regular
-from flight.link.security.sdls import KEY_BYTES
-from flight.link.telemetry.segments import make_lasting
+from flight.link.telemetry.archive import make_lasting
 from knightcube.errors import FlightError, UsageError
+
+SPI_BYTES = 2
+IV_BYTES = 12
+MAC_BYTES = 16
+SECURITY_HEADER_BYTES = SPI_BYTES + IV_BYTES
+OVERHEAD_BYTES = SECURITY_HEADER_BYTES + MAC_BYTES
+KEY_BYTES = 32
+
+_NO_IV = bytes(IV_BYTES)
+
+
+def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
+    masked = int.from_bytes(header, "big") & int.from_bytes(mask, "big")
+    return masked.to_bytes(len(header), "big") + spi + _NO_IV
+
+
+def protect(cipher: AESGCM, spi: int, counter: int, header: bytes, mask: bytes, data: bytes) -> bytes:
+    """Return header, security header, ciphertext and MAC; `mask` has the bits of the header that count."""
+    index, iv = spi.to_bytes(SPI_BYTES, "big"), counter.to_bytes(IV_BYTES, "big")
+    return header + index + iv + cipher.encrypt(iv, data, _authenticated(header, mask, index))
+
+
+def spi_of(protected: bytes) -> int:
+    """Return the index of the association that protects a frame, -1 of one that is too short."""
+    return int.from_bytes(protected[:SPI_BYTES], "big") if len(protected) >= OVERHEAD_BYTES else -1
+
+
+def counter_of(protected: bytes) -> int:
+    """Return the counter of a frame; believe it only after `unprotect`."""
+    return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big")
+
+
+def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> bytes | None:
+    """Return the data of a frame, from the security header on; None unless the MAC is right."""
+    index, iv = protected[:SPI_BYTES], protected[SPI_BYTES:SECURITY_HEADER_BYTES]
+    try:
+        return cipher.decrypt(iv, protected[SECURITY_HEADER_BYTES:], _authenticated(header, mask, index))
+    except InvalidTag:
+        return None
+
 
 COMMAND_SPIS = (1, 2)
 """Of commands: the usual one and its reserve."""

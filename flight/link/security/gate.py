@@ -16,8 +16,17 @@ from enum import Enum
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flight.link.frames.telecommand import FrameError
-from flight.link.security.associations import COPIES, HIGHEST_COUNTER, Association, Vault
-from flight.link.security.sdls import KEY_BYTES, counter_of, protect, spi_of, unprotect
+from flight.link.security.associations import (
+    COPIES,
+    HIGHEST_COUNTER,
+    KEY_BYTES,
+    Association,
+    Vault,
+    counter_of,
+    protect,
+    spi_of,
+    unprotect,
+)
 from flight.link.telemetry.packets import crc16
 from knightcube.errors import FlightError
 

@@ -1,4 +1,4 @@
-"""The form of a packet's definition; `flight.link.telemetry.definitions` is the table of all."""
+"""Types of a packet definition; `flight.link.telemetry.definitions` is the table of all packets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Alarms = tuple[tuple[int, Level], ...]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The ranges (low, high) that a value lies in while all is well; outside, it is a warning or a fault."""
+    """Nominal ranges (low, high) of a value; a value outside is a warning or a fault."""
 
     warning: Range | None = None
     fault: Range | None = None
@@ -26,12 +26,12 @@ class Field:
     `count` > 1 makes an array. All numbers are big-endian on the wire.
 
     Attributes:
-        states: the numbers that may stand in the field, each with its name.
-        bits: the bits that may be set in the field, each with its name; several may be.
-        alarms: the states, or the bits when set, that are a warning or a fault.
-        limits: when a value without states is a warning or a fault.
-        valid: the range (low, high) of a command's argument.
-        wraps: past its largest number the field goes on at 0, as a counter may.
+        states: the values of an enumerated field, each with its name.
+        bits: the bits of a bit field, each with its name; several bits can be set.
+        alarms: the states or set bits that are a warning or a fault.
+        limits: the nominal ranges of a value without states.
+        valid: the allowed range (low, high) of a command's argument.
+        wraps: whether the field continues at 0 after its largest number.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Field:
 
 
 def counter(name: str, meaning: str, kind: str = "u4") -> Field:
-    """Return a field that counts, and wraps."""
+    """Return the field of a counter, which wraps at the end of its range."""
     return Field(name, kind, "-", meaning, wraps=True)
 
 
@@ -56,7 +56,7 @@ def counter(name: str, meaning: str, kind: str = "u4") -> Field:
 class Packet:
     """One packet: its application process identifier (APID), rate and fields.
 
-    `hazard` states the harm that a telecommand can do; empty where there is none.
+    `hazard` states the harm that a telecommand can cause, empty if there is none.
     """
 
     name: str

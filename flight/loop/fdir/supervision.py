@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import Recorder
 from flight.loop.executive.executive import RateGroup
 from flight.loop.fdir.facts import EventLog
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer

@@ -30,7 +30,7 @@ from msgspec import Meta
 from flight.link import events
 from flight.link.events import EventKind
 from flight.link.regular_files import read_regular
-from flight.link.telemetry.segments import make_lasting
+from flight.link.telemetry.archive import make_lasting
 from flight.loop.state.content import StoredState, check
 
 LARGEST_FILE = 1 << 20

@@ -33,9 +33,9 @@ from flight.link.commands.codec import (
 )
 from flight.link.commands.definitions import DUMP_PARAMETERS, PING
 from flight.link.modes import Mode
-from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.loop.executive.executive import Cycle
 from flight.loop.services import Services
 from flight.loop.state.content import KeptTable

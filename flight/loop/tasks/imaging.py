@@ -13,8 +13,7 @@ from collections import deque
 import numpy as np
 
 from flight.link import events
-from flight.link.telemetry.definitions import SIGHTINGS, TRACK
-from flight.link.telemetry.vision_definitions import MOST_SIGHTINGS
+from flight.link.telemetry.definitions import MOST_SIGHTINGS, SIGHTINGS, TRACK
 from flight.loop.body import Body, BodyView
 from flight.loop.executive.executive import Cycle
 from flight.loop.executive.jobs import JobResult

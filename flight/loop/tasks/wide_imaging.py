@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flight.link import events
-from flight.link.telemetry.orbit_definitions import DIRECTIONS
+from flight.link.telemetry.definitions import DIRECTIONS
 from flight.loop.body import WideCameraUse
 from flight.loop.executive.jobs import JobResult
 from flight.loop.fdir import facts

@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from flight.app.cli import main
 from flight.link.commands.codec import LoadParameters, unpack
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
+from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.recorder import Recorder
 from flight.loop.fdir.facts import EventLog, Facts, Streams
 from flight.loop.services import Services
 from flight.loop.tasks.commanding import ParameterTable, ParameterUsers

@@ -13,9 +13,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import EVENT, HEALTH
+from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.states import FACTS
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.console.browser import Page, another_origin, browsing, missing, opened

@@ -18,8 +18,8 @@ from flight.link.commands import codec
 from flight.link.commands.codec import Command
 from flight.link.commands.definitions import COMMANDS
 from flight.link.modes import Mode
-from flight.link.parameters import FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
+from flight.link.telemetry.parameters import FIELDS, crc_of
 from ground.console.access import Access
 from ground.console.commanding import Commanding
 from ground.console.history import History

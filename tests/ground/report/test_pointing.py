@@ -11,8 +11,8 @@ import pytest
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry import definitions as table
+from flight.link.telemetry.definitions import ORBIT_TRUTH, SPIN
 from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.orbit_definitions import ORBIT_TRUTH, SPIN
 from flight.link.telemetry.packets import Packer
 from ground.report import draw, summarise
 from ground.telemetry.reader import read_run

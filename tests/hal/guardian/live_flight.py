@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.segments import find_segments
+from flight.link.telemetry.archive import find_segments
 from ground.telemetry.reader import Run, read_run
 from ground.telemetry.scanner import scan
 from tests.scenario.flights import CONFIG

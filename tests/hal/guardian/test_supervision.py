@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flight.link.events import EventKind
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.log import Recorder
 from flight.loop.fdir.supervision import Supervision
 from hal.interfaces.guardian import GuardianNews
 from tests.manual_clock import ManualClock

@@ -26,7 +26,7 @@ from flight.app.run_folder import utc_ns
 from flight.link.files.store import Store
 from flight.link.process import directives
 from flight.link.process.directives import Play, SendFile
-from flight.link.telemetry.link_definitions import LINK
+from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.files import FileSession
 from ground.link.keys import make_keys

@@ -17,9 +17,8 @@ import numpy as np
 from flight.link.frames import telecommand
 from flight.link.frames.telecommand import TelecommandHeader, close_frame
 from flight.link.process.station import parser_of
-from flight.link.security.associations import COMMAND_SPIS, Vault
+from flight.link.security.associations import COMMAND_SPIS, OVERHEAD_BYTES, Vault
 from flight.link.security.gate import Gate, RefusedError, Sealer
-from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES
 from ground.link.keys import make_keys
 from tests.studies.fuzz.harness import Finding

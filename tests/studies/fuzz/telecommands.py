@@ -25,7 +25,7 @@ from flight.link.commands.codec import (
     unpack,
 )
 from flight.link.modes import COMMANDABLE, Mode
-from flight.link.parameters import FIELDS
+from flight.link.telemetry.parameters import FIELDS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.studies.fuzz.harness import Finding

@@ -95,7 +95,7 @@ def test_a_gate_that_skips_the_mac_or_the_counter_is_found_out(monkeypatch: pyte
 
 
 def test_a_scanner_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight.link.telemetry.walk.crc16", lambda _: 0)
+    monkeypatch.setattr("flight.link.telemetry.packets.crc16", lambda _: 0)
     assert not run("logs", target_of("logs"), 30, seed=7).sound
 
 

@@ -18,8 +18,8 @@ from typing import Any
 import space_packet_parser as other
 from space_packet_parser.xtce.definitions import XtcePacketDefinition
 
+from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, to_text
-from flight.link.telemetry.segments import find_segments
 from ground.telemetry.scanner import scan
 from ground.xtce import document, spread
 

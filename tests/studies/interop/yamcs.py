@@ -24,11 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.parameters import FIELDS, KEYS, crc_of
-from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
-from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
-from flight.link.telemetry.segments import find_segments
-from flight.link.telemetry.walk import walk
+from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
+from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text, walk
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from flight.schema.reader import load
 from ground.telemetry.scanner import scan
 from ground.xtce import spread

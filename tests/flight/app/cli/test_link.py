@@ -25,10 +25,8 @@ from flight.link.commands.definitions import PING
 from flight.link.modes import Mode
 from flight.link.process.verification import Report, Request, Stage
 from flight.link.security.associations import Vault
-from flight.link.telemetry.definitions import COMMAND
-from flight.link.telemetry.link_definitions import VERIFICATION
-from flight.link.telemetry.packets import CRC_BYTES, Packer
-from flight.link.telemetry.walk import walk
+from flight.link.telemetry.definitions import COMMAND, VERIFICATION
+from flight.link.telemetry.packets import CRC_BYTES, Packer, walk
 from ground.link.command_stream import new_token
 from ground.link.gateway import Gateway
 from ground.link.terminal import (

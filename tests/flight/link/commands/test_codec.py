@@ -25,9 +25,9 @@ from flight.link.commands.codec import (
 )
 from flight.link.commands.definitions import COMMANDS, LAYOUTS
 from flight.link.modes import Mode
-from flight.link.parameters import FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16
+from flight.link.telemetry.parameters import FIELDS
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 

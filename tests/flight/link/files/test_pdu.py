@@ -56,7 +56,7 @@ from flight.link.files.units import (
     TransactionStatus as OurTransactionStatus,
 )
 from flight.link.frames.telecommand import HEADER, LONGEST_FRAME
-from flight.link.security.sdls import OVERHEAD_BYTES
+from flight.link.security.associations import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
 
 TRANSACTION = Transaction(1, 0x01020304, 2)

@@ -12,10 +12,9 @@ from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.process.verification import ControlLine, Report, Sent
 from flight.link.security.associations import Vault
-from flight.link.telemetry.definitions import COMMAND, MODE
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.archive import SegmentStore
+from flight.link.telemetry.definitions import COMMAND, LINK, MODE, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
-from flight.link.telemetry.segments import SegmentStore
 from ground.link.keys import make_keys
 from ground.link.terminal import Terminal, TerminalSettings, report_of
 from knightcube.errors import UsageError

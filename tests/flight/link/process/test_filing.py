@@ -16,7 +16,7 @@ from flight.link.process import directives, filing
 from flight.link.process.directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
 from flight.link.process.downlink import FILES, LIVE
 from flight.link.process.filing import LISTING
-from flight.link.telemetry.link_definitions import TRANSFER
+from flight.link.telemetry.definitions import TRANSFER
 from flight.link.telemetry.packets import LAYOUTS
 from tests.flight.link.process.filed_ends import FiledEnds
 from tests.flight.link.telemetry.samples import timing_packets

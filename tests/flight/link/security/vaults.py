@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from flight.link.frames import telecommand
-from flight.link.security.associations import COMMAND_SPIS, Association, Vault
+from flight.link.security.associations import COMMAND_SPIS, OVERHEAD_BYTES, Association, Vault, protect
 from flight.link.security.gate import Gate, Sealer
-from flight.link.security.sdls import OVERHEAD_BYTES, protect
 from flight.link.telemetry.packets import CRC_BYTES
 
 SPACECRAFT = 0x1A5

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import LAYOUTS, crc16
-from flight.link.telemetry.segments import find_segments
 from ground.report import format_report, summarise
 from ground.telemetry.reader import read_run
 from ground.telemetry.scanner import ScanResult, scan

@@ -1,7 +1,7 @@
-"""The one table of parameters: the values that an operator may change in flight, all of them at once.
+"""Table of the parameters that an operator can change in flight, all of them at once.
 
-Each stands for a key of the configuration, whose value flies until a table is loaded. `valid` is what may be
-commanded; the schema's own bounds hold besides.
+Each parameter has a key of the configuration, whose value is used until a table is loaded. `valid` is the
+range that a command accepts; the bounds of the configuration's schema apply as well.
 """
 
 from __future__ import annotations
