@@ -1,6 +1,6 @@
-"""Frames in a stream of bytes (serial line, TCP): each follows an attached sync marker, CCSDS 131.0-B.
+"""Frames in a stream of bytes (serial line, TCP), each after an attached sync marker (CCSDS 131.0-B).
 
-Both directions use the marker of telemetry, 1ACFFC1D; a radio that sends CLTUs makes them itself.
+Both directions use the telemetry marker 1ACFFC1D. A radio that transmits CLTUs must create them itself.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ SYNC = bytes.fromhex("1ACFFC1D")
 
 
 class FrameStream:
-    """Finds the frames in what comes in. For one thread."""
+    """Finds the frames in received bytes. Not thread-safe."""
 
     def __init__(self, length_of: Callable[[bytes], int], header_bytes: int) -> None:
-        """`length_of` returns the bytes of a frame from its first `header_bytes`."""
+        """Find frames whose length (bytes) `length_of` computes from their first `header_bytes` bytes."""
         self._length_of = length_of
         self._header_bytes = header_bytes
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:
-        """Return the frames that end in `data`, also with a wrong CRC: behind such each byte is searched."""
+        """Return the frames that end in `data`, including frames with a wrong CRC.
+
+        After a wrong CRC the search continues inside that frame.
+        """
         self._data += data
         found: list[bytes] = []
         while (mark := self._data.find(SYNC)) >= 0:
@@ -42,10 +45,10 @@ class FrameStream:
 
 
 def telecommand_stream() -> FrameStream:
-    """Return the finder of telecommand frames, whose header states their length."""
+    """Return a stream of telecommand frames, whose header states their length."""
     return FrameStream(telecommand.stated_length, telecommand.HEADER.size)
 
 
 def telemetry_stream(frame_bytes: int) -> FrameStream:
-    """Return the finder of telemetry frames of `frame_bytes`."""
+    """Return a stream of telemetry frames of `frame_bytes` bytes."""
     return FrameStream(lambda _: frame_bytes, 0)

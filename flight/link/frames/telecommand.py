@@ -1,7 +1,8 @@
 """Telecommand transfer frames, CCSDS 232.0-B-4: a header of 5 bytes, one space packet, a CRC of 2.
 
-All are of type BD (bypass, data): neither acknowledged nor sent again by the frame layer. The security of
-CCSDS 355.0-B stands between header and CRC (`flight.link.security.associations`). There is no segment header.
+All frames are of type BD (bypass, data), which the frame layer neither acknowledges nor retransmits. The
+security header and trailer of CCSDS 355.0-B are between header and CRC
+(`flight.link.security.associations`). There is no segment header.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _CHANNEL_BITS = 10
 
 
 class FrameError(FlightError):
-    """Bytes that are no frame of this link; says why."""
+    """Raised for bytes that are not a frame of this link; the text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +41,12 @@ class TelecommandHeader:
 
 
 def stated_length(header: bytes) -> int:
-    """Return the bytes of the frame that begins with these 5."""
+    """Return the length (bytes) of a frame from its header of 5 bytes."""
     return (int.from_bytes(header[2:4], "big") & 0x3FF) + 1
 
 
 def open_frame(frame: bytes, spacecraft: int) -> bytes:
-    """Return a frame without its CRC. Raises FrameError for another spacecraft's and for no frame at all."""
+    """Return a frame without its CRC. Raises FrameError for another spacecraft and for invalid frames."""
     if len(frame) < HEADER.size + CRC_BYTES or stated_length(frame) != len(frame):
         raise FrameError("its length is wrong")
     first = int.from_bytes(frame[:2], "big")

@@ -1,8 +1,8 @@
 """Telemetry transfer frames of fixed length, CCSDS 132.0-B-3: space packets laid end to end.
 
-The header of 6 bytes has a first header pointer: where in the data the first packet begins that begins there.
-So a reader that lost a frame finds the next packet. Gaps are filled with idle packets. Security as of
-`flight.link.security.associations`; there is no operational control field.
+The header of 6 bytes contains the first header pointer, the offset of the first packet that begins in the
+frame. A reader that lost a frame finds the next packet by it. Gaps are filled with idle packets. Frames are
+protected as in `flight.link.security.associations`; there is no operational control field.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ NO_HEADER = 0x7FF
 """First header pointer of a frame in which no packet begins."""
 
 IDLE = 0x7FF
-"""APID of packets that fill."""
+"""APID of idle packets."""
 
 _STATUS = 0b11 << 11  # segment length identifier of packets, all flags zero
 _LEAST_IDLE = HEADER_BYTES + 1
 
 Seal = Callable[[bytes, bytes], bytes]
-"""Header and data to the protected frame, without CRC."""
+"""Function from header and data to the protected frame without CRC."""
 
 
 @dataclass(slots=True)
 class MasterCount:
-    """The count of all frames, whatever their channel."""
+    """Master channel frame count: the count of frames of all virtual channels."""
 
     value: int = 0
 
 
 class TelemetryFramer:
-    """Lays the packets of one virtual channel into frames. For one thread."""
+    """Packs the packets of one virtual channel into frames. Not thread-safe."""
 
     def __init__(
         self, spacecraft: int, channel: int, data_bytes: int, master: MasterCount, seal: Seal
     ) -> None:
-        """`data_bytes` is the room for packets in each frame."""
+        """Make frames with `data_bytes` bytes of packets each."""
         self._first = spacecraft << 4 | channel << 1
         self._room = data_bytes
         self._master = master
@@ -55,17 +55,17 @@ class TelemetryFramer:
 
     @property
     def waits(self) -> bool:
-        """Whether anything waits for a frame to be full."""
+        """Whether packets wait for a frame to fill up."""
         return bool(self._data)
 
     def add(self, packet: bytes) -> list[bytes]:
-        """Add a packet; return the frames that are full."""
+        """Add a packet and return the frames that are full."""
         self._starts.append(len(self._data))
         self._data += packet
         return [self._take() for _ in range(len(self._data) // self._room)]
 
     def flush(self) -> list[bytes]:
-        """Fill up the frame with an idle packet and return what is full."""
+        """Fill up the frame with an idle packet and return the full frames."""
         gap = self._room - len(self._data) % self._room
         length = gap if gap >= _LEAST_IDLE else gap + self._room
         return self.add(idle_packet(length))
@@ -82,7 +82,7 @@ class TelemetryFramer:
 
 
 def idle_packet(length: int) -> bytes:
-    """Return a packet of `length` bytes, 7 at least, that fills and means nothing."""
+    """Return an idle packet of `length` bytes, at least 7."""
     size = length - HEADER_BYTES
     return struct.pack(">HHH", IDLE, UNSEGMENTED, size - 1) + bytes(size)
 
@@ -92,11 +92,14 @@ class PacketAssembler:
 
     def __init__(self) -> None:
         self._count: int | None = None
-        self._rest: bytes | None = None  # of a packet begun; None: wait for a beginning
+        self._rest: bytes | None = None  # begin of an incomplete packet; None until a packet begins
         self.lost_frames = 0
 
     def add(self, header: bytes, data: bytes) -> list[bytes]:
-        """Return the packets that end in a frame, idle ones left out; a gap before it loses those across."""
+        """Return the packets that end in a frame, without idle packets.
+
+        A gap in the frame count loses the packets that continue across the gap.
+        """
         _, _, count, status = HEADER.unpack(header)
         if self._count is not None and (gap := (count - self._count - 1) % 256):
             self.lost_frames += gap

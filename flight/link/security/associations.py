@@ -45,23 +45,23 @@ def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
 
 
 def protect(cipher: AESGCM, spi: int, counter: int, header: bytes, mask: bytes, data: bytes) -> bytes:
-    """Return header, security header, ciphertext and MAC; `mask` has the bits of the header that count."""
+    """Return header, security header, ciphertext and MAC; `mask` selects the header bits of the MAC."""
     index, iv = spi.to_bytes(SPI_BYTES, "big"), counter.to_bytes(IV_BYTES, "big")
     return header + index + iv + cipher.encrypt(iv, data, _authenticated(header, mask, index))
 
 
 def spi_of(protected: bytes) -> int:
-    """Return the index of the association that protects a frame, -1 of one that is too short."""
+    """Return the SPI of a frame, -1 if the frame is too short."""
     return int.from_bytes(protected[:SPI_BYTES], "big") if len(protected) >= OVERHEAD_BYTES else -1
 
 
 def counter_of(protected: bytes) -> int:
-    """Return the counter of a frame; believe it only after `unprotect`."""
+    """Return the counter of a frame, which is authentic only if `unprotect` succeeds."""
     return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big")
 
 
 def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> bytes | None:
-    """Return the data of a frame, from the security header on; None unless the MAC is right."""
+    """Return the data of a frame that begins with its security header, None if the MAC is wrong."""
     index, iv = protected[:SPI_BYTES], protected[SPI_BYTES:SECURITY_HEADER_BYTES]
     try:
         return cipher.decrypt(iv, protected[SECURITY_HEADER_BYTES:], _authenticated(header, mask, index))
@@ -70,13 +70,13 @@ def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> b
 
 
 COMMAND_SPIS = (1, 2)
-"""Of commands: the usual one and its reserve."""
+"""Primary and reserve SPI of commands."""
 
 TELEMETRY_SPIS = (3, 4)
-"""Of telemetry: the usual one and its reserve."""
+"""Primary and reserve SPI of telemetry."""
 
 HIGHEST_COUNTER = 2**63
-"""Higher ones are refused; a sender that makes a thousand frames a second reaches it in 292 million years."""
+"""Largest accepted counter. A sender of a thousand frames per second reaches it in 292 million years."""
 
 COPIES = ("a", "b")
 
@@ -88,7 +88,7 @@ _LOCK, _OWNER = "lock", "owner"
 
 @dataclass(frozen=True, slots=True, order=True)
 class Association:
-    """Key and counter of an SPI: `unused` is the lowest counter that is still good under this key."""
+    """Key and counter of an SPI: `unused` is the lowest unused counter of this key."""
 
     spi: int
     generation: int
@@ -102,16 +102,16 @@ class Association:
 
 
 def encode(association: Association) -> bytes:
-    """Return the bytes of a copy."""
+    """Return the bytes of a stored copy."""
     a = association
     record = _RECORD.pack(_MAGIC, a.spi, a.generation, a.unused, a.key)
     return record + zlib.crc32(record).to_bytes(_CRC_BYTES, "big")
 
 
 def decode(data: bytes) -> Association | None:
-    """Return the association of a copy, None for anything that `encode` does not produce.
+    """Return the association of a stored copy, None for bytes that `encode` does not produce.
 
-    A counter beyond `HIGHEST_COUNTER`, which no gate admits and no sealer reserves, makes a copy bad.
+    A copy with a counter beyond `HIGHEST_COUNTER` is invalid, because no gate or sealer produces one.
     """
     record, crc = data[: _RECORD.size], data[_RECORD.size :]
     if len(record) != _RECORD.size or zlib.crc32(record).to_bytes(_CRC_BYTES, "big") != crc:
@@ -122,10 +122,10 @@ def decode(data: bytes) -> Association | None:
 
 
 class Vault:
-    """The associations of a folder. Several processes of one user may share it."""
+    """Stored associations of a folder, which several processes of one user may share."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder. Raises UsageError where there is none, or with files that others may read."""
+        """Open a folder. Raises UsageError if it does not exist or if others may read its files."""
         self._folder = folder
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; `python -m ground keys` makes keys")
@@ -135,12 +135,12 @@ class Vault:
 
     @property
     def folder(self) -> Path:
-        """Where the associations are."""
+        """Folder of the associations."""
         return self._folder
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing meanwhile. Raises FlightError if the folder cannot be written."""
+        """Lock the folder against writes of other processes. Raises FlightError if it cannot be written."""
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -152,7 +152,7 @@ class Vault:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Keep a second link process from this folder. Raises UsageError where there is one."""
+        """Lock the folder against a second link process. Raises UsageError if another process owns it."""
         path = self._folder / _OWNER
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -166,24 +166,24 @@ class Vault:
             os.close(file)
 
     def read(self, name: int | str) -> Association | None:
-        """Return the newer copy of an association, None where both are lost."""
+        """Return the newest valid copy of an association, None if both copies are lost."""
         return max(self._copies(name), default=None)
 
     def copies(self, name: int | str) -> int:
-        """Return how many copies are good and the newest."""
+        """Return the number of valid copies that equal the newest copy."""
         found = self._copies(name)
         return found.count(max(found)) if found else 0
 
     def write(self, association: Association, name: int | str | None = None) -> int:
-        """Write both copies; return how many are durable. Raises nothing: a disk that fails makes none."""
+        """Write both copies and return the number of durable copies, 0 if the disk fails. Never raises."""
         data = encode(association)
         spi = association.spi if name is None else name
         return sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
 
     def advance(self, association: Association) -> int:
-        """Write both copies unless another process wrote a newer one; return how many are durable.
+        """Write both copies unless another process wrote a newer one; return the number of durable copies.
 
-        A disk that fails, or that is read-only, makes none durable.
+        The number is 0 if the disk fails or is read-only.
         """
         try:
             with self.locked():
@@ -216,10 +216,10 @@ class Vault:
 
 
 def overwrite(path: Path, data: bytes) -> bool:
-    """Write a file in place, durably; return whether that worked."""
+    """Overwrite a file in place durably, and return whether this succeeded."""
     try:
         new = not path.exists()
-        # Without O_NONBLOCK a FIFO in place of the file would be waited for without end.
+        # Without O_NONBLOCK, opening a FIFO at this path would block.
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         try:
             if os.pwrite(file, data, 0) != len(data):

@@ -28,23 +28,23 @@ SUFFIX = ".ccsds"
 
 
 class SegmentFile(Protocol):
-    """The part of an unbuffered binary file that the log uses."""
+    """Interface of an unbuffered binary file, as the log uses it."""
 
     def write(self, data: bytes, /) -> int | None:
-        """Append bytes; returns how many were taken. Raises OSError."""
+        """Append bytes and return the number of bytes written. Raises OSError."""
 
     def truncate(self, size: int, /) -> int:
-        """Cut the file. Raises OSError."""
+        """Truncate the file to `size` bytes. Raises OSError."""
 
     def fileno(self) -> int:
-        """Return the descriptor."""
+        """Return the file descriptor."""
 
     def close(self) -> None:
         """Close the file. Raises OSError."""
 
 
 def make_lasting(folder: Path) -> None:
-    """Have the names in a folder outlive a loss of power."""
+    """Sync a folder, so that the names of its files survive a loss of power. Raises OSError."""
     names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(names)
@@ -53,16 +53,15 @@ def make_lasting(folder: Path) -> None:
 
 
 def open_segment(path: Path) -> SegmentFile:
-    """Create a segment, never over an existing file, and make its name durable.
+    """Create a segment and make its name durable. Raises OSError, also if the file exists.
 
-    It is opened for appending: after a write that failed half-way and was cut off, the next one follows on
-    the last whole packet.
+    The segment is opened for appending, so that a write after a truncation follows the last whole packet.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
         make_lasting(path.parent)
-    except OSError:  # nothing is left in the way of another try
+    except OSError:  # the file is removed, so that the next attempt can create it
         file.close()
         path.unlink(missing_ok=True)
         raise
@@ -70,7 +69,7 @@ def open_segment(path: Path) -> SegmentFile:
 
 
 def find_segments(folder: Path, stem: str) -> list[Path]:
-    """Return the segments of a log, oldest first; [] when there is none."""
+    """Return the segments of a log, oldest first, or an empty list if there is none."""
     pattern = re.compile(re.escape(stem) + r"-(\d+)" + re.escape(SUFFIX))
     matches = ((pattern.fullmatch(path.name), path) for path in folder.glob(f"{stem}-*{SUFFIX}"))
     return [path for _, path in sorted((int(match[1]), path) for match, path in matches if match)]
@@ -79,11 +78,11 @@ def find_segments(folder: Path, stem: str) -> list[Path]:
 class SegmentStore:
     """Appends packets to `<stem>-0001.ccsds`, `<stem>-0002.ccsds`, ... in an existing folder.
 
-    The files depend on the packets alone, not on how they were divided among calls.
+    The content of the files depends on the packets only, not on their division among calls.
 
     Attributes:
-        packets: packets wholly written.
-        dropped: segments deleted to keep the budget.
+        packets: number of packets written completely.
+        dropped: number of segments deleted to keep the budget.
     """
 
     def __init__(
@@ -107,10 +106,10 @@ class SegmentStore:
         self._open_next()
 
     def append(self, packets: Sequence[bytes]) -> None:
-        """Write packets, turning to a new segment wherever one is full. Raises OSError.
+        """Write packets, and begin a new segment whenever one is full. Raises OSError.
 
-        After a failure `packets` counts the packets kept; the segment ends with the last of them, and may
-        be appended to again.
+        After a failure `packets` counts the packets written completely. The segment ends with the last of
+        them, and `append` may be called again.
         """
         chunk: list[bytes] = []
         size = self._size
@@ -124,7 +123,7 @@ class SegmentStore:
         self._write(chunk)
 
     def removed(self) -> bool:
-        """Return whether the segment was removed from outside. Raises OSError."""
+        """Return whether another process has removed the segment. Raises OSError."""
         try:
             os.stat(self._path)
         except FileNotFoundError:
@@ -132,7 +131,7 @@ class SegmentStore:
         return False
 
     def sync(self) -> None:
-        """Make durable what was written. Raises OSError."""
+        """Make the written packets durable. Raises OSError."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
@@ -143,7 +142,7 @@ class SegmentStore:
             self._file.close()
 
     def _open_next(self) -> None:
-        """Begin the next segment; a failure leaves the present one as it is."""
+        """Begin the next segment; after a failure the current segment remains in use."""
         path = self._folder / f"{self._stem}-{self._number + 1:04d}{SUFFIX}"
         self._file = self._opener(path)
         self._path = path
@@ -172,7 +171,7 @@ class SegmentStore:
         self.packets += len(chunk)
 
     def _make_room(self, coming: int) -> None:
-        """Delete the oldest segments until the budget holds the coming bytes; the newest is never deleted."""
+        """Delete the oldest segments, except the newest, until `coming` bytes fit into the budget."""
         total = self._size + coming + sum(size for _, size in self._finished)
         while self._finished and total > self._budget_bytes:
             path, size = self._finished.popleft()
@@ -181,7 +180,7 @@ class SegmentStore:
             total -= size
 
     def _keep_whole(self, chunk: list[bytes], written: int) -> None:
-        """Count the packets of `chunk` that lie within `written` bytes and cut off the rest."""
+        """Count the packets of `chunk` within `written` bytes, and truncate the file after them."""
         whole = 0
         for packet in chunk:
             if whole + len(packet) > written:
@@ -191,40 +190,40 @@ class SegmentStore:
         try:
             self._file.truncate(self._size + whole)
             self._size += whole
-        except OSError:  # a reader copes with the stump as well
+        except OSError:  # readers skip the incomplete packet
             self._size += written
 
 
 MOST_RUNS = 1000
-"""A board that crashes at every start makes many runs of a few kilobytes: they are bounded by number too."""
+"""Maximum number of runs. A board that crashes at every start would create many small runs."""
 
 LEAST_FREE_BYTES = 64 << 20
-"""On the disk, for a run to begin with: hours of packets."""
+"""Free disk space (bytes) at the start of a run, enough for hours of packets."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""Errors of a full or failing disk; other errors are mistakes in the path."""
+"""Errors of a full or failing disk. Other errors indicate a wrong path."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
 
 @dataclass(frozen=True, slots=True)
 class NewRun:
-    """A run's new folder, not yet there on a disk that takes nothing, and how many old ones went for it."""
+    """Folder of a new run, which is missing if the disk cannot be written, and the number of dropped runs."""
 
     folder: Path
     dropped: int
 
 
 def find_runs(archive: Path) -> list[Path]:
-    """Return the folders of an archive's runs, oldest first; [] when it holds none."""
+    """Return the folders of an archive's runs, oldest first, or an empty list if there is none."""
     return [path for _, path in _numbered(archive) if path.is_dir() and not path.is_symlink()]
 
 
 def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
-    """Make the folder of the next run, and room for `coming_bytes`, all that it may come to hold.
+    """Create the folder of the next run, and free `coming_bytes`, the maximum size of the run.
 
-    Nothing but the folders of runs is ever removed. Raises UsageError when the budget holds not even the
-    coming run, or when the path is wrong; a failing disk is reported by the log that writes to it.
+    Only folders of runs are removed. Raises UsageError if the budget is smaller than the new run or if the
+    path is wrong. A failing disk is reported by the log that writes to it.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(
@@ -246,7 +245,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
 
 
 def _free(archive: Path) -> float:
-    """Return the bytes that may yet be written to the archive's disk, infinity when it does not say."""
+    """Return the free space (bytes) of the archive's disk, infinity if it is unknown."""
     try:
         disk = os.statvfs(archive)
     except OSError:
@@ -255,18 +254,18 @@ def _free(archive: Path) -> float:
 
 
 def _drop(run: Path) -> None:
-    """Remove a run; what cannot go now is tried again at the next boot."""
+    """Remove a run; files that cannot be removed now are removed at the next boot."""
     shutil.rmtree(run, ignore_errors=True)
 
 
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
-    """Return whatever has the name of a run, with its number, in order."""
+    """Return all paths that have the name of a run, with their numbers, in order."""
     matches = ((_NAME.fullmatch(path.name), path) for path in archive.glob("run-*"))
     return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def _make_room(runs: list[Path], room_bytes: int) -> int:
-    """Drop the oldest runs until the others fit; returns how many went."""
+    """Drop the oldest runs until the others fit into the room; return the number of dropped runs."""
     sizes = [_size(run) for run in runs]
     total, dropped = sum(sizes), 0
     while dropped < len(runs) and (total > room_bytes or len(runs) - dropped >= MOST_RUNS):
@@ -277,7 +276,7 @@ def _make_room(runs: list[Path], room_bytes: int) -> int:
 
 
 def _size(folder: Path) -> int:
-    """Return the bytes of all files below a folder; what vanishes meanwhile has none."""
+    """Return the size (bytes) of all files below a folder; files that vanish meanwhile are not counted."""
     total = 0
     for path in folder.rglob("*"):
         try:

@@ -23,7 +23,7 @@ SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity i
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
 """The use of the coils (`flight.loop.body.SteeringState`)."""
 STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
-"""The quality of a stream of readings (`flight.loop.fdir.facts.StreamLimitsLimitsState`)."""
+"""The quality of a stream of readings (`flight.loop.fdir.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 """How well the attitude is known (`flight.bodies.orbit.view`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))

@@ -30,9 +30,9 @@ _RECENT_NS = 2_000_000_000
 
 
 class FlightLog:
-    """One log of one folder. One thread writes; the clock's ticker drains.
+    """Log in a folder. One thread calls `write`; a ticker of the clock writes the queue to disk.
 
-    The bytes on disk depend on the packets alone, not on when they were drained.
+    The bytes on disk depend on the packets only, not on the times at which the queue is written.
     """
 
     def __init__(
@@ -52,10 +52,10 @@ class FlightLog:
     ) -> None:
         """Begin a new log.
 
-        `sync_period_ns` None leaves fsync to the end of each segment: right for lock-step simulation, where
-        seconds are short. Raises UsageError when the folder holds such a log already and `overwrite` is not
-        set, when the sizes make no sense, or when the folder cannot be written; but a `patient` log waits for
-        a failing disk, as it does later on.
+        With `sync_period_ns` None, fsync is called only at the end of each segment, as suits a lock-step
+        simulation, which is faster than real time. Raises UsageError if the folder already holds such a log
+        and `overwrite` is not set, if the sizes are invalid, or if the folder cannot be written. A `patient`
+        log does not raise for a failing disk but retries.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(
@@ -95,7 +95,7 @@ class FlightLog:
         self._ticker = clock.ticker(f"log-{stem}", drain_period_ns, self._drain)
 
     def write(self, packet: bytes) -> None:
-        """Queue one packet. Never waits: a packet that does not fit is lost and counted."""
+        """Queue one packet without waiting; a packet that exceeds the queue is counted and lost."""
         if self._closed or len(self._queue) >= self._queue_packets:
             self._refused += 1
             self._refused_ns = self._clock.now_ns()
@@ -104,16 +104,16 @@ class FlightLog:
 
     @property
     def lost(self) -> int:
-        """Packets given to `write` that are not on disk and will not be."""
+        """Number of packets given to `write` that are lost."""
         return self._refused + self._unwritten
 
     @property
     def dropped_segments(self) -> int:
-        """Oldest segments deleted to keep the budget."""
+        """Number of segments deleted to keep the budget."""
         return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:
-        """Return what is wrong and how many packets the log has lost so far, empty while nothing is wrong.
+        """Return the current problem and the number of lost packets, or an empty text without a problem.
 
         A closed log reports any loss since it was opened.
         """
@@ -133,7 +133,7 @@ class FlightLog:
         return ""
 
     def close(self) -> None:
-        """Write the queue, sync and close. Safe to call twice; never waits long for a hung disk."""
+        """Write the queue, sync and close. Safe to call twice; waits at most five seconds for a hung disk."""
         if self._closed:
             return
         self._ticker.stop()
@@ -154,7 +154,7 @@ class FlightLog:
             self._draining.release()
 
     def _drain(self) -> None:
-        """Put the queue on disk and sync when it is time: the ticker's job."""
+        """Write the queue to disk and sync it if a sync is due. The ticker calls this method."""
         with self._draining:
             now_ns = self._clock.now_ns()
             if self._closed or (self._failure and now_ns < self._retry_ns):
@@ -173,7 +173,7 @@ class FlightLog:
             self._busy_since_ns = None
 
     def _look(self) -> None:
-        """Report files that were removed from outside, and go on in a new folder at the next try."""
+        """Report files that another process removed; the next attempt continues in a new folder."""
         store = self._store
         with suppress(OSError):
             if store is not None and store.removed():
@@ -183,7 +183,7 @@ class FlightLog:
                 store.close()
 
     def _write_queue(self) -> None:
-        """Write the packets queued now; those that the disk does not take wait on."""
+        """Write the queued packets; packets that the disk does not accept stay in the queue."""
         if self._store is None:
             if self._failure and self._clock.now_ns() < self._retry_ns and not self._closed:
                 return
@@ -206,13 +206,13 @@ class FlightLog:
         self._retry_ns = self._clock.now_ns() + _RETRY_NS
 
     def _give_up(self) -> None:
-        """Count what still waits as lost."""
+        """Count the packets in the queue as lost."""
         self._unwritten += len(self._queue)
         self._queue.clear()
 
 
 def _clear(folder: Path, stem: str, overwrite: bool) -> None:
-    """Make the folder and see to a log that is there already. Raises UsageError, OSError."""
+    """Create the folder, and remove an existing log if `overwrite` is set. Raises UsageError, OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     old = find_segments(folder, stem)
     if old and not overwrite:
@@ -223,25 +223,25 @@ def _clear(folder: Path, stem: str, overwrite: bool) -> None:
 
 _STATUS = (RUN, CONTROL, ATTITUDE, HOUSEKEEPING, HEALTH)
 _STATUS_EVENTS = 2
-"""With these and the answer to a command a datagram fits into one Ethernet frame."""
+"""Number of events in a status, so that status and answer to a command fit into one Ethernet frame."""
 
 
 class Log(Protocol):
-    """Where packets go."""
+    """Destination of packets."""
 
     def write(self, packet: bytes) -> None:
-        """Keep a packet; never waits."""
+        """Store a packet without waiting."""
 
 
 class Recorder:
-    """Packs values and hands them to the logs. Times given are of the clock; packets carry mission time.
+    """Packs values and writes the packets to the logs, with mission time instead of clock time.
 
-    A record that cannot be packed is counted and lost; it never fails the task that wrote it.
+    A record that cannot be packed is counted and lost, without an error in the task that wrote it.
 
     Attributes:
-        epoch_ns: the clock's time at mission time zero.
-        lost: records whose values did not fit their packet.
-        lost_text: why the newest of them did not fit.
+        epoch_ns: clock time (ns) of mission time zero.
+        lost: number of records whose values did not fit their packet.
+        lost_text: reason for the newest lost record.
     """
 
     def __init__(self, flight: Log, performance: Log) -> None:
@@ -256,7 +256,7 @@ class Recorder:
         self.lost_text = ""
 
     def record(self, packet: Packet, time_ns: int, **values: Any) -> bytes | None:
-        """Write a packet to the flight log and return its bytes; None when its values do not fit."""
+        """Write a packet to the flight log and return its bytes, None if its values do not fit."""
         packed = self._pack(self._flight_packer, packet, time_ns, values)
         if packed is not None:
             self._newest[packet.name] = packed
@@ -264,15 +264,15 @@ class Recorder:
         return packed
 
     def status(self) -> bytes:
-        """Return the newest packets that show how a flight stands, then its newest events, oldest first.
+        """Return the newest packets about the state of the flight, then the newest events, oldest first.
 
-        Obeyed commands are left out of the events: who asks for the status would see its own question.
+        Events of obeyed commands are omitted, because each request of a status would appear in its answer.
         """
         newest = [self._newest[packet.name] for packet in _STATUS if packet.name in self._newest]
         return b"".join([*newest, *self._events])
 
     def newest(self, packet: Packet) -> bytes:
-        """Return the newest packet of a kind, empty when none was written."""
+        """Return the newest packet of a type, empty if none was written."""
         return self._newest.get(packet.name, b"")
 
     def time(self, packet: Packet, time_ns: int, **values: Any) -> None:
@@ -282,7 +282,7 @@ class Recorder:
             self._performance.write(packed)
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event: the sink of `flight.loop.fdir.facts.EventLog`."""
+        """Write an event, as the sink of `flight.loop.fdir.facts.EventLog`."""
         packed = self.record(
             EVENT,
             time_ns,

@@ -46,7 +46,7 @@ _STRUCT_CODES = {"f8": "d", "f4": "f", "u1": "B", "u2": "H", "u4": "I", "u8": "Q
 
 
 class TelemetryError(FlightError):
-    """Values that do not fit their packet's definition, or bytes that are no packets."""
+    """Raised for values that do not fit the definition of their packet and for bytes that are not packets."""
 
 
 def crc16(data: bytes) -> int:
@@ -60,9 +60,9 @@ def to_text(value: bytes) -> str:
 
 
 def _to_bytes(value: object, size: int) -> bytes:
-    """Return less than `size` bytes of UTF-8, cut between characters; what UTF-8 cannot say becomes '?'.
+    """Return a text as less than `size` bytes of UTF-8, cut between characters; others become '?'.
 
-    A zero always follows: clients of the XTCE form find the end of a text by it.
+    At least one zero follows, by which clients of the XTCE definition find the end of the text.
     """
     if not isinstance(value, str):
         raise TypeError("a text is needed")
@@ -76,7 +76,7 @@ def _text_size(field: Field) -> int:
 
 
 def wraps_at(field: Field) -> int:
-    """Return the number at which a counter goes on at 0; 0 for a field that does not wrap."""
+    """Return the modulus of a counter, 0 for a field that does not wrap."""
     return 1 << 8 * np.dtype(field.kind).itemsize if field.wraps else 0
 
 
@@ -86,7 +86,7 @@ def _struct_code(field: Field) -> str:
 
 @dataclass(frozen=True)
 class Layout:
-    """The bytes of one packet, compiled from its definition."""
+    """Layout of the bytes of a packet, compiled from its definition."""
 
     packet: Packet
 
@@ -108,7 +108,7 @@ class Layout:
 
     @cached_property
     def fields(self) -> tuple[tuple[str, int, int, int], ...]:
-        """Of each field its name, its bytes when it is a text (else 0), its count, its end if it wraps."""
+        """Name, length (bytes) of a text or 0, count, and modulus of a counter or 0, for each field."""
         return tuple(
             (field.name, _text_size(field), field.count, wraps_at(field)) for field in self.packet.fields
         )
@@ -144,7 +144,7 @@ class Layout:
 
 
 def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
-    """Return the layouts of a table by packet name. Raises TelemetryError for a table that cannot work."""
+    """Return the layouts of a table by packet name. Raises TelemetryError for an inconsistent table."""
     layouts = {packet.name: Layout(packet) for packet in packets}
     apids = [layout.packet.apid for layout in layouts.values()]
     if len(set(apids)) != len(apids):
@@ -162,10 +162,10 @@ LAYOUTS: dict[str, Layout] = compile_layouts(PACKETS)
 
 
 class Packer:
-    """Makes packets, and counts them for each APID. For one thread."""
+    """Makes packets with a sequence count per APID. Not thread-safe."""
 
     def __init__(self, layouts: Mapping[str, Layout] | None = None) -> None:
-        """Pack the packets of a compiled table, by default telemetry's."""
+        """Pack the packets of a compiled table, by default of the telemetry table."""
         self._layouts = LAYOUTS if layouts is None else layouts
         self._counts = dict.fromkeys(self._layouts, 0)
 
@@ -204,7 +204,7 @@ class Packer:
 
 
 def _to_items(value: Any, count: int) -> list[Any]:
-    """Return the numbers of an array field. Raises ValueError unless there are `count` of them."""
+    """Return the numbers of an array field. Raises ValueError if their number is not `count`."""
     items: list[Any] = value.tolist() if isinstance(value, np.ndarray) else value
     if type(items) is not list:
         items = list(items)
@@ -251,7 +251,7 @@ _SEQUENCE_FLAGS = UNSEGMENTED >> 8  # as the first byte of the sequence control 
 
 
 def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:
-    """Yield layout, first byte and end of each valid packet, also of other versions than the table's."""
+    """Yield layout, first byte and end of each valid packet of any version."""
     position, end = 0, len(data)
     while position < end:
         layout = BY_IDENTIFIER.get(data[position : position + 2])
@@ -265,7 +265,10 @@ def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:
 
 
 def truncated_bytes(data: bytes, begin: int) -> int:
-    """Return how many bytes at the end of `data`, behind its last packet, look like a packet cut short."""
+    """Return the length of an incomplete packet at the end of `data`, 0 if there is none.
+
+    `begin` is the end of the last valid packet.
+    """
     position, end = begin, len(data)
     while position < end:
         if _cut_short(data, position):
@@ -276,7 +279,7 @@ def truncated_bytes(data: bytes, begin: int) -> int:
 
 
 def _valid_length(data: bytes, position: int, layout: Layout) -> int:
-    """Return the length of the valid packet at `position`, 0 when there is none."""
+    """Return the length of the valid packet at `position`, 0 if there is none."""
     length = _stated_length(data, position)
     stop = position + length
     if length < HEADER_BYTES + 1 or stop > len(data):
@@ -289,13 +292,13 @@ def _valid_length(data: bytes, position: int, layout: Layout) -> int:
 
 
 def _stated_length(data: bytes, position: int) -> int:
-    """Return the length that the header at `position` states, 0 when the header itself is incomplete."""
+    """Return the packet length in the header at `position`, 0 if the header is incomplete."""
     header = data[position : position + HEADER_BYTES]
     return int.from_bytes(header[4:], "big") + HEADER_BYTES + 1 if len(header) == HEADER_BYTES else 0
 
 
 def _cut_short(data: bytes, position: int) -> bool:
-    """Return whether `position` may begin a packet of which the end is missing."""
+    """Return whether an incomplete packet may begin at `position`."""
     left = len(data) - position
     if left == 1:
         return any(identifier[:1] == data[position:] for identifier in BY_IDENTIFIER)

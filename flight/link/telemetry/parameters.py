@@ -36,10 +36,10 @@ FIELDS: tuple[Field, ...] = (
     _parameter("health.temperature", "degree C", -40.0, 150.0, "the board is warm beyond it"),
     _parameter("health.hottest", "degree C", -40.0, 150.0, "and too hot beyond it"),
 )
-"""As they stand in the packets, in their order."""
+"""Fields of the parameters, in their order in the packets."""
 
 KEYS: tuple[str, ...] = tuple(field.name.replace("_", ".", 1) for field in FIELDS)
-"""Their names in a configuration."""
+"""Keys of the parameters in a configuration, in the same order."""
 
 
 def crc_of(values: Sequence[float]) -> int:
@@ -48,7 +48,7 @@ def crc_of(values: Sequence[float]) -> int:
 
 
 def problem_of(values: Mapping[str, float]) -> str:
-    """Return why a table by key is none: a key that lacks or is unknown, a value out of range; else empty."""
+    """Return the problem of a table (missing or unknown key, value out of range), else an empty text."""
     if lacking := [key for key in KEYS if key not in values]:
         return f"{lacking[0]} is missing: a table is loaded as a whole"
     if unknown := sorted(set(values) - set(KEYS)):
