@@ -1,7 +1,7 @@
 """Builds the simulated hardware of a configuration: the world and the emulated devices in it.
 
-The devices offer the same Protocols as Linux's, so simulated flights exercise the drivers that fly. Until its
-release the body is held still at its initial attitude.
+The devices offer the same Protocols as the devices on Linux, so simulated flights exercise the flight
+drivers. Until its release the body is held still at its initial attitude.
 """
 
 from __future__ import annotations
@@ -15,30 +15,75 @@ import numpy as np
 
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
+from hal.drivers.h_bridge import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
-from sim_hal.coil_assembly import assemble_coils
-from sim_hal.emulators.device import EmulatedDevice, SerialEnd
+from sim_hal.device import EmulatedDevice, FaultTimeline, SerialEnd
+from sim_hal.emulators.coil_circuit import CoilCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
-from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.objects import Objects
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
 from sim_hal.orbit_sky import from_orbit
 from sim_hal.settings import Simulation, Sky
-from sim_hal.worlds.coil_circuit import CoilCircuit
-from sim_hal.worlds.motion import Motion
-from sim_hal.worlds.simulation import TimedSimulation
-from sim_hal.worlds.surroundings import OrbitingWorld
-from sim_hal.worlds.truth import TruthRecorder
-from sim_hal.worlds.world import World, WorldInputs, make_world
+from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
+from sim_hal.worlds.world import Motion, OrbitingWorld, World, WorldInputs, make_world
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack, StarCameraModel
+
+
+BUS_VOLTAGE = 5.0
+"""V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoilHardware:
+    """The parts on the I2C bus and the circuit behind them; a configuration may have no monitor."""
+
+    bus: EmulatedI2cBus
+    pwm: EmulatedPca9685
+    monitor: EmulatedIna219 | None
+    circuit: CoilCircuit
+
+
+def assemble_coils(
+    config: Config,
+    section: Simulation,
+    generator: np.random.Generator,
+    now_ns: Callable[[], int],
+    wait: Callable[[int], None] | None = None,
+) -> CoilHardware:
+    """Build the coils; `now_ns` returns the simulation's time, `wait` advances time while the bus hangs."""
+    pwm = EmulatedPca9685(config.coils.address, now_ns)
+    circuit = CoilCircuit(
+        pwm,
+        _coil_settings(config, section),
+        generator,
+        now_ns,
+        uncertainty=section.current_noise,
+        bus_voltage=BUS_VOLTAGE,
+    )
+    settings = config.power_monitor
+    monitor = None
+    if settings is not None:
+        monitor = EmulatedIna219(settings.address, now_ns, circuit.mean_supply, settings.shunt)
+    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
+    return CoilHardware(bus, pwm, monitor, circuit)
+
+
+def _coil_settings(config: Config, section: Simulation) -> CoilSettings:
+    """Return the true coil settings."""
+    coils = config.coils
+    resistance = section.truth.resistance or coils.resistance
+    supply = section.truth.supply_voltage or coils.supply_voltage
+    wired = wirings(coils.channels, resistance, coils.signs, coils.enable_channels)
+    return CoilSettings(wired, supply, coils.current_limit, coils.stale_after)
+
 
 _LINE_STREAM = 0x11E
 _FAULT_STREAM = 0xFA017

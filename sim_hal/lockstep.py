@@ -1,4 +1,8 @@
-"""Simulated hardware in lock-step: the clock jumps, the devices answer in memory, runs repeat bit for bit."""
+"""Simulated hardware in lock-step: the clock jumps, devices answer in memory, runs repeat exactly.
+
+A posed camera is a simulated star camera alone, held at the released attitude or turning at a constant rate;
+its true attitude and rate are known at any time.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +12,64 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+import numpy as np
+
 from flight.link.telemetry.log import FlightLog
 from flight.schema.sections import Config
 from hal.interfaces.wires import Wires
-from sim_hal.assembly import Hardware, assemble, fault_generator, line_generator
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from sim_hal.assembly import (
+    Hardware,
+    StarRenderer,
+    assemble,
+    fault_generator,
+    inline_exposure,
+    line_generator,
+)
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.emulators.star_camera import EmulatedStarCamera
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import put, scheduled
+from sim_hal.objects import Objects
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.settings import Simulation
-from sim_hal.worlds.truth import TruthRecorder
+from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
+from sim_hal.worlds.world import Motion, WorldInputs, make_world
+
+
+def posed_camera(
+    config: Config, section: Simulation, clock: SimClock, rate: FloatArray
+) -> tuple[EmulatedStarCamera, Callable[[int], FloatArray]]:
+    """Return the camera of a configuration on a clock, and its attitude (4,), ICRS into camera, at a time.
+
+    It turns at `rate` (3,) rad/s, camera axes, from the attitude at which the body is released. Raises
+    ConfigError for a world that cannot be.
+    """
+    camera = config.camera
+    assert camera is not None, "the caller has seen to a camera section"
+    begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
+    world = make_world(WorldInputs(config, section, lambda: np.zeros(3), begun_ns))
+    objects = Objects(section.objects, section.utc, begun_ns, world)
+    held, body_rate = world.motion(begun_ns), attitude_matrix(mounting).T @ rate
+    nothing = np.zeros(3)
+
+    def motion(time_ns: int) -> Motion:
+        turned = from_rotation_vector(body_rate * ((time_ns - begun_ns) * 1e-9))
+        return Motion(time_ns, multiply(turned, held.quaternion), body_rate, nothing, nothing)
+
+    device = EmulatedStarCamera(
+        motion,
+        inline_exposure(StarRenderer(camera, section.sky, section.seed)),
+        clock.now_ns,
+        round(section.sky.readout * 1e9),
+        mounting,
+        round(section.sky.line_time * camera.rows * 1e9),
+        objects.tracks,
+    )
+    clock.attach(TimedSimulation(lambda _: None, [device]))
+    return device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion)
 
 
 @dataclass(frozen=True, slots=True)

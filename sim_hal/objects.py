@@ -21,8 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, earth_velocity
 from sim_hal.settings import LineOfSight, ObjectState, SkyObject, Tumble
-from sim_hal.worlds.surroundings import OrbitingWorld, orbiting
-from sim_hal.worlds.world import World
+from sim_hal.worlds.world import OrbitingWorld, World, orbiting
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack

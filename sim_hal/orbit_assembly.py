@@ -13,17 +13,15 @@ from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Lens, Pinhole
+from sim_hal.device import SerialEnd
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
-from sim_hal.emulators.device import SerialEnd
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
+from sim_hal.emulators.solar_strings import EmulatedStrings, SolarStringsModel
 from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
-from sim_hal.emulators.strings import EmulatedStrings
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices
 from sim_hal.settings import OrbitDeviceTruth, Simulation
 from sim_hal.worlds import sun
-from sim_hal.worlds.solar_strings import SolarStringsModel
-from sim_hal.worlds.surroundings import OrbitingWorld, orbiting
-from sim_hal.worlds.world import World
+from sim_hal.worlds.world import OrbitingWorld, World, orbiting
 
 _STREAM = 0x0B17
 _UNIX_EPOCH = 2_440_587.5

@@ -14,7 +14,7 @@ from sim_hal.emulators.star_camera import EmulatedStarCamera
 if TYPE_CHECKING:  # they take half a second to import, and the testbed has none
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
     from sim_hal.emulators.gps import EmulatedGps
-    from sim_hal.emulators.strings import EmulatedStrings
+    from sim_hal.emulators.solar_strings import EmulatedStrings
 
 GPS_LINE = 1
 """The number of the receiver's line; the inertial unit's has none."""

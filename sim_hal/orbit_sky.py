@@ -20,7 +20,7 @@ from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.emulators.star_camera import Expose
-from sim_hal.worlds.surroundings import OrbitingWorld, Surroundings
+from sim_hal.worlds.world import OrbitingWorld, Surroundings
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack

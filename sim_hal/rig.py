@@ -21,11 +21,11 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.faults import grammar
+from sim_hal.faults import schedule
 from sim_hal.faults.catalogue import listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, scheduled
-from sim_hal.posed_camera import posed_camera
+from sim_hal.lockstep import posed_camera
 from sim_hal.serving import remote
 from sim_hal.settings import Simulation
 
@@ -68,7 +68,7 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     section = request.section()
     if request.seed is not None:
         section = configuration.replace(section, seed=request.seed)
-    section = configuration.replace(section, faults=(*section.faults, *grammar.entries(request.faults)))
+    section = configuration.replace(section, faults=(*section.faults, *schedule.entries(request.faults)))
     check(section.faults, config, request.realtime)
     opener = _served if request.realtime else _in_lockstep
     return with_host_faults(opener(request, config, section, stack), section)
@@ -92,12 +92,12 @@ def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) ->
 
 def fault_catalogue() -> tuple[str, str]:
     """Return how faults are written, and a list of all."""
-    return grammar.GRAMMAR, listing()
+    return schedule.GRAMMAR, listing()
 
 
 def injected_faults(request: SimulationRequest) -> tuple[str, ...]:
     """Return the faults of a flight as they are written, the configuration's first."""
-    faults = (*grammar.schedule(request.section().faults), *map(grammar.parse, request.faults))
+    faults = (*schedule.schedule(request.section().faults), *map(schedule.parse, request.faults))
     return tuple(map(str, faults))
 
 

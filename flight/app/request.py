@@ -15,7 +15,7 @@ class RunRequest:
     `devices` is the file of a running server of simulated devices; without it, a server is started.
     `archive` holds the runs of a board: the flight's folder is the archive's next, instead of `out`.
     `accepted` flies `config_path` only if it is the accepted file, else the last one that flew.
-    `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.grammar`.
+    `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.schedule`.
     """
 
     config_path: Path

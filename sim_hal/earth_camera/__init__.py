@@ -10,10 +10,9 @@ meets, `sun_disc` the Sun and its glare, `optics` the blur, `detector` the count
 Radiance is in units of that of a white matt surface with the Sun overhead, so the Sun's own disc is 46,000.
 """
 
-from sim_hal.earth_camera.atmosphere import Atmosphere
 from sim_hal.earth_camera.image import expected_radiance, render
 from sim_hal.earth_camera.model import EarthCameraModel
-from sim_hal.earth_camera.scene import EarthScene
+from sim_hal.earth_camera.scene import Atmosphere, EarthScene
 from sim_hal.earth_camera.truth import LimbTruth, limb_truth, nadir, sun_direction, sun_point
 
 APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height

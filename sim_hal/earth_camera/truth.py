@@ -10,8 +10,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import semi_axes
 from sim_hal.earth_camera.model import EarthCameraModel
+from sim_hal.earth_camera.radiance import towards_sun
 from sim_hal.earth_camera.scene import EarthScene
-from sim_hal.earth_camera.sun_disc import towards_sun
 
 
 @dataclass(frozen=True, slots=True, eq=False)

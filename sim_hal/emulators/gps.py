@@ -36,8 +36,8 @@ from knightcube.astro.earth.orientation import (
     geodetic,
     north_east_down,
 )
-from sim_hal.emulators.device import NEVER, SerialEnd
-from sim_hal.worlds.surroundings import OrbitingWorld
+from sim_hal.device import NEVER, SerialEnd
+from sim_hal.worlds.world import OrbitingWorld
 
 UNIX_EPOCH = 2_440_587.5
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"

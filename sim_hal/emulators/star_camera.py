@@ -17,8 +17,8 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import multiply
-from sim_hal.emulators.device import NEVER
-from sim_hal.worlds.motion import Motion
+from sim_hal.device import NEVER
+from sim_hal.worlds.world import Motion
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack

@@ -1,30 +1,385 @@
 """An emulated VN-100 on the device end of a serial line.
 
-It executes commands through `vn100_commands` and sends the measurements of `vn100_sensors` in the formats of
-`vn100_outputs`, on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to 26, 32 to 51,
-74, 82 to 84) are stored and echoed without effect, except the heading mode of 35; of register 85 the windows
-of magnetometer, accelerometer and gyro have an effect. Not emulated: SYNC lines, the second serial port. The
-500 ms of a flash write are VectorNav's; the second of start-up is assumed.
+The unit executes commands and sends its asynchronous outputs (one ASCII sentence and three binary packets)
+on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to 26, 32 to 51, 74, 82 to 84)
+are stored and echoed without effect, except the heading mode of 35; of register 85 the windows of
+magnetometer, accelerometer and gyro have an effect. SYNC lines and the second serial port are not emulated.
+The 500 ms of a flash write are VectorNav's; the second of start-up is assumed.
+
+The commands of the attitude filter are those of VectorNav UM001 ch. 8; set initial heading and set filter
+bias are as VectorNav's SDK 0.99 sends them and as its units with satellite navigation answer them. Assumed:
+in the absolute heading mode the magnetometer sets the heading, so tare and set initial heading change
+nothing; gravity sets pitch and roll in every mode, so only the yaw of a given attitude has an effect. The
+filter has no gyro bias error.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hal.drivers.vn100.protocol import Checksum, Sentence, build, parse
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.frames import NED_TO_TESTBED
-from knightcube.astro.quaternion import IDENTITY
-from sim_hal.emulators.device import NEVER, SerialEnd
-from sim_hal.emulators.vn100_attitude import AttitudeCommands
-from sim_hal.emulators.vn100_commands import CommandInterface, UnitActions
-from sim_hal.emulators.vn100_outputs import REPORT_BY_TYPE, Instant, report_length
-from sim_hal.emulators.vn100_registers import ASYNC_RATES_HZ, RegisterFile, UnitError
-from sim_hal.emulators.vn100_sensors import IMU_RATE_HZ, PROFILES, Measured, NoiseProfile, Sensors
-from sim_hal.emulators.vn100_streams import OutputStreams
-from sim_hal.worlds.motion import Motion
+from knightcube.astro.quaternion import IDENTITY, from_rotation_vector, multiply, normalise
+from sim_hal.device import NEVER, SerialEnd
+from sim_hal.emulators.vn100_registers import (
+    ASYNC_RATES_HZ,
+    BINARY_OUTPUTS,
+    FILTER_STARTUP_BIAS,
+    GYRO_STARTUP_BIAS,
+    INVALID_CHECKSUM,
+    INVALID_COMMAND,
+    INVALID_PARAMETER,
+    INVALID_REGISTER,
+    LOW_BAUD,
+    RECEIVE_OVERFLOW,
+    TOO_FEW,
+    UNAUTHORIZED,
+    BinaryOutput,
+    RegisterFile,
+    UnitError,
+    binary_output,
+    expect_count,
+)
+from sim_hal.emulators.vn100_sensors import (
+    FIELD_VALUES,
+    IMU_RATE_HZ,
+    PROFILES,
+    REPORT_BY_REGISTER,
+    REPORT_BY_TYPE,
+    Instant,
+    Measured,
+    NoiseProfile,
+    Report,
+    Sensors,
+    report_length,
+)
+from sim_hal.worlds.world import Motion
+
+ATTITUDE_COMMANDS = frozenset({"KMD", "KAD", "TAR", "SIH", "SGB", "SFB"})
+_DISTURBANCES = {"KMD": 1 << 11, "KAD": 1 << 12}
+_VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
+
+
+class AttitudeCommands:
+    """The attitude filter of one unit as far as commands reach it.
+
+    Attributes:
+        status: the VPE status word; KMD and KAD set its disturbance bits.
+    """
+
+    def __init__(self, registers: RegisterFile, gyro_bias: FloatArray) -> None:
+        """`gyro_bias` (3,) rad/s, sensor axes, is the filter's estimate, which SGB and SFB store."""
+        self._registers = registers
+        self._gyro_bias = gyro_bias
+        self._turn: FloatArray | None = None
+        self.status = 0
+
+    def reset(self) -> None:
+        """Discard the state that commands have set."""
+        self._turn = None
+        self.status = 0
+
+    def turned(self, measured: Measured) -> Measured:
+        """Return a sample with the heading that commands have set."""
+        if self._turn is None:
+            return measured
+        return replace(measured, quaternion=multiply(measured.quaternion, self._turn))
+
+    def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Measured]) -> None:
+        """Execute one of ATTITUDE_COMMANDS; `sample` measures now. Raises UnitError."""
+        if command in _DISTURBANCES:
+            bit = _DISTURBANCES[command]
+            self.status = self.status | bit if flag(fields) else self.status & ~bit
+        elif command == "SIH":
+            self._set_heading(_yaw_of(_numbers_of(fields)), sample)
+        else:
+            expect_count(fields, 0, 0)
+            if command == "TAR":
+                self._set_heading(0.0, sample)
+            else:
+                self._store_biases(everything=command == "SFB")
+
+    def _set_heading(self, yaw: float, sample: Callable[[], Measured]) -> None:
+        """Turn the attitude about the vertical so that the yaw is now `yaw`, rad."""
+        if self._registers.integer(_VPE_CONTROL, _HEADING_MODE) == _ABSOLUTE:
+            return
+        change = from_rotation_vector(np.array([0.0, 0.0, yaw - math.radians(sample().yaw_pitch_roll[0])]))
+        self._turn = change if self._turn is None else normalise(multiply(self._turn, change))
+
+    def _store_biases(self, everything: bool) -> None:
+        gyro = tuple(f"{value:+010.6f}" for value in self._gyro_bias.tolist())
+        self._registers.write(GYRO_STARTUP_BIAS, gyro)
+        kept = self._registers.read(FILTER_STARTUP_BIAS)[3:]
+        self._registers.write(FILTER_STARTUP_BIAS, (*gyro, *(("+00.000000",) * 4 if everything else kept)))
+
+
+def flag(fields: tuple[str, ...]) -> bool:
+    """Return the one field, 0 or 1, of a command. Raises UnitError."""
+    expect_count(fields, 1, 1)
+    if fields[0] not in {"0", "1"}:
+        raise UnitError(INVALID_PARAMETER)
+    return fields[0] == "1"
+
+
+def _numbers_of(fields: tuple[str, ...]) -> list[float]:
+    """Return a heading, yaw, pitch and roll, all in degrees, or a quaternion. Raises UnitError."""
+    expect_count(fields, 1, 4)
+    if len(fields) == 2:
+        raise UnitError(TOO_FEW)
+    try:
+        values = [float(text) for text in fields]
+    except ValueError as error:
+        raise UnitError(INVALID_PARAMETER) from error
+    if not all(map(math.isfinite, values)):
+        raise UnitError(INVALID_PARAMETER)
+    return values
+
+
+def _yaw_of(values: list[float]) -> float:
+    """Return the yaw in rad of `_numbers_of`; a quaternion needs no unit length. Raises UnitError."""
+    if len(values) < 4:
+        return math.radians(values[0])
+    if not any(values):
+        raise UnitError(INVALID_PARAMETER)
+    attitude = Measured(normalise(np.array(values)), np.zeros(3), np.zeros(3), np.zeros(3))
+    return math.radians(attitude.yaw_pitch_roll[0])
+
+
+_OUR_PORT = 1
+
+
+@dataclass(slots=True)
+class Stream:
+    """One asynchronous output, sent every `divisor` ticks; `length` in bytes, `sent_ns` in device time."""
+
+    divisor: int
+    length: int
+    message: Callable[[Instant], bytes]
+    sent_ns: int
+
+
+class OutputStreams:
+    """The streams of one unit.
+
+    Attributes:
+        muted: registers whose output is silent until they are written again.
+    """
+
+    def __init__(self, registers: RegisterFile) -> None:
+        self._registers = registers
+        self._streams: dict[int, Stream] = {}
+        self.muted: set[int] = set()
+
+    def reset(self) -> None:
+        """Remove all streams."""
+        self._streams = {}
+        self.muted.clear()
+
+    def build(self, device_ns: int) -> None:
+        """Rebuild the streams from the registers. Raises UnitError, unchanged, when the line is too slow."""
+        registers = self._registers
+        streams: dict[int, Stream] = {}
+        report = REPORT_BY_TYPE.get(registers.integer(6))
+        if report is not None and not self.muted & {6, 7}:
+            divisor = IMU_RATE_HZ // registers.integer(7)
+            crc_bytes = 2 * (self.checksum() == "crc16")
+            length = report_length(report) + len(self._suffix(0)) + crc_bytes
+            streams[6] = Stream(divisor, length, lambda now: self._sentence(report, now), device_ns)
+        for number in sorted(set(BINARY_OUTPUTS) - self.muted):
+            output = binary_output(registers.read(number))
+            if output is not None and output.ports & _OUR_PORT:
+                streams[number] = Stream(output.divisor, output.layout.length, packer(output), device_ns)
+        # A stream that continues unchanged keeps the time of its last message.
+        for number in streams.keys() & self._streams.keys():
+            streams[number].sent_ns = self._streams[number].sent_ns
+        load = sum(10 * stream.length * IMU_RATE_HZ / stream.divisor for stream in streams.values())
+        if load > registers.integer(5):
+            raise UnitError(LOW_BAUD)
+        self._streams = streams
+
+    def next_tick(self, passed: int) -> int | None:
+        """Return the first tick after `passed` on which a stream is due, None without streams."""
+        return min(((passed // s.divisor + 1) * s.divisor for s in self._streams.values()), default=None)
+
+    def due(self, tick: int) -> list[Stream]:
+        """Return the streams that are due on a tick."""
+        return [stream for stream in self._streams.values() if tick % stream.divisor == 0]
+
+    def checksum(self) -> Checksum:
+        """Return the checksum that register 30 selects."""
+        return "crc16" if self._registers.integer(30, 4) == 3 else "xor8"
+
+    def _suffix(self, status: int) -> str:
+        count = ",T0000000000" if self._registers.integer(30, 0) else ""
+        return count + (f",S{status:04X}" if self._registers.integer(30, 1) else "")
+
+    def _sentence(self, report: Report, now: Instant) -> bytes:
+        fields = [*report.text(now), *self._suffix(now.status).split(",")[1:]]
+        return build(report.header, *fields, checksum=self.checksum())
+
+
+def packer(output: BinaryOutput) -> Callable[[Instant], bytes]:
+    """Return the function that packs a binary output."""
+    sources = [FIELD_VALUES[key] for key in output.layout.fields]
+    return lambda now: output.layout.pack([value for source in sources for value in source(now)])
+
+
+_RECEIVE_BUFFER = 256
+
+
+@dataclass(frozen=True, slots=True)
+class UnitActions:
+    """The unit's actions that commands call, each with the time in ns.
+
+    Attributes:
+        sample: measures at this time.
+        build_streams: rebuilds the outputs from the registers; raises UnitError.
+        write_flash: saves the registers and calls the function when done.
+        restart: resets the unit.
+    """
+
+    sample: Callable[[int], Instant]
+    build_streams: Callable[[int], None]
+    write_flash: Callable[[int, Callable[[int], None]], None]
+    restart: Callable[[int], None]
+
+
+class CommandInterface:
+    """Executes the commands of one unit.
+
+    Attributes:
+        paused: whether asynchronous outputs are paused (ASY).
+    """
+
+    def __init__(
+        self,
+        line: SerialEnd,
+        registers: RegisterFile,
+        streams: OutputStreams,
+        actions: UnitActions,
+        attitude: AttitudeCommands,
+    ) -> None:
+        self._line = line
+        self._registers = registers
+        self._streams = streams
+        self._actions = actions
+        self._attitude = attitude
+        self._received = bytearray()
+        self.paused = False
+
+    def reset(self) -> None:
+        """Discard received bytes and the state that commands have set."""
+        self._received.clear()
+        self.paused = False
+        self._attitude.reset()
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """Execute and answer the commands that `data` completes."""
+        self._received += data
+        while (end := self._received.find(b"\n")) >= 0:
+            line = bytes(self._received[: end + 1])
+            del self._received[: end + 1]
+            start = line.rfind(b"$")
+            if start >= 0:
+                self._answer_line(line[start:], now_ns)
+        if len(self._received) > _RECEIVE_BUFFER:
+            self._received.clear()
+            self._report_error(RECEIVE_OVERFLOW, self._streams.checksum(), now_ns)
+
+    def _answer_line(self, line: bytes, now_ns: int) -> None:
+        sentence = parse(line, allow_none=True)
+        if sentence is None:
+            wide = len(line.rstrip(b"\r\n").rpartition(b"*")[2]) == 4
+            self._report_error(INVALID_CHECKSUM, "crc16" if wide else "xor8", now_ns)
+            return
+        checksum = self._streams.checksum() if sentence.checksum == "none" else sentence.checksum
+        try:
+            self._execute(sentence, checksum, now_ns)
+        except UnitError as error:
+            self._report_error(error.code, checksum, now_ns)
+
+    def _report_error(self, code: int, checksum: Checksum, now_ns: int) -> None:
+        mode = self._registers.integer(30, 6)
+        if mode:
+            self._line.write(build("ERR", f"{code:02X}", checksum=checksum), now_ns)
+        if mode == 2:
+            self._registers.write(6, ("0",))
+            self._actions.build_streams(now_ns)
+
+    def _execute(self, sentence: Sentence, checksum: Checksum, now_ns: int) -> None:
+        """Execute a command and answer it. Raises UnitError."""
+
+        def answer(*fields: str, at_ns: int = now_ns) -> None:
+            self._line.write(build(sentence.command, *fields, checksum=checksum), at_ns)
+
+        fields = sentence.fields
+        match sentence.command:
+            case "RRG":
+                expect_count(fields, 1, 2)
+                answer(fields[0], *self._read(_number_of(fields[0]), now_ns))
+            case "WRG":
+                expect_count(fields, 2, 16)
+                self._write(_number_of(fields[0]), fields, answer, now_ns)
+            case "ASY":
+                self.paused = not flag(fields)
+                answer(*fields)
+            case command if command in ATTITUDE_COMMANDS:
+                self._attitude.execute(command, fields, lambda: self._actions.sample(now_ns).measured)
+                answer(*fields)
+            case "BOM":
+                expect_count(fields, 1, 1)
+                self._poll_binary(BINARY_OUTPUTS[0] - 1 + _number_of(fields[0]), now_ns)
+            case "WNV":
+                self._actions.write_flash(now_ns, lambda end_ns: answer(at_ns=end_ns))
+            case "RFS" | "RST":
+                answer()
+                if sentence.command == "RFS":
+                    self._registers.restore()
+                self._actions.restart(now_ns)
+            case _:
+                raise UnitError(INVALID_COMMAND)
+
+    def _read(self, number: int, now_ns: int) -> tuple[str, ...]:
+        report = REPORT_BY_REGISTER.get(number)
+        if report is not None:
+            return tuple(report.text(self._actions.sample(now_ns)))
+        return self._registers.read(number)
+
+    def _write(self, number: int, fields: tuple[str, ...], answer: Callable[..., None], now_ns: int) -> None:
+        if number in REPORT_BY_REGISTER:
+            raise UnitError(UNAUTHORIZED)
+        before = self._registers.read(number)
+        echo = self._registers.write(number, fields[1:])
+        self._streams.muted.discard(number)
+        try:
+            self._actions.build_streams(now_ns)
+        except UnitError:
+            self._registers.set_back(number, before)
+            raise
+        # The answer is sent at the old speed.
+        answer(fields[0], *echo)
+        self._line.baud_rate = self._registers.integer(5)
+
+    def _poll_binary(self, number: int, now_ns: int) -> None:
+        if number not in BINARY_OUTPUTS:
+            raise UnitError(INVALID_PARAMETER)
+        output = binary_output(self._registers.read(number))
+        if output is None:
+            raise UnitError(INVALID_PARAMETER)
+        self._line.write(packer(output)(self._actions.sample(now_ns)), now_ns)
+
+
+def _number_of(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise UnitError(INVALID_REGISTER) from error
+
 
 TICK_NS = 1_000_000_000 // IMU_RATE_HZ
 _BILLION = 1_000_000_000
@@ -60,7 +415,7 @@ class Vn100EmulatorSettings:
 
 
 class Vn100Emulator:
-    """The unit; a `sim_hal.emulators.device.EmulatedDevice`.
+    """The unit; a `sim_hal.device.EmulatedDevice`.
 
     Attributes:
         alter: changes each measurement before it is sent, for faults.

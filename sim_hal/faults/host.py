@@ -1,13 +1,17 @@
-"""Faults inside the flight process: its workers, its wall clock, its disk, the file it reads at the start.
+"""Faults inside the flight process: its workers, wall clock and disk, and the configuration file.
 
-The app passes clock, workers and log files through here only when a simulation asks for such faults. The
-wrappers apply each fault in its window of mission time, in lock-step and in real time.
+The application passes clock, workers and log files through this module only when a simulation requests such
+faults. The wrappers apply each fault in its window of mission time, in lock-step and in real time.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import importlib
 import os
+import signal
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +20,49 @@ from typing import Any
 import numpy as np
 
 from hal.interfaces.wires import Clock, Ticker
-from sim_hal.faults.grammar import ScheduledFault, parse, schedule
-from sim_hal.faults.jobs import Task, perform
+from sim_hal.faults.schedule import ScheduledFault, parse, schedule
 from sim_hal.settings import Simulation
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A job: its function as MODULE:NAME, its argument, and its fault, empty for none."""
+
+    function: str
+    argument: Any
+    fault: str = ""
+    delay: float = 0.0
+
+
+def perform(task: Task) -> Any:
+    """Run a job with its fault."""
+    module, _, name = task.function.partition(":")
+    if task.fault == "endless":
+        while True:
+            pass
+    if task.fault == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if task.fault == "exception":
+        raise ArithmeticError("an injected defect of the worker")
+    value = getattr(importlib.import_module(module), name)(task.argument)
+    if task.fault == "slow":
+        time.sleep(task.delay)
+    return without_numbers(value) if task.fault == "nan" else value
+
+
+def without_numbers(value: Any) -> Any:
+    """Return a value with every float replaced by NaN."""
+    if isinstance(value, float):
+        return float("nan")
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        return np.full_like(value, np.nan)
+    if isinstance(value, tuple) and type(value) is tuple:
+        return tuple(map(without_numbers, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [field.name for field in dataclasses.fields(value) if field.init]
+        return dataclasses.replace(value, **{name: without_numbers(getattr(value, name)) for name in names})
+    return value
+
 
 DEVICES = ("planner", "vision", "clock", "disk")
 

@@ -1,15 +1,146 @@
-"""Puts the faults of a flight on the time line of the emulated devices."""
+"""The grammar of faults, and the check and scheduling of the faults of a flight.
+
+A fault is written `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`. Seconds are of mission time.
+Without `@` a fault begins at 0, without `for` it lasts to the end. In the `simulation` section of a
+configuration the same fault is written `{fault: 'imu: silent', at: 120, for: 5}`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from flight.schema.sections import Config
 from knightcube.errors import UsageError
-from sim_hal.faults.bench import Bench, Lift
-from sim_hal.faults.grammar import ScheduledFault, schedule
-from sim_hal.faults.kinds import Where
+from sim_hal.faults.bench import Bench, FaultKind, Lift, Where
+from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
+
+GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
+
+LONGEST = 1e9
+"""s, thirty years; more would not fit into 64 bits of ns."""
+
+_FAULT = re.compile(
+    r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
+    r"\s*(@\s*(?P<at>\S+))?\s*(\bfor\s+(?P<span>\S+))?\s*"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduledFault:
+    """A fault and its time: from `at` s of mission time for `span` s, None to the end."""
+
+    kind: FaultKind
+    at: float
+    span: float | None
+    parameters: Mapping[str, float]
+
+    @property
+    def end(self) -> float:
+        """The end, s: the beginning for a momentary fault, infinity for a lasting one."""
+        if self.kind.momentary:
+            return self.at
+        return math.inf if self.span is None else self.at + self.span
+
+    def __str__(self) -> str:
+        """Return the fault as a user writes it."""
+        given = ", ".join(f"{name}={value:g}" for name, value in self.parameters.items())
+        lasts = "" if self.span is None else f" for {self.span:g}"
+        return f"{self.kind.name}{f' ({given})' if given else ''} @ {self.at:g}{lasts}"
+
+
+def parse(text: str) -> ScheduledFault:
+    """Parse one fault. Raises UsageError with the correct form."""
+    found = _FAULT.fullmatch(text)
+    if found is None:
+        raise UsageError(f"fault {text!r}: write it as {GRAMMAR}")
+    device, _, kind = found["name"].partition(":")
+    known = _known(f"{device.strip()}: {kind.strip()}", text)
+    at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
+    span = _seconds(found["span"], "for", text) if found["span"] is not None else None
+    if span == 0.0:
+        raise UsageError(f"fault {text!r}: for 0 is no time at all: give more, or leave `for` out")
+    return ScheduledFault(known, at, span, _parameters(known, found["given"] or "", text))
+
+
+def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
+    """Read the faults of a `simulation` section. Raises UsageError naming the entry."""
+    made = []
+    for number, entry in enumerate(entries):
+        place = f"simulation.faults[{number}]"
+        try:
+            fault = parse(entry.fault)
+        except UsageError as error:
+            raise UsageError(f"{place}: {error}") from error
+        if entry.at is not None and "@" in entry.fault:
+            raise UsageError(f"{place}: `at` and `@` in one fault; which?")
+        if entry.span is not None and fault.span is not None:
+            raise UsageError(f"{place}: `for` stands twice; which?")
+        at = fault.at if entry.at is None else entry.at
+        span = fault.span if entry.span is None else entry.span
+        if max(at, span or 0.0) > LONGEST:
+            raise UsageError(f"{place}: seconds go up to {LONGEST:g}")
+        made.append(replace(fault, at=at, span=span))
+    return tuple(made)
+
+
+def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
+    """Return faults of the command line as those of a section. Raises UsageError for a bad one.
+
+    Leaves out faults that only the command line can inject: they were applied to the text already.
+    """
+    faults = map(parse, texts)
+    return tuple(
+        FaultEntry(fault=str(fault)) for fault in faults if fault.kind.where is not Where.COMMAND_LINE
+    )
+
+
+def _known(name: str, text: str) -> FaultKind:
+    kind = CATALOGUE.get(name.lower())
+    if kind is not None:
+        return kind
+    device = name.lower().partition(":")[0]
+    same = [other for other in CATALOGUE if other.startswith(f"{device}:")]
+    near = difflib.get_close_matches(name.lower(), same or list(CATALOGUE), n=1, cutoff=0.0)
+    rest = f" ({device} has {', '.join(other.partition(': ')[2] for other in same)})" if same else ""
+    raise UsageError(f"fault {text!r}: there is no {name!r}, did you mean {near[0]!r}?{rest}")
+
+
+def _parameters(kind: FaultKind, given: str, text: str) -> dict[str, float]:
+    values = {name: value.default for name, value in kind.parameters.items() if value.default is not None}
+    for word in filter(None, (word.strip() for word in given.split(","))):
+        name, equals, value = (part.strip() for part in word.partition("="))
+        if name not in kind.parameters or not equals:
+            has = ", ".join(kind.parameters) or "no parameters"
+            raise UsageError(f"fault {text!r}: {word!r}: {kind.name} has {has}")
+        values[name] = _number(value, name, text)
+        if not kind.parameters[name].accepts(values[name]):
+            raise UsageError(f"fault {text!r}: {name}={value}: it is {kind.parameters[name].bounds()}")
+    return values
+
+
+def _seconds(word: str, after: str, text: str) -> float:
+    value = _number(word, after, text)
+    if value < 0.0:
+        raise UsageError(f"fault {text!r}: {after} {word}: seconds cannot be below zero")
+    if value > LONGEST:
+        raise UsageError(f"fault {text!r}: {after} {word}: seconds go up to {LONGEST:g}")
+    return value
+
+
+def _number(word: str, what: str, text: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise UsageError(f"fault {text!r}: {what} {word!r} is no number")
+    return value
+
 
 _SECTIONS = {
     "camera": "camera",

@@ -1,4 +1,8 @@
-"""The command line of the emulated devices."""
+"""The command line of the emulated devices.
+
+`sim_hal emulate` serves one device; `sim_hal serve` serves the simulated hardware of a configuration in real
+time.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,89 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 
+import msgspec
 import numpy as np
 
+from flight.schema import reader as configuration
+from flight.schema.carried import config_path, names
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import Clock
-from sim_hal.emulators.pty_line import PtyLine
+from knightcube.errors import UsageError
+from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import BAUD_RATES
 from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.serving import command, emulate_i2c
+from sim_hal.serving import emulate_i2c
 from sim_hal.serving.options import number, positive, seed
-from sim_hal.worlds.motion import Motion, about_thread
+from sim_hal.serving.server import DeviceServer
+from sim_hal.settings import Simulation
+from sim_hal.worlds.world import Motion, about_thread
+
+
+def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        "serve",
+        help="serve all devices of a configuration in real time",
+        description="Serve the simulated hardware of a configuration in real time: the VN-100 on a "
+        "pseudo-terminal, the I2C bus and the camera on a Unix socket. Prints a JSON object with their names "
+        "once they answer. `python -m flight run CONFIG --realtime` starts this by itself.",
+    )
+    carried = ", ".join(names())
+    parser.add_argument(
+        "config",
+        type=config_path,
+        metavar="CONFIG",
+        help=f"YAML file with a simulation section, or one of {carried}",
+    )
+    parser.add_argument("--folder", type=Path, required=True, metavar="DIR", help="where the truth is logged")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of the simulation instead")
+    parser.add_argument(
+        "--patience", type=float, metavar="S", help="end S seconds after the last client has left"
+    )
+    parser.add_argument(
+        "--facts", type=Path, metavar="FILE", help="write the object to FILE too, for `flight run --devices`"
+    )
+    parser.set_defaults(command=_serve)
+
+
+def _serve(options: argparse.Namespace) -> int:
+    """Serve until SIGINT or SIGTERM."""
+    try:
+        config = configuration.load(options.config)
+        text = options.config.read_text(encoding="utf-8")
+        section = configuration.simulation_section(text, str(options.config), Simulation)
+        if section is None:
+            raise UsageError(f"{options.config} has no simulation section: nothing to serve")
+        if options.seed is not None:
+            section = msgspec.structs.replace(section, seed=options.seed)
+        server = DeviceServer(config, section, options.folder)
+    except UsageError as error:
+        sys.stderr.write(f"sim_hal: {error}\n")
+        return 2
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_number, server.stop)
+    try:
+        facts = {
+            "serial": server.serial_device,
+            "baud_rate": config.inertial_unit.baud_rate,
+            "socket": str(server.socket_path),
+            "camera": config.camera is not None,
+            "gps": server.gps_device,
+            "gps_baud_rate": None if config.gps is None else config.gps.baud_rate,
+            "wide": len(config.wide_cameras),
+        }
+        if options.facts is not None:
+            beside = options.facts.with_suffix(".part")
+            beside.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+            beside.replace(options.facts)
+        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.flush()
+        server.serve(None if options.patience is None else round(options.patience * 1e9))
+    finally:
+        server.close()
+    return 0
+
 
 _LONGEST_WAIT_NS = 50_000_000
 
@@ -50,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
     devices = emulate.add_subparsers(required=True, metavar="DEVICE")
     _add_vn100(devices)
     emulate_i2c.add_to(devices)
-    command.add_to(commands)
+    _add_serve(commands)
     return parser
 
 
@@ -99,7 +175,7 @@ def _emulate_vn100(options: argparse.Namespace) -> int:
         sys.stdout.flush()
 
     try:
-        serve(emulator, line, clock, announce, options.duration)
+        serve_unit(emulator, line, clock, announce, options.duration)
     finally:
         line.close()
     return 0
@@ -120,7 +196,7 @@ def _demonstration(options: argparse.Namespace, start_ns: int) -> Callable[[int]
     return motion
 
 
-def serve(
+def serve_unit(
     emulator: Vn100Emulator,
     line: PtyLine,
     clock: Clock,

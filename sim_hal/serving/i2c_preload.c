@@ -1,6 +1,6 @@
 /* Lets unchanged programs open an emulated I2C bus as /dev/i2c-N. Loaded by LD_PRELOAD.
  *
- * An open of the device becomes a connection to the server's socket (sim_hal/serving/i2c_server.py); read, write
+ * An open of the device becomes a connection to the server's socket (sim_hal/serving/emulate_i2c.py); read, write
  * and the ioctls of linux/i2c-dev.h on that descriptor become requests. All other files go to the C library.
  * Descriptors are recognised by their socket's inode, so copies by dup and fork work, and nothing is left behind
  * by a close. A program that looks for the device by stat or access finds it; a listing of /dev does not show it.

@@ -28,15 +28,14 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
-from sim_hal.emulators.pty_line import PtyLine
+from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.emulators.star_camera import EmulatedStarCamera
 from sim_hal.faults.bench import Bench
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.schedule import put
+from sim_hal.faults.schedule import parse, put
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, Sky
-from sim_hal.worlds.truth import TruthRecorder
+from sim_hal.worlds.simulation import TruthRecorder
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene

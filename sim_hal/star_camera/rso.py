@@ -1,4 +1,4 @@
-"""Resident space objects (RSOs) as the star camera sees them: points that move in the sky (Sease ch. 2).
+"""Resident space objects (RSOs) in the star camera's field: points that move in the sky (Sease ch. 2).
 
     camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
     orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
@@ -6,8 +6,14 @@
     tracks = source_tracks(camera, [debris], epoch=2_461_041.5, start=120.0, end=120.5)
     frame = render(model, directions, magnitudes, times, quaternions, rng, extra=tracks)
 
-An object has the same magnitude from wherever it is seen, but for what of the Sun the Earth hides from it.
-Directions are geometric: the stars of the catalogue too are without the aberration of the camera's motion.
+The magnitude of an object does not depend on the observer, except for the part of the Sun that the Earth
+hides from the object. Directions are geometric: like the stars of the catalogue, they exclude the aberration
+by the camera's motion.
+
+Exclusion (Sease 2.16-2.19, corrected): the Sun or the Earth is in the camera's field, or the Earth is
+between camera and object. The boresight is the camera's +z, and the field is a cone around it. With half the
+field of view (the thesis's choice) a corner of the frame may still contain the Sun or the limb; with the
+pinhole's half diagonal it may not. Vectors are in ICRS, positions geocentric in m.
 """
 
 from __future__ import annotations
@@ -20,13 +26,63 @@ from typing import Protocol
 import numpy as np
 
 from hal.interfaces.errors import OutOfRange
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.shadow import Shadow, sunlit_share
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, SUN_RADIUS
+from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera import SourceTrack
 from sim_hal.worlds import sun
-from sim_hal.worlds.exclusion import hidden_by_earth
 from sim_hal.worlds.orbit import Orbit
+
+
+def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:
+    """Return the boresights (m, 3), ICRS, at body `attitudes` (m, 4); `mounting` (4,) body into camera."""
+    return np.asarray(quaternion.attitude_matrix(quaternion.multiply(mounting, attitudes))[..., 2, :])
+
+
+def sun_in_field(
+    boresight: FloatArray, position: FloatArray, sun: FloatArray, half_angle: float, buffer: float = 0.0
+) -> BoolArray:
+    """Return at which `boresight` (m, 3) the Sun's disc is within `half_angle` + `buffer` rad (2.16, 2.17).
+
+    `position` (m, 3) is the camera's, `sun` (m, 3) the Sun's; `buffer` is for stray light past the baffle.
+    """
+    to_sun = np.asarray(sun) - position
+    return _within(boresight, to_sun, SUN_RADIUS, half_angle + buffer)
+
+
+def earth_in_field(
+    boresight: FloatArray, position: FloatArray, half_angle: float, buffer: float = 0.0
+) -> BoolArray:
+    """Return at which `boresight` (m, 3) the Earth is within `half_angle` + `buffer` rad (2.18, 2.19)."""
+    return _within(boresight, -np.asarray(position), EARTH_RADIUS, half_angle + buffer)
+
+
+def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
+    """Return for which pairs the Earth stands between `position` and `target`, (m, 3) each."""
+    way = target - position
+    length = np.sum(way * way, axis=-1)
+    nearest = np.clip(-np.sum(position * way, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    closest = np.linalg.norm(position + nearest[..., None] * way, axis=-1)
+    return np.asarray(closest < EARTH_RADIUS)
+
+
+def in_field(
+    camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
+) -> BoolArray:
+    """Return which `directions` (m, 3) ICRS are within `margin` px of the detector at camera `attitudes`."""
+    seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
+    return camera.contains(camera.project(seen), margin)
+
+
+def _within(boresight: FloatArray, to_body: FloatArray, radius: float, half_angle: float) -> BoolArray:
+    distance = np.linalg.norm(to_body, axis=-1)
+    cosine = np.sum(boresight * to_body, axis=-1) / distance
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.asarray(angle < np.arcsin(np.minimum(1.0, radius / distance)) + half_angle)
+
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7

@@ -16,13 +16,11 @@ import numpy as np
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
-from sim_hal.settings import CageTruth
+from sim_hal.settings import CageTruth, Disturbances
 from sim_hal.worlds.free_body.body import elements, julian_date
 from sim_hal.worlds.free_body.environment import Environment
-from sim_hal.worlds.free_body.section import Disturbances
-from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.testbed import Testbed, TestbedModel, model_of
-from sim_hal.worlds.world import WorldInputs
+from sim_hal.worlds.world import Motion, WorldInputs
 
 _STREAM = 0xCA6E
 

@@ -18,8 +18,16 @@ from flight.schema.errors import ConfigError
 from flight.schema.testbed import TestbedConfig, as_testbed
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
-from sim_hal.worlds.motion import Motion, about_thread
-from sim_hal.worlds.world import WorldInputs, WorldTruth
+from sim_hal.worlds.world import Motion, WorldInputs, WorldTruth, about_thread
+
+VACUUM_PERMEABILITY = 4e-7 * math.pi
+"""T m/A, as the thesis has it."""
+
+
+def helmholtz_field(turns: float, current: float, radius: float) -> float:
+    """Return the field in T in the middle of two coils of `turns` each; `current` in A, `radius` in m."""
+    return math.pow(0.8, 1.5) * VACUUM_PERMEABILITY * turns * current / radius
+
 
 _LONGEST_STEP = 0.025
 

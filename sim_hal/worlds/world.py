@@ -1,21 +1,58 @@
 """The world seam: what the emulated devices need of any simulated world.
 
 A configuration names its world in `simulation.world`: one of `WORLDS`, or a third party's factory as
-`module:factory`, which takes `WorldInputs` and returns a `World`.
+`module:factory`, which takes `WorldInputs` and returns a `World`. A world in orbit is an `OrbitingWorld`.
 """
 
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
 
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y
 from sim_hal.settings import Simulation
-from sim_hal.worlds.motion import Motion
+
+STANDARD_GRAVITY = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The measurements of an ideal inertial unit at one time.
+
+    Attributes:
+        time_ns: simulation time.
+        quaternion: (4,) reference frame (the testbed's T) into body, scalar last.
+        rate: (3,) rad/s, body axes.
+        field_body: (3,) T, body axes.
+        specific_force_body: (3,) m/s^2, body axes; at rest it points up.
+    """
+
+    time_ns: int
+    quaternion: FloatArray
+    rate: FloatArray
+    field_body: FloatArray
+    specific_force_body: FloatArray
+
+
+def about_thread(time_ns: int, angle: float, rate: float, field: float) -> Motion:
+    """Return the motion of a body turned on the thread by `angle` rad, at `rate` rad/s, `field` T on -z_T."""
+    return Motion(
+        time_ns=time_ns,
+        quaternion=about_axis_y(angle),
+        rate=np.array([0.0, rate, 0.0]),
+        # (0, 0, -field) and the specific force of the thread (0, -g, 0), turned into body axes.
+        field_body=np.array([field * math.sin(angle), 0.0, -field * math.cos(angle)]),
+        specific_force_body=np.array([0.0, -STANDARD_GRAVITY, 0.0]),
+    )
+
 
 WORLDS = {
     "testbed": "sim_hal.worlds.testbed:make",
@@ -90,4 +127,81 @@ def make_world(inputs: WorldInputs) -> World:
         raise ConfigError(
             "simulation.world", f"is {named!r}: its factory returns no World (sim_hal.worlds.world)"
         )
+    return world
+
+
+Floats = tuple[float, float, float]
+
+CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
+
+
+class Surroundings(NamedTuple):
+    """What surrounds the craft at an instant, ICRS.
+
+    Attributes:
+        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
+        sun: (3,) its direction from the craft.
+        light: sunlight over that at one astronomical unit; 0 in the umbra.
+        sunlit: the share of the Sun's disc that is seen.
+        density: of the air, kg/m^3.
+        walk: (3,) of the walking dipole, of unit standard deviation, body axes.
+    """
+
+    position: Floats
+    velocity: Floats
+    field: Floats
+    sun: Floats
+    light: float
+    sunlit: float
+    density: float
+    walk: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrbitTruth(WorldTruth):
+    """The state of a world in orbit; vectors in ICRS where nothing else is said.
+
+    Attributes:
+        utc: Julian date. quaternion: (4,) ICRS into body. rate: (3,) rad/s, body axes.
+        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
+        sun: (3,) its direction. sunlit: share of its disc that is seen.
+        residual_dipole: (3,) A m^2, body axes.
+        causes: evaluates `torques`, which few readers want.
+    """
+
+    utc: float
+    quaternion: FloatArray
+    rate: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    field: FloatArray
+    sun: FloatArray
+    sunlit: float
+    residual_dipole: FloatArray
+    causes: Callable[[], dict[str, FloatArray]]
+
+    @property
+    def torques(self) -> dict[str, FloatArray]:
+        """Torques (3,) N m, body axes, by `CAUSES`; empty where the world does not know them apart."""
+        return self.causes()
+
+
+@runtime_checkable
+class OrbitingWorld(World, Protocol):
+    """A world with an orbit: what GPS receiver, solar strings and wide cameras measure."""
+
+    def surroundings(self) -> Surroundings:
+        """Return what surrounds the craft at the present state."""
+
+    def utc_ns(self) -> int:
+        """Return UTC of the present state, ns since 1970."""
+
+    def orbit_truth(self) -> OrbitTruth:
+        """Return all of the present state, with the torques by their causes."""
+
+
+def orbiting(world: World, section: str) -> OrbitingWorld:
+    """Return the world as one with an orbit, for a device of `section`. Raises ConfigError without orbit."""
+    if not isinstance(world, OrbitingWorld):
+        raise ConfigError(section, "needs a world with an orbit, such as `simulation.world: free_body`")
     return world

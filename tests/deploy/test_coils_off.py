@@ -17,8 +17,7 @@ from hal.drivers.pca9685 import ALL_LED_OFF_H, AUTO_INCREMENT, CHANNELS, FULL, L
 from hal.interfaces.guardian import CoilReach
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
-from sim_hal.serving.i2c_server import I2cServer
-from sim_hal.serving.preload import library
+from sim_hal.serving.emulate_i2c import I2cServer, library
 from tests.deploy.scripts import DEPLOY
 
 

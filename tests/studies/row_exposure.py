@@ -15,7 +15,7 @@ from scipy.special import ndtr
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from sim_hal.star_camera import StarCameraModel, detector
+from sim_hal.star_camera import StarCameraModel, image
 from tests.studies.campaigns.scenes import catalogue
 
 Turns = Callable[[FloatArray], FloatArray]
@@ -61,7 +61,7 @@ def row_scene(
         attitudes = multiply(from_rotation_vector(turns(times)), middle)
         path = _places(camera, directions[star : star + 1], attitudes)[:, 0]
         _add(light, camera, path, times, exposure, float(electrons[star]))
-    pixels = detector.counts(camera, light.astype(np.float32), exposure, generator)
+    pixels = image.counts(camera, light.astype(np.float32), exposure, generator)
     inside = np.abs(coarse) <= 0.5 * exposure
     seen = (
         camera.pinhole.contains(places[inside][:, near].reshape(-1, 2)).reshape(-1, len(near)).mean(0) > 0.3

@@ -14,9 +14,8 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.telemetry.reader import Run
 from hal.interfaces.wires import SECOND_NS
-from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.settings import CraftSection, FaultEntry, Simulation
 from sim_hal.worlds.free_body.craft import CRAFTS
-from sim_hal.worlds.free_body.section import CraftSection
 from tests.scenario.flights import CONFIG
 
 

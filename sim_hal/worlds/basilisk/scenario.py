@@ -33,11 +33,11 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
+from sim_hal.settings import Disturbances
 from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.craft import TrueCraft
-from sim_hal.worlds.free_body.pressure import DRAG_COEFFICIENT
-from sim_hal.worlds.free_body.section import Disturbances
+from sim_hal.worlds.free_body.loads import DRAG_COEFFICIENT
 from sim_hal.worlds.orbit import KeplerianElements
 
 MASS = 1.0

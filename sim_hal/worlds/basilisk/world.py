@@ -19,22 +19,20 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
-from sim_hal.emulators.device import NEVER
+from sim_hal.device import NEVER
+from sim_hal.settings import FreeBodySection
 from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.body import (
     KNIGHTCUBE_POWER,
     CoilPower,
     elements,
+    generators,
     julian_date,
     released,
 )
 from sim_hal.worlds.free_body.craft import CRAFTS, build
-from sim_hal.worlds.free_body.section import FreeBodySection
-from sim_hal.worlds.free_body.streams import generators
-from sim_hal.worlds.motion import Motion
-from sim_hal.worlds.surroundings import Floats, OrbitTruth, Surroundings
-from sim_hal.worlds.world import WorldInputs, WorldTruth
+from sim_hal.worlds.world import Floats, Motion, OrbitTruth, Surroundings, WorldInputs, WorldTruth
 
 if TYPE_CHECKING:
     from sim_hal.worlds.basilisk.scenario import Scenario

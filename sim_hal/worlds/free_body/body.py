@@ -1,7 +1,7 @@
-"""A free body in orbit as a world: the craft of one seed, turned by its coils and by all disturbances.
+"""A free body in orbit as a world: the craft of one seed, moved by its coils and by all disturbances.
 
-The rotation is integrated when somebody looks or when the currents change, not at every event between: the
-result depends by less than a microradian on when somebody looked. Torques of air and sunlight and the
+The rotation is integrated when the state is read or when the currents change, not at every event between;
+the result depends on the times of reading by less than a microradian. Torques of air and sunlight and the
 residual dipole are held in body axes for 0.1 s.
 """
 
@@ -20,11 +20,12 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import DAY
-from sim_hal.emulators.device import NEVER
+from sim_hal.device import NEVER
+from sim_hal.settings import FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.craft import CRAFTS, build
 from sim_hal.worlds.free_body.environment import Environment
-from sim_hal.worlds.free_body.load_model import LoadModel
+from sim_hal.worlds.free_body.loads import LoadModel
 from sim_hal.worlds.free_body.rotation import (
     Floats,
     Loads,
@@ -34,12 +35,17 @@ from sim_hal.worlds.free_body.rotation import (
     steps_within,
     turned,
 )
-from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff
-from sim_hal.worlds.free_body.streams import generators
-from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.orbit import KeplerianElements
-from sim_hal.worlds.surroundings import OrbitTruth, Surroundings
-from sim_hal.worlds.world import WorldInputs, WorldTruth
+from sim_hal.worlds.world import Motion, OrbitTruth, Surroundings, WorldInputs, WorldTruth
+
+_STREAM = 0xF4EE
+
+
+def generators(seed: int) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+    """Return the generators of the craft's errors, of the release, and of air, storms and walks."""
+    errors, tip_off, weather = (np.random.default_rng([seed, _STREAM, stream]) for stream in range(3))
+    return errors, tip_off, weather
+
 
 UNIX_EPOCH = 2_440_587.5
 """The Julian date of 1970."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
-from sim_hal.worlds.free_body.section import CraftSection, Disturbances
+from sim_hal.settings import CraftSection, Disturbances
 
 CRAFTS = {
     # Sease 2013 Table 5.1 with its exponent corrected; 80 turns of 0.0081 m^2.

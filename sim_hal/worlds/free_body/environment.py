@@ -1,9 +1,14 @@
-"""The surroundings along an orbit, evaluated at knots and read between them by cubic splines.
+"""The environment along an orbit: evaluated at knots, interpolated by cubic splines.
 
-Knots stand 10 s apart, which is a thousandth of a turn of position and field: position is then true to
-2 mm and the field to 1e-4 nT, far below the models' own errors. Sunlight changes within seconds in the
-penumbra, so it has knots each second, joined by straight lines. Knots are made 1,000 s at a time, and what is
-random follows the order of the knots, never the times that are asked for.
+Knots are 10 s apart, in which position and field change by a thousandth of a revolution; interpolation is
+then accurate to 2 mm and 1e-4 nT, far below the models' own errors. Sunlight changes within seconds in the
+penumbra, so it has knots each second, joined by straight lines. Knots are made 1,000 s at a time, and random
+draws follow the order of the knots, never the order of the times that are requested.
+
+The air density is an exponential profile (Vallado, Fundamentals of Astrodynamics, 4th ed. 2013, Table 8-4)
+with a day bulge. The bulge has its apex 30 deg behind the Sun in right ascension and falls off as cos^4 of
+half the angle from it (Montenbruck & Gill 2000, 3.5.2, Harris-Priester). By day the air is four times as
+dense as by night, as near 500 km at a mean solar activity.
 """
 
 from __future__ import annotations
@@ -15,14 +20,53 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orientation import ROTATION_RATE
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from sim_hal.settings import Disturbances
 from sim_hal.worlds import geomagnetism, sun
-from sim_hal.worlds.free_body.atmosphere import log_density
-from sim_hal.worlds.free_body.section import Disturbances
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
-from sim_hal.worlds.surroundings import Floats, Surroundings
+from sim_hal.worlds.world import Floats, Surroundings
+
+_PROFILE = np.array(
+    [
+        [150e3, 2.070e-9],
+        [200e3, 2.789e-10],
+        [250e3, 7.248e-11],
+        [300e3, 2.418e-11],
+        [350e3, 9.518e-12],
+        [400e3, 3.725e-12],
+        [450e3, 1.585e-12],
+        [500e3, 6.967e-13],
+        [600e3, 1.454e-13],
+        [700e3, 3.614e-14],
+        [800e3, 1.170e-14],
+        [900e3, 5.245e-15],
+        [1000e3, 3.019e-15],
+    ]
+)
+"""Height in m, density in kg/m^3."""
+_NIGHT, _DAY = 0.4, 1.6
+_MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
+"""Over all sides."""
+_LAG = math.radians(30.0)
+
+
+def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -> FloatArray:
+    """Return the logarithm (n,) of the density in kg/m^3 at positions (n, 3) m, the Sun at (n, 3) m, ICRS.
+
+    `day_bulge` is a share of the bulge: zero is its mean on all sides.
+    """
+    distance = np.linalg.norm(position, axis=-1)
+    profile = np.interp(distance - EARTH_RADIUS, _PROFILE[:, 0], np.log(_PROFILE[:, 1]))
+    cosine, sine = math.cos(_LAG), math.sin(_LAG)
+    x, y = sun[..., 0], sun[..., 1]
+    apex = np.stack([cosine * x - sine * y, sine * x + cosine * y, sun[..., 2]], axis=-1)
+    facing = np.sum(position * apex, axis=-1) / (distance * np.linalg.norm(apex, axis=-1))
+    bulge = _NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2
+    return np.asarray(profile + np.log(_MEAN + day_bulge * (bulge - _MEAN)))
+
 
 KNOT = 10.0
 _CHUNK = 100

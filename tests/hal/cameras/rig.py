@@ -21,7 +21,7 @@ from hal.interfaces.errors import Refused
 from hal.interfaces.wires import Clock
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.emulators.star_camera import EmulatedStarCamera
-from sim_hal.worlds.motion import Motion
+from sim_hal.worlds.world import Motion
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.manual_clock import ManualClock
 

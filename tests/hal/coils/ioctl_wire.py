@@ -8,7 +8,7 @@ from typing import Any
 
 from smbus2 import smbus2
 
-from sim_hal.emulators import i2c_adapter
+from sim_hal.emulators import i2c_bus
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus, Message
 
 I2C_RETRIES = 0x0701
@@ -29,7 +29,7 @@ class IoctlWire:
         self.wire = wire
         self._address = -1
         self.settings: list[tuple[int, int]] = []
-        self.functions = i2c_adapter.FUNCTIONS
+        self.functions = i2c_bus.FUNCTIONS
         self.slave_error = 0
 
     def __call__(self, descriptor: int, request: int, argument: Any = 0) -> int:
@@ -54,7 +54,7 @@ class IoctlWire:
         union = message.data.contents if message.data else None
         sent = b"" if union is None else bytes(union.block)
         reading, command, size = message.read_write == 1, message.command, message.size
-        answer = i2c_adapter.smbus(self.wire, self._address, reading, command, size, sent)
+        answer = i2c_bus.smbus(self.wire, self._address, reading, command, size, sent)
         if union is not None:
             union.block[: len(answer)] = answer
 

@@ -11,10 +11,10 @@ from hal.drivers.h_bridge import CoilSettings, CoilWiring
 from hal.drivers.pca9685 import Pca9685
 from hal.interfaces.devices import TorqueCoils
 from hal.interfaces.wires import Clock, I2cBus
+from sim_hal.emulators.coil_circuit import CoilCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
-from sim_hal.worlds.coil_circuit import CoilCircuit
 from tests.manual_clock import ManualClock
 
 PCA, INA = 0x40, 0x45

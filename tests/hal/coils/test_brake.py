@@ -9,7 +9,7 @@ import pytest
 from hal.drivers.h_bridge import CoilWiring, brake
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.errors import Refused
-from sim_hal.worlds.coil_circuit import Condition
+from sim_hal.emulators.coil_circuit import Condition
 from tests.hal.coils.rig import PCA, THESIS, Rig
 
 MS = 1_000_000

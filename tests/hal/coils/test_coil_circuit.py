@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from hal.drivers.h_bridge import CoilWiring
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
-from sim_hal.worlds.chopped_supply import Bridge, Chopping, common_counts
-from sim_hal.worlds.coil_circuit import CoilCircuit
+from sim_hal.emulators.coil_circuit import Bridge, Chopping, CoilCircuit, common_counts
 from tests.hal.coils.rig import THESIS, THESIS_COILS, Rig
 
 FULL = 3.4 / 23.0

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from smbus2 import SMBus, i2c_msg
 
-from sim_hal.emulators.i2c_adapter import smbus
+from sim_hal.emulators.i2c_bus import smbus
 from tests.hal.coils.ioctl_wire import IoctlWire
 from tests.hal.coils.rig import INA, PCA
 

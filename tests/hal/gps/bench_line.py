@@ -12,8 +12,8 @@ from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection
 from sim_hal.worlds.simulation import TimedSimulation
 
 UTC = "2026-03-20T12:00:00Z"

@@ -17,10 +17,9 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.orbit_knowledge import GpsFix
 from knightcube.astro.earth.sun import DAY
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
-from sim_hal.emulators.pty_line import PtyLine
-from sim_hal.emulators.serial_line import LineFaults
+from sim_hal.emulators.serial_line import LineFaults, PtyLine
+from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body.body import UNIX_EPOCH, FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection
 from tests.hal.gps.bench_line import EXACT, bench
 from tests.hal.gps.test_codec import PVT
 

@@ -14,7 +14,7 @@ from knightcube.astro.quaternion import IDENTITY
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
-from sim_hal.worlds.motion import Motion, about_thread
+from sim_hal.worlds.world import Motion, about_thread
 
 MISSION = Vn100Settings(
     attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED),

@@ -19,7 +19,7 @@ from knightcube.astro.quaternion import about_axis_y, attitude_matrix, from_rota
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.worlds.motion import Motion, about_thread
+from sim_hal.worlds.world import Motion, about_thread
 from tests.hal.vn100.bench_line import MISSION, at_rest, bench_line, turning
 
 QUIET = Vn100EmulatorSettings(noise=PROFILES["none"])

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 
 from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from knightcube.astro.quaternion import attitude_matrix
-from sim_hal.emulators.device import NEVER
+from sim_hal.device import NEVER
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
-from sim_hal.emulators.vn100_outputs import REPORTS
 from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS
-from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.worlds.motion import about_thread
+from sim_hal.emulators.vn100_sensors import PROFILES, REPORTS
+from sim_hal.worlds.world import about_thread
 
 WATCHED = (1, 5, 6, 7, 21, 36, 38, 43, 44, 50, 51, 74, 75)
 

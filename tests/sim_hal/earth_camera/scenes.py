@@ -12,7 +12,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth
-from sim_hal.earth_camera.sun_disc import visible_share
+from sim_hal.earth_camera.radiance import visible_share
 from sim_hal.earth_camera.truth import limb_directions, sun_point
 
 View = Literal["sunlit", "terminator", "dark", "any"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_hal.earth_camera import EarthCameraModel, render
-from sim_hal.earth_camera.detector import counts, spill
+from sim_hal.earth_camera.image import counts, spill
 from tests.sim_hal.earth_camera.scenes import limb_scene
 
 LOGARITHMIC = EarthCameraModel.fuga15d(dead_pixels=0, hot_pixels=0, fixed_pattern=0.0)

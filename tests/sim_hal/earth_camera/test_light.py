@@ -10,10 +10,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import APPARENT_LIMB_HEIGHT, Atmosphere, EarthCameraModel, EarthScene, limb_truth
-from sim_hal.earth_camera.albedo import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, albedo
 from sim_hal.earth_camera.image import expected_radiance
 from sim_hal.earth_camera.model import pixel_rays
-from sim_hal.earth_camera.radiance import look
+from sim_hal.earth_camera.radiance import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, albedo, look
 from tests.sim_hal.earth_camera.scenes import limb_scene, pointing, random_scene
 
 QUIET = EarthCameraModel.fuga15d(scatter=0.0)

@@ -13,7 +13,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
 from sim_hal.earth_camera.image import expected_radiance
 from sim_hal.earth_camera.model import pixel_rays
-from sim_hal.earth_camera.sun_disc import add_disc, scatter_centre, visible_share
+from sim_hal.earth_camera.radiance import add_disc, scatter_centre, visible_share
 from tests.sim_hal.earth_camera.scenes import pointing, random_sun_scene
 
 CLEAN = EarthCameraModel.fuga15d(scatter=0.0)

@@ -10,15 +10,13 @@ from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.emulators.device import NEVER
+from sim_hal.device import NEVER
+from sim_hal.emulators.coil_circuit import Condition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.faults.bench import Bench
+from sim_hal.faults.bench import Bench, FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.kinds import FaultKind, Where
-from sim_hal.faults.schedule import put
+from sim_hal.faults.schedule import parse, put
 from sim_hal.lockstep import LockStep
-from sim_hal.worlds.coil_circuit import Condition
 from tests.scenario.flights import demo_config, demo_world
 from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
 

@@ -11,8 +11,7 @@ from hal.drivers.pca9685 import Pca9685
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.bench import Bench
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.schedule import put
+from sim_hal.faults.schedule import parse, put
 from tests.scenario.flights import demo_config, demo_world
 
 CYCLE_NS = 25_000_000

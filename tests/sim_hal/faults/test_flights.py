@@ -10,8 +10,8 @@ import pytest
 from flight.link.events import EVENTS, Reaction, Severity
 from flight.schema import reader as configuration
 from ground.telemetry.reader import Run
+from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE
-from sim_hal.faults.kinds import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_world, event_names, fly
 from tests.studies.campaigns import fault_judgement, fault_table, faults, soak

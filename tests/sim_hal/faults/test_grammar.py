@@ -10,10 +10,9 @@ from flight.app.cli import main
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from knightcube.errors import UsageError
+from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE, listing
-from sim_hal.faults.grammar import entries, parse, schedule
-from sim_hal.faults.kinds import FaultKind
-from sim_hal.faults.schedule import check, scheduled
+from sim_hal.faults.schedule import check, entries, parse, schedule, scheduled
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import CONFIG, TEXT, demo_config
 

@@ -15,9 +15,8 @@ from flight.loop.executive.jobs import JobResult, LockStepRunner, Worker
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from sim_hal.clock import SimClock
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.host import HostFaults, corrupted, corrupted_by
-from sim_hal.faults.jobs import Task, perform, without_numbers
+from sim_hal.faults.host import HostFaults, Task, corrupted, corrupted_by, perform, without_numbers
+from sim_hal.faults.schedule import parse
 from tests.scenario.flights import TEXT
 
 SECOND_NS = 1_000_000_000

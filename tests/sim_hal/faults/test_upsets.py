@@ -15,8 +15,7 @@ from sim_hal.clock import SimClock
 from sim_hal.emulators.ina219 import CALIBRATION, CONFIG
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.catalogue import CATALOGUE
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.schedule import put
+from sim_hal.faults.schedule import parse, put
 from tests.hal.coils.rig import INA, Rig
 from tests.hal.vn100.bench_line import bench_line
 from tests.scenario.flights import demo_config, demo_world

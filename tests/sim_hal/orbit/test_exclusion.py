@@ -10,7 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.worlds.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
+from sim_hal.star_camera.rso import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
 
 HALF = np.radians(10.0)
 CAMERA = np.array([[0.0, EARTH_RADIUS + 380e3, 0.0]])

@@ -17,12 +17,11 @@ from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.clock import SimClock
+from sim_hal.lockstep import posed_camera
 from sim_hal.objects import Objects
-from sim_hal.posed_camera import posed_camera
-from sim_hal.settings import LineOfSight, ObjectState, Simulation, Sky, SkyObject, Tumble
+from sim_hal.settings import FreeBodySection, LineOfSight, ObjectState, Simulation, Sky, SkyObject, Tumble
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection
-from sim_hal.worlds.surroundings import OrbitingWorld
+from sim_hal.worlds.world import OrbitingWorld
 
 UTC = "2026-03-20T12:00:00Z"
 EXPOSURE = 0.5

@@ -9,10 +9,9 @@ from flight.schema.orbit_devices import Gps, SolarString, SolarStrings, WideCame
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
-from sim_hal.settings import Simulation
+from sim_hal.settings import FreeBodySection, OrbitSection, Simulation, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff
-from sim_hal.worlds.surroundings import Surroundings
+from sim_hal.worlds.world import Surroundings
 from tests.scenario.flights import demo_config, demo_world
 
 UTC = "2026-03-20T12:00:00Z"

@@ -23,8 +23,7 @@ from knightcube.vision.camera.pixel_access import ArrayPixels
 from knightcube.vision.sun.direction import SunSettings, find_sun
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.faults.grammar import parse
-from sim_hal.faults.schedule import put
+from sim_hal.faults.schedule import parse, put
 from sim_hal.lockstep import LockStep, utc_ns
 from sim_hal.orbit_assembly import wide_model
 from sim_hal.orbit_sky import aberrated, view

@@ -11,9 +11,8 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Measured
-from sim_hal.settings import ImuNoise
-from sim_hal.worlds.free_body.section import FreeBodySection, TipOff
-from sim_hal.worlds.motion import Motion
+from sim_hal.settings import FreeBodySection, ImuNoise, TipOff
+from sim_hal.worlds.world import Motion
 from tests.scenario.flights import demo_config, demo_world
 
 BIAS = (2e-6, -1e-6, 3e-6)

@@ -30,6 +30,6 @@ def test_a_frame_that_waits_to_be_rendered_is_given_up_for_the_next() -> None:
 
 
 def test_a_server_starts_without_the_optics_that_its_renderer_needs() -> None:
-    code = "import sys, sim_hal.serving.command; sys.stdout.write(str('sim_hal.star_camera' in sys.modules))"
+    code = "import sys, sim_hal.serving.cli; sys.stdout.write(str('sim_hal.star_camera' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout == "False"

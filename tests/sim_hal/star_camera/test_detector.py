@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.star_camera import StarCameraModel, expected_electrons, render, scatter_hot_pixels
-from sim_hal.star_camera.detector import counts
+from sim_hal.star_camera.image import counts
 from tests.sim_hal.star_camera.scenes import at_pixels, still, turning
 
 DEEP = StarCameraModel(columns=96, rows=96, field_of_view=np.radians(2.0), bits=16, full_well=60_000.0)

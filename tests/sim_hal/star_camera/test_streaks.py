@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import SourceTrack, StarCameraModel, expected_electrons
-from sim_hal.star_camera.attitude_history import AttitudeHistory
+from sim_hal.star_camera.image import AttitudeHistory
 from tests.sim_hal.star_camera.scenes import POINTING, at_pixels, centroid, integrated_by_brute_force, turning
 
 MODEL = StarCameraModel(columns=200, rows=160, field_of_view=np.radians(4.0))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema.testbed import as_testbed
-from sim_hal.worlds.motion import Motion, about_thread
-from sim_hal.worlds.world import WorldInputs, WorldTruth
+from sim_hal.worlds.world import Motion, WorldInputs, WorldTruth, about_thread
 
 RATE = 0.05
 NO_FACTORY = "three"

@@ -12,11 +12,10 @@ from flight.schema import reader
 from flight.schema.errors import ConfigError
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
+from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection
 from sim_hal.worlds.basilisk.world import BasiliskWorld, make
 from sim_hal.worlds.free_body.body import CoilPower, FreeBody
-from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection
-from sim_hal.worlds.surroundings import OrbitingWorld
-from sim_hal.worlds.world import WorldInputs, make_world
+from sim_hal.worlds.world import OrbitingWorld, WorldInputs, make_world
 from tests.scenario.flights import demo_config, demo_world
 
 SECOND = 1_000_000_000

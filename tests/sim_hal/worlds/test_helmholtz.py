@@ -7,7 +7,7 @@ import pytest
 from flight.schema import reader
 from flight.schema.carried import config_path
 from flight.schema.testbed import as_testbed
-from sim_hal.worlds.helmholtz import helmholtz_field
+from sim_hal.worlds.testbed import helmholtz_field
 
 RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
 """m, A, T: "approximately 15 cm", "9.98 gauss ... at a current of 2.19 A"."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection
 
 PERIOD_NS = 25_000_000
 

@@ -20,7 +20,7 @@ from knightcube.gnc.estimation.measurements import (
     RateMeasurement,
 )
 from sim_hal.emulators.vn100_sensors import NoiseProfile, Sensors
-from sim_hal.worlds.motion import Motion
+from sim_hal.worlds.world import Motion
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS, DIPOLE, INERTIA, TESTBED_FIELD, World
 
 QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4

@@ -24,7 +24,7 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, FieldDetumblerSettings
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
-from sim_hal.worlds.free_body.section import Disturbances, TipOff
+from sim_hal.settings import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.detumble_bound import SATURATED, least_time
 from tests.studies.campaigns.free_flight import (

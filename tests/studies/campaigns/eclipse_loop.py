@@ -24,9 +24,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER, SEMI_MAJOR_AXIS
 from knightcube.astro.earth.orbit_knowledge import OrbitState
-from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.settings import FaultEntry, FreeBodySection, Simulation, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.section import FreeBodySection, TipOff
 from tests.scenario.flights import CONFIG, fly
 from tests.studies.campaigns.campaign import Result
 

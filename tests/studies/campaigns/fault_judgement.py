@@ -13,7 +13,7 @@ from flight.link.events import EVENTS, EventKind, Reaction, Severity
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
-from sim_hal.faults.kinds import FaultKind
+from sim_hal.faults.bench import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_world
 from tests.studies.campaigns.campaign import Result

@@ -21,8 +21,8 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
+from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
-from sim_hal.faults.kinds import FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_config, demo_world, fly

@@ -33,7 +33,7 @@ from knightcube.vision.horizon.settings import (
     SensedDirection,
 )
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
-from sim_hal.earth_camera.atmosphere import Atmosphere
+from sim_hal.earth_camera.scene import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction, random_scene
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 

@@ -25,7 +25,7 @@ from knightcube.gnc.control.three_axes.pointing_job import PointingJob
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
-from sim_hal.worlds.free_body.section import TipOff
+from sim_hal.settings import TipOff
 from tests.studies.campaigns.first_orbits import circular, flow
 from tests.studies.campaigns.free_flight import FreeFlight
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, PointingFlight

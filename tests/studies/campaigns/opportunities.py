@@ -22,9 +22,16 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.shadow import Shadow, sunlit_share
 from knightcube.astro.earth.sun import DAY
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.star_camera.rso import ResidentSpaceObject, directions
+from sim_hal.star_camera.rso import (
+    ResidentSpaceObject,
+    boresights,
+    directions,
+    earth_in_field,
+    hidden_by_earth,
+    in_field,
+    sun_in_field,
+)
 from sim_hal.worlds import sun
-from sim_hal.worlds.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
 
 DEVICE = "observation opportunities"

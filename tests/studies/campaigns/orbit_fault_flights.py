@@ -21,7 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.surroundings import Surroundings
+from sim_hal.worlds.world import Surroundings
 from tests.scenario.flights import CONFIG
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")

@@ -14,7 +14,7 @@ from ground.report.signals import seconds
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import BoolArray
 from knightcube.astro.quaternion import attitude_matrix
-from sim_hal.faults.kinds import FaultKind
+from sim_hal.faults.bench import FaultKind
 from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
 from tests.studies.campaigns.fault_table import OWN, own_events, part_of

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
-from sim_hal.faults.kinds import FaultKind, Where
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import fly

@@ -39,7 +39,7 @@ from knightcube.vision.sun.direction import SunSettings
 from knightcube.vision.sun.several_cameras import SunOfCameras, sun_of_cameras
 from knightcube.vision.sun.solar_cells import CoarseSun, SolarStrings, coarse_sun
 from sim_hal.earth_camera import EarthScene, render
-from sim_hal.worlds.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_strings import SolarStringsModel
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band

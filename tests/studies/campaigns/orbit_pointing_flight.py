@@ -35,7 +35,7 @@ from knightcube.gnc.estimation.free_motion import GYRO, TURN, Around
 from knightcube.gnc.estimation.free_settings import FreeFilterSettings
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from sim_hal.worlds.free_body.section import Disturbances, TipOff
+from sim_hal.settings import Disturbances, TipOff
 from tests.studies.campaigns.free_flight import (
     FIELD_NOISE,
     FIX_SIGMA,

@@ -21,9 +21,9 @@ from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.sun.solar_cells import SolarStrings, coarse_sun
+from sim_hal.emulators.solar_strings import SolarStringsModel
+from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds import sun
-from sim_hal.worlds.free_body.section import Disturbances, TipOff
-from sim_hal.worlds.solar_strings import SolarStringsModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.detumble import SAMPLES_NS, SCHEDULE, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight

@@ -28,7 +28,7 @@ from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.sun.solar_cells import SolarStrings
-from sim_hal.worlds.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_strings import SolarStringsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])

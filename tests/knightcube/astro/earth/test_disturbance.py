@@ -10,7 +10,7 @@ from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.control.three_axes.pointing_job import slew
 from knightcube.gnc.guidance.three_axes.slew_task import along
 from sim_hal.worlds.free_body.craft import CRAFTS, box
-from sim_hal.worlds.free_body.pressure import drag
+from sim_hal.worlds.free_body.loads import air_torque
 from tests.knightcube.gnc.control.three_axes.test_pointing_job import AXES, BEGIN, NADIR, WISH
 from tests.knightcube.gnc.control.three_axes.test_pointing_law import ORBIT
 
@@ -28,7 +28,7 @@ def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> N
     flight = np.array([1.0, 0.0, 0.0])
     air = Pressures(np.tile(flight, (len(VIEWS), 1)), np.zeros((len(VIEWS), 3)))
     flows = (SPEED * (VIEWS @ flight)).tolist()
-    true = np.array([drag(faces, (x, y, z), DENSITY) for x, y, z in flows])
+    true = np.array([air_torque(faces, (x, y, z), DENSITY) for x, y, z in flows])
     missed = []
     for pressed in (air.facing(box_areas(np.diag(craft.inertia)), VIEWS), air):
         shape = shapes(pressed, VIEWS)[:, :, AIR]

@@ -14,7 +14,7 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.sun.several_cameras import cameras_by_sun
 from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, SolarStrings, coarse_sun
-from sim_hal.worlds.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_strings import SolarStringsModel
 from tests.sim_hal.earth_camera.scenes import pointing, random_direction
 
 STRINGS = SolarStrings()

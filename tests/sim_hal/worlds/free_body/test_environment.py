@@ -8,11 +8,10 @@ import pytest
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from sim_hal.settings import Disturbances, OrbitSection
 from sim_hal.worlds import geomagnetism, sun
-from sim_hal.worlds.free_body.atmosphere import log_density
 from sim_hal.worlds.free_body.body import elements, julian_date
-from sim_hal.worlds.free_body.environment import RING_CURRENT, Environment, air_flow
-from sim_hal.worlds.free_body.section import Disturbances, OrbitSection
+from sim_hal.worlds.free_body.environment import RING_CURRENT, Environment, air_flow, log_density
 from sim_hal.worlds.orbit import propagate
 
 DATE = julian_date("2026-03-20T12:00:00Z")

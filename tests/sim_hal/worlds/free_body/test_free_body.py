@@ -11,11 +11,10 @@ from flight.schema import reader
 from flight.schema.errors import ConfigError
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
-from sim_hal.settings import Simulation
-from sim_hal.worlds.free_body import pressure
+from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection, Simulation, TipOff
+from sim_hal.worlds.free_body import loads
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.craft import CRAFTS, box, build
-from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds.world import World, WorldInputs, make_world
 from tests.scenario.flights import demo_config, demo_world
 
@@ -95,16 +94,17 @@ def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
     shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
     expected = np.cross(arm, -0.5 * 2.2 * 1e-12 * shadow * flow)
     x, y, z = flow.tolist()
-    np.testing.assert_allclose(pressure.drag(faces, (x, y, z), 1e-12), expected, rtol=1e-12)
+    np.testing.assert_allclose(loads.air_torque(faces, (x, y, z), 1e-12), expected, rtol=1e-12)
 
 
 def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> None:
     arm = np.array([0.0, 0.02, 0.0])
-    black = pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.zeros(6)), (1.0, 0.0, 0.0), 1.0)
+    black = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.zeros(6)), (1.0, 0.0, 0.0), 1.0)
     np.testing.assert_allclose(black, [0.0, 0.0, 0.02 * 4.56e-6 * 0.01], atol=1e-20)
-    mirror = pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 1.0)
+    mirror = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 1.0)
     np.testing.assert_allclose(mirror, 2.0 * np.array(black), atol=1e-20)
-    assert pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 0.0) == (0.0, 0.0, 0.0)
+    dark = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 0.0)
+    assert dark == (0.0, 0.0, 0.0)
 
 
 def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:

@@ -1,0 +1,235 @@
+"""The solar strings of a body in orbit: their currents, and the ADS1115 converters that measure them.
+
+The currents follow from sunlight, the Earth's reflected light, shadow, and the errors of the cells. The
+Earth's light is summed over the visible ground, which is matt, has one albedo everywhere, and is sunlit by
+the cosine law: 0.3 is the Earth's mean (Stephens et al. 2015, Rev. Geophys. 53: 0.29).
+
+The emulated ADS1115 has the registers Config and Conversion and converts at its own pace (TI SBAS444, Table
+8-3): single-ended inputs and single shots, as the driver uses them. Other settings are stored but convert
+nothing. The voltage is that at the end of the conversion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.drivers.ads1115 import StringWiring
+from hal.interfaces.errors import check_limits
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from sim_hal.worlds import sun
+from sim_hal.worlds.world import OrbitingWorld
+
+DEVICE = "solar strings"
+_RINGS, _SPOKES = 16, 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolarStringsModel:
+    """What the strings do.
+
+    Attributes:
+        normals: (n, 3) unit vectors, outward, in body axes.
+        peaks: (n,) A, at one astronomical unit, straight upon them.
+        gain_errors: (n,) relative departures from the peaks.
+        grazing: rad; light that falls in within so much of the surface is reflected: the cosine gives way.
+        noise: A, standard deviation.
+        albedo: of the Earth.
+    """
+
+    normals: FloatArray
+    peaks: FloatArray
+    gain_errors: FloatArray
+    grazing: float = math.radians(5.0)
+    noise: float = 2e-3
+    albedo: float = 0.3
+
+    def __post_init__(self) -> None:
+        count = len(self.normals)
+        if np.shape(self.normals) != (count, 3) or np.shape(self.peaks) != (count,):
+            raise ValueError(f"{DEVICE}: give normals (n, 3) and peaks (n,)")
+        if np.shape(self.gain_errors) != (count,):
+            raise ValueError(f"{DEVICE}: give one gain error a string")
+        limits = {"grazing": (0.0, 0.5, "rad"), "noise": (0.0, 10.0, "A"), "albedo": (0.0, 1.0, "")}
+        check_limits(DEVICE, self, limits)
+
+    def currents(
+        self, position: FloatArray, sun: FloatArray, body: FloatArray, generator: np.random.Generator
+    ) -> FloatArray:
+        """Return the currents (n,) A at `position` (3,) m, the Sun at `sun` (3,) m, geocentric, ICRS.
+
+        `body` (3, 3) is the attitude matrix, ICRS into body axes.
+        """
+        to_sun = sun - position
+        distance = float(np.linalg.norm(to_sun))
+        share = float(sunlit_share(position, sun)) * (ASTRONOMICAL_UNIT / distance) ** 2
+        normals = self.normals @ body
+        light = share * self._accepted(normals @ to_sun / distance)
+        light = light + self._earthlight(normals, position, sun)
+        noise = self.noise * generator.standard_normal(len(self.peaks))
+        # A string's diode lets no current back.
+        return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
+
+    def _accepted(self, cosines: FloatArray) -> FloatArray:
+        """Return what of light at `cosines` (...) of incidence becomes current, 0 .. 1."""
+        grazing = math.sin(self.grazing)
+        dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
+        return np.asarray(np.maximum(dimmed, 0.0))
+
+    def _earthlight(self, normals: FloatArray, position: FloatArray, sun: FloatArray) -> FloatArray:
+        """Return the Earth's light on strings of `normals` (n, 3), ICRS, over the Sun's."""
+        rays, ground, solid = _ground_in_view(position)
+        lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
+        return np.asarray(self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit))
+
+
+def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return unit vectors (m, 3) from `position` (3,) m to the ground, its verticals (m, 3), and sr for each.
+
+    Rings of equal solid angle as the satellite sees them, so that the near ground has its weight.
+    """
+    distance = float(np.linalg.norm(position))
+    down = -position / distance
+    widest = math.sqrt(1.0 - (EARTH_RADIUS / distance) ** 2)
+    cosine = 1.0 - (np.arange(_RINGS) + 0.5) / _RINGS * (1.0 - widest)
+    sine = np.sqrt(1.0 - cosine**2)
+    angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(down)
+    rays = cosine[:, None, None] * down + sine[:, None, None] * spokes
+    length = distance * cosine - np.sqrt(EARTH_RADIUS**2 - (distance * sine) ** 2)
+    ground = (position + length[:, None, None] * rays) / EARTH_RADIUS
+    return rays.reshape(-1, 3), ground.reshape(-1, 3), 2.0 * np.pi * (1.0 - widest) / (_RINGS * _SPOKES)
+
+
+CONVERSION, CONFIG = 0x00, 0x01
+_GENERAL_CALL, _RESET = 0x00, b"\x06"
+POWER_ON_CONFIG = 0x8583
+_START = 0x8000
+_SINGLE_SHOT = 0x0100
+_FULL_SCALE = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)
+_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
+
+
+class EmulatedAds1115:
+    """One converter; `measure(channel)` returns the voltage at an input now.
+
+    Attributes:
+        address: on the bus.
+    """
+
+    def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
+        self.address = address
+        self._now_ns = now_ns
+        self._measure = measure
+        self.brown_out()
+
+    def brown_out(self) -> None:
+        """Return to the power-on state."""
+        self._pointer = CONVERSION
+        self._config = POWER_ON_CONFIG & ~_START
+        self._conversion = 0
+        self._ready_ns = self._now_ns()
+        self._converting = False
+
+    def answers(self, address: int) -> bool:
+        """Return whether the part acknowledges this address: its own and the general call."""
+        return address in {_GENERAL_CALL, self.address}
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take the register pointer, and a word for Config; thresholds are not modelled.
+
+        The reset by general call is the power-on state (9.5.1.2).
+        """
+        if address == _GENERAL_CALL:
+            if data == _RESET:
+                self.brown_out()
+            return
+        self._complete()
+        self._pointer = data[0] & 0b11
+        if len(data) >= 3 and self._pointer == CONFIG:
+            word = data[1] << 8 | data[2]
+            self._config = word & ~_START
+            if word & _START and word & _SINGLE_SHOT:
+                self._converting = True
+                self._ready_ns = self._now_ns() + 1_000_000_000 // _RATES[word >> 5 & 0b111]
+
+    def read(self, count: int) -> bytes:
+        """Return bytes of the register that the pointer names, over again beyond its two."""
+        self._complete()
+        word = self._conversion if self._pointer == CONVERSION else self._config
+        if self._pointer == CONFIG and not self._converting:
+            word |= _START
+        return (word.to_bytes(2, "big") * (count // 2 + 1))[:count]
+
+    def _complete(self) -> None:
+        """End a conversion whose time is over."""
+        if not self._converting or self._now_ns() < self._ready_ns:
+            return
+        self._converting = False
+        mux = self._config >> 12 & 0b111
+        volts = self._measure(mux & 0b11) if mux & 0b100 else 0.0
+        counts = round(volts / _FULL_SCALE[self._config >> 9 & 0b111] * 32_768)
+        self._conversion = min(0x7FFF, max(-0x8000, counts)) & 0xFFFF
+
+
+_UNIX_EPOCH = 2_440_587.5
+_FRESH_NS = 20_000_000
+
+
+class EmulatedStrings:
+    """The strings and the converters that measure them.
+
+    Attributes:
+        parts: the converters.
+        dead: strings (n,) that give no current. frozen: whether all stay as they are now.
+        gain: of all amplifiers over the sound one.
+    """
+
+    def __init__(
+        self,
+        world: OrbitingWorld,
+        model: SolarStringsModel,
+        wirings: Sequence[StringWiring],
+        now_ns: Callable[[], int],
+        generator: np.random.Generator,
+    ) -> None:
+        self.dead = np.zeros(len(wirings), dtype=bool)
+        self.frozen = False
+        self.gain = 1.0
+        self._world, self._model, self._now_ns, self._generator = world, model, now_ns, generator
+        self._strings = {(w.address, w.channel): (i, w.volt_per_ampere) for i, w in enumerate(wirings)}
+        self._currents: FloatArray = np.zeros(len(wirings))
+        self._measured_ns = -_FRESH_NS
+        self.parts = tuple(
+            EmulatedAds1115(address, now_ns, self._input(address))
+            for address in sorted({wiring.address for wiring in wirings})
+        )
+
+    def _input(self, address: int) -> Callable[[int], float]:
+        def volts(channel: int) -> float:
+            index, volt_per_ampere = self._strings.get((address, channel), (None, 0.0))
+            return 0.0 if index is None else volt_per_ampere * float(self._now()[index])
+
+        return volts
+
+    def _now(self) -> FloatArray:
+        """Return the currents (n,) A as the amplifiers give them; within 20 ms they are measured once."""
+        now_ns = self._now_ns()
+        if not self.frozen and now_ns - self._measured_ns >= _FRESH_NS:
+            self._measured_ns = now_ns
+            self._currents = self._light(now_ns)
+        return np.where(self.dead, 0.0, self.gain * self._currents)
+
+    def _light(self, now_ns: int) -> FloatArray:
+        body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
+        around = self._world.surroundings()
+        date = _UNIX_EPOCH + self._world.utc_ns() * 1e-9 / 86_400.0
+        return self._model.currents(np.array(around.position), sun.position(date), body, self._generator)
