@@ -67,7 +67,7 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
 def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
     """Return attitudes (k, 4) in which the stars about the boresight are shifted to `velocity` (3,) m/s."""
     boresights = quaternion.attitude_matrix(attitudes)[:, 2, :]
-    # Stars move towards the velocity, so the camera sees them as if it were turned the other way.
+    # Aberration moves stars towards the velocity: the equivalent rotation of the camera is the opposite one.
     turn = np.cross(boresights, velocity / SPEED_OF_LIGHT)
     in_camera = np.einsum("kij,kj->ki", quaternion.attitude_matrix(attitudes), turn)
     return quaternion.multiply(quaternion.from_rotation_vector(-in_camera), attitudes)

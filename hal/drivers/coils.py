@@ -122,7 +122,7 @@ class CoilOutputs:
 
     Attributes:
         written: signed counts of the coils that the chip acknowledged last.
-        braked: the bridges that are braked, likewise.
+        braked: the bridges that are braked.
         written_ns: host time since when those are on the wire, -1 before the first.
         failing: the last exchange failed; the chip's state is not known.
         faults: failed transactions since start.

@@ -1,13 +1,14 @@
-"""What a wide-angle camera sees of Earth and Sun from a low orbit, and what it makes of it.
+"""The image model of a wide-angle camera that views Earth and Sun from a low orbit.
 
     model = EarthCameraModel.fuga15d(seed=1)
     scene = EarthScene(position, attitude, sun.position(julian_date))
     frame = render(model, scene, generator)
-    truth = limb_truth(scene, model)          # where the limb is, and how the Sun stands there
+    truth = limb_truth(scene, model)          # the true limb, and the Sun's elevation there
 
-`scene` says where everything is, `atmosphere` and `albedo` what shines, `radiance` what a line of sight
-meets, `sun_disc` the Sun and its glare, `optics` the blur, `detector` the counts, `truth` what to find.
-Radiance is in units of that of a white matt surface with the Sun overhead, so the Sun's own disc is 46,000.
+`model` holds the camera's parameters, `scene` the positions of camera, Earth and Sun, and the atmosphere.
+`radiance` gives the radiance along lines of sight, the Sun's disc and its glare; `image` adds optics and
+detector. `truth` gives the true nadir, Sun direction and limb. Radiance is in units of that of a white matt
+surface with the Sun at the zenith; the radiance of the Sun's disc is 46,000.
 """
 
 from sim_hal.earth_camera.image import expected_radiance, render
@@ -16,7 +17,7 @@ from sim_hal.earth_camera.scene import Atmosphere, EarthScene
 from sim_hal.earth_camera.truth import LimbTruth, limb_truth, nadir, sun_direction, sun_point
 
 APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height
-"""m above the ellipsoid where a sunlit limb has half its brightness, in the default atmosphere: 18.4 km."""
+"""Height (m) above the ellipsoid at which a sunlit limb has half its brightness (default atmosphere)."""
 
 __all__ = [
     "APPARENT_LIMB_HEIGHT",

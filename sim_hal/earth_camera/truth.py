@@ -1,4 +1,4 @@
-"""What sensors that look at a scene should find: nadir, the Sun, and the limb's curve."""
+"""The true nadir, Sun direction and limb of a scene, to compare the results of detectors with."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sun_direction(scene: EarthScene) -> FloatArray:
 
 
 def sun_point(scene: EarthScene, model: EarthCameraModel) -> FloatArray:
-    """Return the pixel (2,) of the Sun's centre, maybe off the detector; NaN where the lens sees nothing."""
+    """Return the pixel (2,) of the Sun's centre. It may be off the detector; NaN beyond the lens's field."""
     return np.asarray(model.lens.project(sun_direction(scene)[None, :])[0])
 
 

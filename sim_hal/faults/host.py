@@ -95,7 +95,7 @@ class HostFaults:
         return any(fault.kind.device in devices for fault in self._faults)
 
     def clock(self) -> Clock:
-        """Return the clock as the flight process sees it."""
+        """Return the clock of the flight process, with its faults."""
         return _SteppedClock(self._clock, self) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:

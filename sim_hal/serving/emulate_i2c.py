@@ -244,7 +244,7 @@ def _coils(config_file: Path, number: int) -> CoilHardware:
     config = configuration.load(config_file)
     text = config_file.read_text(encoding="utf-8")
     section = configuration.simulation_section(text, str(config_file), Simulation)
-    if section is None:  # a board's configuration: its coils are as it believes
+    if section is None:  # a board's configuration: its coils have the configured values
         section = Simulation(release=Release(q2=0.0))
     return assemble_coils(config, section, np.random.default_rng(number), SystemClock().now_ns)
 

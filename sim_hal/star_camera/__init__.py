@@ -4,10 +4,10 @@
     stars = catalogue.load()
     frame = render(model, stars.directions_at(2030.5), stars.magnitude, times, quaternions, rng)
 
-`times` and `quaternions` are the camera's attitude over the exposure, sampled as finely as it was simulated.
-`model` holds the camera's numbers, `attitude_history` interpolates the attitude, `point_spread` says how a
-point's light falls on the pixels, `exposure` gathers it along each source's path, `rolling_shutter` does so
-when each row has its own time (`line_time`), `detector` makes counts.
+`times` and `quaternions` are the camera's attitude over the exposure, sampled at the steps of the simulation.
+`model` holds the camera's parameters. `exposure` integrates the light of each source along its path, with a
+global or a rolling shutter (`line_time`). `image` interpolates the attitude and makes the counts. `rso` gives
+the tracks of resident space objects.
 """
 
 from sim_hal.star_camera.image import SourceTrack, expected_electrons, render

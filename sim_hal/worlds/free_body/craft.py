@@ -1,7 +1,7 @@
 """The true craft: mass properties, faces, coils and residual dipole, with the errors that a seed draws.
 
-The flight software believes round numbers; the truth differs from them as a built satellite differs from its
-drawing. Everything inside is in principal axes or in body axes, as each name says.
+The flight software assumes nominal values; the true values differ from them as a built satellite differs from
+its drawing. Quantities are in principal axes or in body axes, as their names state.
 """
 
 from __future__ import annotations
