@@ -96,9 +96,9 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
             exposed = rate[i - round(recipe.rate_hz) : i + 1]
             logs["flight"].write(_streak(packer, stamp, i // frame, exposed))
             logs["flight"].write(_stars(packer, stamp, i // frame, q2[i]))
-        logs["flight"].write(_control(packer, stamp, i, q2[i], rate[i], current[i]))
         if recipe.bus_power is not None and i % round(recipe.rate_hz) == 0:
             logs["flight"].write(_housekeeping(packer, stamp, recipe.bus_power))
+        logs["flight"].write(_control(packer, stamp, i, q2[i], rate[i], current[i]))
         if recipe.truth:
             logs["truth"].write(_truth(packer, stamp, q2[i], rate[i], current[i], spent[i]))
         if recipe.performance:
