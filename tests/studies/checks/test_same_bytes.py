@@ -265,7 +265,7 @@ def test_a_missing_key_of_an_answer_is_found_and_an_added_one_counted(tmp_path: 
     old, new = {"roll_deg": 1.0, "status": "solved"}, {"roll_deg": 1.0, "stars": 3}
     found = compare("x", *answer_folders(tmp_path, old, new), Texts())
     assert found.difference is not None
-    assert found.difference.field == "status"
+    assert (found.difference.field, found.difference.new) == ("status", "missing")
     assert found.added == {"key stars": 1}
 
 

@@ -41,7 +41,7 @@ UNCOMPARED = frozenset(
 )
 _APID_BITS = 0x7FF
 Table = Mapping[int, Layout]
-_NONE = object()  # no such value
+_NONE = type("NoSuchValue", (), {"__repr__": lambda _: "missing"})()
 _SHORT = 100  # characters of a value that are shown
 
 
