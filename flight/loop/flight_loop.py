@@ -1,6 +1,4 @@
-"""The rate groups of the loop, in order of importance.
-
-One flight from its release to its end: starts the tasks, runs the executive, switches the coils off.
+"""One flight from its release to its end: starts the tasks, runs the rate groups, switches the coils off.
 
 `flight.app` opens and closes the devices and composes the tasks.
 """

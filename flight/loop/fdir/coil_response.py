@@ -13,9 +13,8 @@ inertia makes, and estimates the error that remains by nuisance parameters
 Earth's, the field measured in their last pause is rotated with the body.
 
 The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
-supply current did distinguishes a broken coil from a wrong monitor (`observed_share`).
-
-Checks a verdict on a coil against the motion; if the motion contradicts it, the monitor is wrong.
+supply current did distinguishes a broken coil from a wrong monitor (`observed_share`). `MotionWitness` checks
+verdicts that rest on the supply current in this way.
 """
 
 from __future__ import annotations

@@ -1,16 +1,10 @@
-"""The settings of the coil watch, and its verdicts.
+"""The coil monitor: detects broken coils from commands, supply current and motion, and identifies the fault.
 
-Tracks whether the coil currents are known.
-
-They are not while the PWM driver fails, the loop has stalled, or the supply current speaks against them.
-
-A small current wave on one axis at a time, to distinguish coil faults that readings alone cannot.
-
-Detects broken coils and identifies the fault, from commands, supply current and the body's motion.
-
-All calls are cheap, none waits. Each cycle the loop reports the commands (`commanded`, `interrupted`), the
-samples of the inertial unit (`observe_motion`) and the newest reading of the monitor (`measured`), and then
-reads `verdicts`, `available`, `braked`, `at_rest`, `probe`, `suspicion` and `monitor_doubted`.
+Each cycle the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
+(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilWatch`, and then reads
+`verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and `monitor_doubted`. No call
+waits. `CoilKnowledge` states whether the coil currents are known: they are unknown while the PWM driver
+fails, after the loop has stalled, and while the supply current contradicts the commands.
 
 The monitor measures the sum of |I| of three bridges, so it cannot detect a reversed coil, and detects an open
 one only while that axis is commanded: axes that are not driven are not judged. Every reading is compared with
@@ -253,9 +247,8 @@ class CoilWatch:
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._weak = ""  # which coil's torque is missing in the motion
         self._verdicts: dict[int, CoilVerdict] = {}
-        self._rests: dict[
-            int, tuple[int, str]
-        ] = {}  # by resting axis: time since which it rests, and the reason
+        # By resting axis: time at which its rest began, and the reason.
+        self._rests: dict[int, tuple[int, str]] = {}
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
         self._proof = BrakeProof()

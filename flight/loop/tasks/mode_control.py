@@ -1,10 +1,8 @@
-"""A timer for how long a condition has held without interruption.
+"""Mode control: turns reactions, commands and achievements into triggers, and enters modes.
 
-Watches the attitude and the spin of a body that must acquire its attitude.
-
-Monitors the rate and the pointing error of a steered body.
-
-Mode control: turns reactions, commands and achievements into triggers, and enters modes.
+`AttitudeWatch` observes the attitude and the spin of a body that must acquire its attitude, `PointingWatch`
+the rate and the pointing error of a steered body. `HoldTimer` measures how long a condition has held without
+interruption.
 
 Entering a mode never waits for an estimate: a hold takes its attitude from the first cycle with an estimate.
 """
