@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.schema.reader import load
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 ROOT = CONFIG.parents[1]
 DEPLOY = ROOT / "deploy"

@@ -15,7 +15,7 @@ import pytest
 
 from sim_hal.faults.host import corrupted
 from tests.deploy.scripts import DEPLOY, ROOT, TESTBED, changed_testbed
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 pytestmark = pytest.mark.skipif(
     shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"

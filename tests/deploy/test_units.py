@@ -24,7 +24,7 @@ from tests.deploy.scripts import (
     link_dropin,
     safe_dropin,
 )
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
 LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"

@@ -14,9 +14,9 @@ import pytest
 
 from ground.xtce import SPACE
 from ground.yamcs import INSTANCE, USER, files, main, write
-from tests.studies.interop.linked_flight import free_port
 from tests.studies.interop.yamcs import PLANS, fly
-from tests.studies.interop.yamcs_server import basic, missing, serving
+from tests.support.linked_flight import free_port
+from tests.support.yamcs_server import basic, missing, serving
 
 
 def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

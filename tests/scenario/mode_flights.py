@@ -14,7 +14,7 @@ from flight.schema.testbed import TestbedConfig
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Release, Simulation
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 CYCLE = 0.025
 BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}

@@ -15,7 +15,7 @@ from hal.interfaces.wires import Rig
 from sim_hal import lockstep
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.lockstep import LockStep
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 DEVICES = ("imu", "pwm")
 EVENTS = {"imu": "imu-silent", "pwm": "coil-fault"}

@@ -14,7 +14,7 @@ from flight.schema.sections import Config
 from ground.report.signals import true_attitude
 from ground.telemetry.reader import Run
 from sim_hal.settings import Simulation
-from tests.scenario.flights import event_names, fly
+from tests.support.flights import event_names, fly
 
 TEXT = config_path("cage").read_text(encoding="utf-8")
 

@@ -16,8 +16,8 @@ from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.scenario.mode_flights import modes_of
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 AT = 4.0
 SECOND = 1_000_000_000

@@ -14,8 +14,8 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run
 from ground.telemetry.scanner import decode
-from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.mode_flights import commanded, modes_of
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 
 class Script:

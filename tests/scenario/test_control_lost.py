@@ -21,8 +21,8 @@ from ground.telemetry.reader import Run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
-from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
 from tests.scenario.mode_flights import commanded, currents, released
+from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 SILENT_AT = 3.0
 WITHIN = 0.1

@@ -1,4 +1,4 @@
-"""Any way a flight ends leaves the coils at zero: `tests.scenario.flights.fly` looks at each end."""
+"""Any way a flight ends leaves the coils at zero: `tests.support.flights.fly` looks at each end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ground.telemetry.reader import read_run
-from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 
 def test_the_configured_end(tmp_path: Path) -> None:

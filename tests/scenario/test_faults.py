@@ -13,7 +13,7 @@ from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 BEGIN, END, DURATION = 6.0, 9.0, 20.0
 WITHIN = 0.1

@@ -17,7 +17,6 @@ from flight.schema.testbed import Step
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.mode_flights import (
     BRIEF,
     CYCLE,
@@ -29,6 +28,7 @@ from tests.scenario.mode_flights import (
     released,
     true_angle,
 )
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 
 def test_the_demonstration_is_what_flies_by_default_after_one_cycle_of_boot(tmp_path: Path) -> None:

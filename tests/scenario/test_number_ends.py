@@ -17,9 +17,9 @@ from flight.loop.fdir.facts import FACTS
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry.reader import Run
-from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.test_objects import flight_with_objects, two_objects
 from tests.scenario.test_orbit import orbit_config, world
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 NEAR = (1 << 32) - 30
 """A count that passes 32 bits within a second of control cycles."""

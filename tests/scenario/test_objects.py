@@ -20,7 +20,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from sim_hal.settings import LineOfSight, SkyObject
-from tests.scenario.flights import demo_config, demo_world, event_names, fly
+from tests.support.flights import demo_config, demo_world, event_names, fly
 
 _DURATION = 9.5
 _HELD = np.array([0.0, 0.2, 0.0, np.sqrt(0.96)])

@@ -19,8 +19,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from sim_hal.faults.schedule import check
 from sim_hal.settings import FaultEntry, Simulation
-from tests.scenario.flights import CONFIG, event_names, fly
 from tests.scenario.mode_flights import currents, entered, modes_of
+from tests.support.flights import CONFIG, event_names, fly
 
 ORBIT = CONFIG.parent / "orbit.yaml"
 TEXT = ORBIT.read_text(encoding="utf-8")

@@ -15,8 +15,8 @@ from ground.telemetry.reader import Run
 from knightcube.astro import quaternion
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
-from tests.scenario.flights import event_names, fly
 from tests.scenario.test_orbit import orbit_config, world
+from tests.support.flights import event_names, fly
 
 NEAR_REST = 0.00524
 """rad/s, 0.3 deg/s: slower than where braking ends."""

@@ -12,9 +12,9 @@ from flight.schema.orbit import TargetStep
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry.reader import Run
 from knightcube.astro.quaternion import angle_between
-from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import modes_of
 from tests.scenario.test_orbit_navigation import navigating, skyward
+from tests.support.flights import event_names, fly
 
 DURATION, SUNWARD = 60.0, 45.0
 """s: the flight, and when the mode SUN is commanded."""

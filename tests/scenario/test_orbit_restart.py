@@ -11,8 +11,8 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.telemetry.reader import Run
 from sim_hal.settings import Simulation
-from tests.scenario.flights import Rigged, event_names, fly
 from tests.scenario.test_orbit_navigation import GYRO_BIAS, navigating, skyward
+from tests.support.flights import Rigged, event_names, fly
 
 KILLED, AGAIN = 40.0, 16.0
 """s of the first flight after which it is killed, and of the second."""

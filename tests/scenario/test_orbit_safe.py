@@ -9,9 +9,9 @@ from flight.link.modes import Mode
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry.reader import Run
-from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import currents, entered, modes_of
 from tests.scenario.test_orbit import orbit_config, speed, world
+from tests.support.flights import event_names, fly
 
 SPEED, SLOW = 0.05, 0.042
 DURATION = 45.0

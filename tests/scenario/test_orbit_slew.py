@@ -15,9 +15,9 @@ from ground.telemetry.reader import Run
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
 from knightcube.gnc.control.three_axes import pointing_law
 from sim_hal.settings import FaultEntry, Simulation
-from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import modes_of
 from tests.scenario.test_orbit_navigation import navigating, skyward
+from tests.support.flights import event_names, fly
 
 BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([10.0, 20.0, -10.0])
 """s; s and rad of the slew."""

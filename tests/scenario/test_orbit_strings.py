@@ -9,8 +9,8 @@ from flight.schema import reader as configuration
 from ground.report.knowledge import COARSE, attitude_errors
 from ground.telemetry.reader import Run
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import fly
 from tests.scenario.test_orbit import orbit_config, world
+from tests.support.flights import fly
 
 DEAD = 6.0
 """When a string gives no more current, s."""

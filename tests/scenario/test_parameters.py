@@ -11,9 +11,9 @@ from flight.link.commands.codec import CommandPacker, DumpParameters, LoadParame
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from ground.telemetry.scanner import decode
-from tests.scenario.flights import event_names
 from tests.scenario.mode_flights import commanded
 from tests.scenario.test_commands import said
+from tests.support.flights import event_names
 
 SPINS = "tumbling"
 

@@ -20,7 +20,7 @@ from knightcube.gnc.guidance.one_axis.job import PlanJob
 from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
-from tests.scenario.flights import demo_config, event_names, fly, thesis_config
+from tests.support.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 24.0
 GOOD_PLANS = 2

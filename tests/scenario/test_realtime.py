@@ -14,7 +14,7 @@ import pytest
 
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run, read_run
-from tests.scenario.flights import CONFIG, event_names
+from tests.support.flights import CONFIG, event_names
 
 ROOT = CONFIG.parents[1]
 # One frame is asked for after 5 s: on a busy machine its worker needs some more.

@@ -11,8 +11,8 @@ from flight.schema.camera_model import camera_model
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from tests.scenario.flights import fly
 from tests.studies.bench import slew_frames
+from tests.support.flights import fly
 
 DURATION, BEGIN = 85.0, 6.0
 """s: the flight ends while the body still turns faster from frame to frame."""

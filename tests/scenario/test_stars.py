@@ -12,7 +12,7 @@ from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.support.flights import Rigged, demo_config, event_names, fly
 
 _LOST, _TRACKED = 0, 1
 # Of three degrees of freedom, passed by chance once in 1e5; twice the sigma left to streaks of 300 px.

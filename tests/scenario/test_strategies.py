@@ -13,7 +13,7 @@ from flight.schema.testbed import Step, TestbedConfig
 from ground.telemetry.reader import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.one_axis.plant import angle_of
-from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
+from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 
 def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> TestbedConfig:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ground.telemetry.reader import Run
-from tests.scenario.flights import fly
+from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_other_body, without_cameras
 
 TWO_PERCENT_OFF = (0.0066, 0.0340, 0.0326)

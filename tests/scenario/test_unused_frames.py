@@ -6,7 +6,7 @@ from pathlib import Path
 
 from flight.schema import reader as configuration
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import demo_config, demo_world, event_names, fly
+from tests.support.flights import demo_config, demo_world, event_names, fly
 
 
 def test_frames_upside_down_are_reported_as_unused(tmp_path: Path) -> None:

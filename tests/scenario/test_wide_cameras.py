@@ -9,8 +9,8 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from ground.report.knowledge import COARSE, attitude_errors
 from ground.telemetry.reader import Run
-from tests.scenario.flights import CONFIG, event_names, fly
 from tests.scenario.test_orbit import orbit_config, world
+from tests.support.flights import CONFIG, event_names, fly
 
 DURATION, SETTLED = 30.0, 15.0
 """s."""

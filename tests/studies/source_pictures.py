@@ -26,7 +26,7 @@ from knightcube.vision.streaks.corners.streak_rate import estimate_rate
 from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
-from tests.studies.campaigns.scenes import FIELD, YEAR, slew
+from tests.support.scenes import FIELD, YEAR, slew
 
 STREAK_SEED, CENTRE_SEED, OBJECT_SEED = 1, 1, 1
 TURN = 1.0

@@ -16,7 +16,7 @@ from ground.telemetry.reader import Run
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.settings import CraftSection, FaultEntry, Simulation
 from sim_hal.worlds.free_body.craft import CRAFTS
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 
 def configured(name: str) -> tuple[OrbitConfig, Simulation]:

@@ -28,7 +28,7 @@ from ground.telemetry.reader import read_run
 from sim_hal.faults.host import corrupted
 from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 TESTBED = CONFIG.parent / "testbed.yaml"
 TEXT = TESTBED.read_text(encoding="utf-8")

@@ -16,7 +16,7 @@ from flight.schema.testbed import as_testbed
 from ground.telemetry.reader import Run
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from tests.scenario.flights import CONFIG, demo_config, fly
+from tests.support.flights import CONFIG, demo_config, fly
 
 DIPOLE_PER_AMPERE = 80 * 0.0081
 

@@ -12,7 +12,7 @@ from knightcube.vision.startracker.identification.lost_in_space import identify
 from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.index.sky_index import load
 from tests.ground.commands.in_process import command
-from tests.studies.bench.star_lists import ListKind, draw
+from tests.support.star_lists import ListKind, draw
 
 
 def test_the_index_of_a_camera_serves_its_field_and_is_smaller(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from flight.loop.fdir.facts import EventLog, Facts, Streams
 from flight.loop.services import Services
 from flight.loop.tasks.commanding import ParameterTable, ParameterUsers
 from flight.schema.sections import Health, Modes
-from tests.scenario.flights import demo_config
+from tests.support.flights import demo_config
 
 
 class Sink:

@@ -12,7 +12,7 @@ pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from sim_hal.star_camera import StarCameraModel  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
-from tests.studies.campaigns.scenes import Scene, slew  # noqa: E402
+from tests.support.scenes import Scene, slew  # noqa: E402
 
 CAMERA = StarCameraModel(columns=640, rows=640, field_of_view=float(np.deg2rad(12.5)))
 FOV = "12.5"

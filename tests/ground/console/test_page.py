@@ -17,7 +17,7 @@ from flight.link.telemetry.definitions import EVENT, FACTS, HEALTH
 from flight.link.telemetry.packets import Packer
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.studies.console.browser import Page, another_origin, browsing, missing, opened
+from tests.support.browser import Page, another_origin, browsing, missing, opened
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=missing() or "-")]
 

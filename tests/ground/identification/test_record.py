@@ -18,7 +18,7 @@ from ground.telemetry.reader import Run
 from ground.telemetry.scanner import ScanResult
 from knightcube.errors import UsageError
 from tests.ground.identification.worlds import World, believed, fly_stack, motion_error
-from tests.scenario import flights
+from tests.support import flights
 
 WORLD = World(inertia=1.15e-3, dipole=0.62, field=4.2e-4, stiffness=1.6e-5, damping=3.0e-6, bias=1e-4, seed=9)
 

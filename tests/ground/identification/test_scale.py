@@ -18,7 +18,7 @@ from ground.identification.record import FieldMeasurement
 from ground.identification.scale import AbsolutePlant, Belief, Beliefs, absolute
 from tests.ground.identification.conftest import Identified
 from tests.ground.identification.worlds import believed, drawn, scale_error
-from tests.scenario import flights
+from tests.support import flights
 
 BELIEFS = beliefs_of(believed())
 

@@ -20,7 +20,7 @@ from knightcube.gnc.control.one_axis.excitation import ExcitationController, Exc
 from knightcube.gnc.guidance.one_axis.path import PathSample
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.worlds.testbed import Testbed, TestbedModel
-from tests.scenario import flights
+from tests.support import flights
 
 PERIOD = 0.025
 ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3

@@ -29,7 +29,7 @@ from ground.link.terminal import Terminal
 from ground.link.token_file import token_file, token_path
 from knightcube.errors import FlightError
 from tests.flight.link.telemetry.samples import plain_contents
-from tests.studies.console import browser
+from tests.support import browser
 
 ROOT = Path(__file__).resolve().parents[3]
 SAFE = CommandPacker().pack(ChangeMode(Mode.SAFE, "end of pass"), 1)

@@ -18,7 +18,7 @@ from ground.report import draw, summarise
 from ground.telemetry.reader import read_run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from tests.manual_clock import ManualClock
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 NAN3 = (math.nan,) * 3
 PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000

@@ -10,7 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import Lens
 from knightcube.vision.startracker.sky_map import SkyMap
-from tests.studies.campaigns.scenes import catalogue
+from tests.support.scenes import catalogue
 
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
 wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")

@@ -26,7 +26,7 @@ from ground.watch.view import View
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import ROOT
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.studies.fuzz.furnishings import Listener, answer
+from tests.support.furnishings import Listener, answer
 
 
 def pack(packer: Packer, packet: Packet, time_s: float, **values: object) -> bytes:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from flight.link.telemetry.archive import find_segments
 from ground.telemetry.reader import Run, read_run
 from ground.telemetry.scanner import scan
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 ROOT = CONFIG.parents[1]
 HANG_S = 1.0

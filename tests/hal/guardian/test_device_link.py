@@ -22,7 +22,7 @@ from hal.buses.i2c_bus import lock_bus
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 ROOT = CONFIG.parents[1]
 _VALUES = st.recursive(st.integers() | st.text() | st.booleans(), lambda value: st.lists(value, max_size=4))

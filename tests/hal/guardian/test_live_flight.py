@@ -7,7 +7,7 @@ import pytest
 
 from tests.hal.guardian.campaign import UNGUARDED, Campaign, Hurt, hurt_in_every_way
 from tests.hal.guardian.live_flight import DRIVEN_A
-from tests.scenario.flights import event_names
+from tests.support.flights import event_names
 
 pytestmark = pytest.mark.slow
 

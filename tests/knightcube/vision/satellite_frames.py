@@ -14,7 +14,7 @@ from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
-from tests.studies.campaigns.scenes import catalogue
+from tests.support.scenes import catalogue
 
 CAMERA = StarCameraModel(columns=512, rows=512)
 EXPOSURE = 0.2

@@ -25,7 +25,7 @@ from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.settings import FaultEntry
 from sim_hal.worlds.testbed import Testbed
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 CYCLE_NS = 25_000_000
 

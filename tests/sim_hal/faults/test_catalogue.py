@@ -17,8 +17,8 @@ from sim_hal.faults.bench import Bench, FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import parse, put
 from sim_hal.lockstep import LockStep
-from tests.scenario.flights import demo_config, demo_world
 from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
+from tests.support.flights import demo_config, demo_world
 
 OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
 SECOND_NS = 1_000_000_000

@@ -12,7 +12,7 @@ from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import parse, put
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 CYCLE_NS = 25_000_000
 WANTED = np.array([0.06, 0.0, -0.03])

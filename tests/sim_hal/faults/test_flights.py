@@ -13,9 +13,9 @@ from ground.telemetry.reader import Run
 from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import demo_world, event_names, fly
 from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
 from tests.studies.campaigns.campaign import Case
+from tests.support.flights import demo_world, event_names, fly
 
 AT = 5.0
 BRIEF = 14.0

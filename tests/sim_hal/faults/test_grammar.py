@@ -14,7 +14,7 @@ from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE, listing
 from sim_hal.faults.schedule import check, entries, parse, schedule, scheduled
 from sim_hal.settings import FaultEntry, Simulation
-from tests.scenario.flights import CONFIG, TEXT, demo_config
+from tests.support.flights import CONFIG, TEXT, demo_config
 
 DEVICES = {
     "imu",

@@ -17,7 +17,7 @@ from flight.schema.errors import ConfigError
 from sim_hal.clock import SimClock
 from sim_hal.faults.host import HostFaults, Task, corrupted, corrupted_by, perform, without_numbers
 from sim_hal.faults.schedule import parse
-from tests.scenario.flights import TEXT
+from tests.support.flights import TEXT
 
 SECOND_NS = 1_000_000_000
 

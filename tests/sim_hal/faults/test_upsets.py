@@ -18,8 +18,8 @@ from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import parse, put
 from tests.hal.coils.rig import INA, Rig
 from tests.hal.vn100.bench_line import bench_line
-from tests.scenario.flights import demo_config, demo_world
 from tests.studies.campaigns import fault_judgement
+from tests.support.flights import demo_config, demo_world
 
 if TYPE_CHECKING:
     from ground.telemetry.reader import Run

@@ -18,7 +18,7 @@ from sim_hal.star_camera import StarCameraModel, expected_electrons
 from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.worlds import sun
 from sim_hal.worlds.orbit import KeplerianElements, propagate
-from tests.studies.campaigns.opportunities import (
+from tests.support.opportunities import (
     Scenario,
     constant_slew,
     exposure_attitudes,

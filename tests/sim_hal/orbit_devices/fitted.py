@@ -12,7 +12,7 @@ from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FreeBodySection, OrbitSection, Simulation, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.world import Surroundings
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 UTC = "2026-03-20T12:00:00Z"
 FACES = (

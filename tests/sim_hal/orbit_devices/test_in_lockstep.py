@@ -28,9 +28,9 @@ from sim_hal.lockstep import LockStep, utc_ns
 from sim_hal.orbit_assembly import wide_model
 from sim_hal.orbit_sky import aberrated, view
 from sim_hal.worlds.free_body.body import FreeBody
-from tests.scenario.flights import TEXT, demo_world
 from tests.sim_hal.faults.test_catalogue import bench_of
 from tests.sim_hal.orbit_devices.fitted import UTC, at_first, orbit_config, orbit_world
+from tests.support.flights import TEXT, demo_world
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Measured
 from sim_hal.settings import Row
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 NONE: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
 UNEQUAL: tuple[Row, Row, Row] = ((5e-4, 1e-4, 0.0), (0.0, 4e-4, 0.0), (-2e-4, 0.0, 3e-4))

@@ -13,7 +13,7 @@ from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Measured
 from sim_hal.settings import FreeBodySection, ImuNoise, TipOff
 from sim_hal.worlds.world import Motion
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 BIAS = (2e-6, -1e-6, 3e-6)
 

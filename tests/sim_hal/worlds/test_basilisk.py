@@ -16,7 +16,7 @@ from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection
 from sim_hal.worlds.basilisk.world import BasiliskWorld, make
 from sim_hal.worlds.free_body.body import CoilPower, FreeBody
 from sim_hal.worlds.world import OrbitingWorld, WorldInputs, make_world
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 SECOND = 1_000_000_000
 UTC = "2026-03-20T12:00:00Z"

@@ -9,8 +9,8 @@ import pytest
 
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
-from tests.scenario.flights import demo_config, demo_world, fly
 from tests.sim_hal.worlds.spinning_world import RATE
+from tests.support.flights import demo_config, demo_world, fly
 
 HERE = "tests.sim_hal.worlds.spinning_world"
 

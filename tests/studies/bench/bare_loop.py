@@ -19,7 +19,7 @@ from array import array
 from pathlib import Path
 
 from hal.buses import linux_process
-from tests.studies.bench.process_watch import stolen_ns
+from tests.support.process_watch import stolen_ns
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1

@@ -23,8 +23,8 @@ from flight.app.run_folder import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from ground.commands.command import exchange
 from knightcube.errors import FlightError
-from tests.scenario.flights import CONFIG
-from tests.studies.bench.flooded_flight import flood, free_port, lateness, process, wait_for
+from tests.support.flights import CONFIG
+from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
 
 PINGS = 20
 _DATAGRAMS_A_SECOND = 20_000

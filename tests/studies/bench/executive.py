@@ -34,9 +34,8 @@ from statistics import median
 import yaml
 
 from tests.hal.guardian.live_flight import ROOT, LiveFlight
-from tests.scenario.flights import TEXT
-from tests.studies.bench import process_watch
-from tests.studies.bench.executive_figures import (
+from tests.support import process_watch
+from tests.support.executive_figures import (
     ASKED,
     PERIOD_NS,
     Began,
@@ -47,8 +46,9 @@ from tests.studies.bench.executive_figures import (
     misses,
     table,
 )
-from tests.studies.bench.lateness import Grid, draw
-from tests.studies.bench.process_watch import ProcessWatch, answering
+from tests.support.flights import TEXT
+from tests.support.lateness import Grid, draw
+from tests.support.process_watch import ProcessWatch, answering
 
 PRIORITY = 50
 """Of the bare loop under SCHED_FIFO: that of the flight's control thread."""

@@ -18,7 +18,7 @@ from knightcube.astro.quaternion import normalise
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.studies.bench.streaks import estimated
-from tests.studies.campaigns.scenes import FIELD, Scene, exposed
+from tests.support.scenes import FIELD, Scene, exposed
 
 EXPOSURE = 0.2
 WANTED = 20

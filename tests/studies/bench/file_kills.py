@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from ground.link.keys import make_keys
-from tests.scenario.flights import CONFIG
-from tests.studies.bench.flooded_flight import free_port
-from tests.studies.interop.linked_flight import service
+from tests.support.flights import CONFIG
+from tests.support.flooded_flight import free_port
+from tests.support.linked_flight import service
 
 _RATE = 1.5e5
 _START_S, _LATEST_S = 1.0, 3.0

@@ -16,7 +16,7 @@ from dataclasses import replace
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import Estimate
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, Flight, fly
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS
 
 _COMMANDED_NS = 10_000_000
 _AGED = replace(SETTINGS, latency_start=0.01, latency_walk=1e-5, unknown_current=0.1)

@@ -35,7 +35,7 @@ from tests.knightcube.vision.streaks.maximum_likelihood.scenes import (
     turn_of,
 )
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
-from tests.studies.streak_bound import endpoint_bound
+from tests.support.streak_bound import endpoint_bound
 
 _SEED = 31_415
 _SETTINGS = LikelihoodSettings(saturation=SATURATION, line_time=0.0)

@@ -31,9 +31,9 @@ from flight.link.telemetry.packets import LAYOUTS
 from ground.link.files import FileSession
 from ground.link.keys import make_keys
 from ground.link.terminal import open_terminal
-from tests.scenario.flights import CONFIG
-from tests.studies.bench.flooded_flight import flood, free_port, lateness, process, wait_for
 from tests.studies.fuzz.link_frames import LinkFrames
+from tests.support.flights import CONFIG
+from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
 
 _FRAMES_A_SECOND = 10_000
 _KINDS = 500

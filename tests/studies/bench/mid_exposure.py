@@ -12,7 +12,7 @@ allows, the worst first: light of fainter stars hides in some streaks. `agreed` 
 
 The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
 not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
-`tests.studies.streak_bound`).
+`tests.support.streak_bound`).
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.attitude_errors import attitude_error, error_in_pixels
 from tests.studies.bench.streaks import estimated, scenes
 from tests.studies.campaigns import streaks as campaign
-from tests.studies.campaigns.scenes import FIELD, Scene, noise_floor
-from tests.studies.streak_bound import star_information
+from tests.support.attitude_errors import attitude_error, error_in_pixels
+from tests.support.scenes import FIELD, Scene, noise_floor
+from tests.support.streak_bound import star_information
 
 _MATCH_PX = 6.0
 _STARS = 30

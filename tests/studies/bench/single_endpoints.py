@@ -22,8 +22,8 @@ from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
 from tests.studies.bench.streaks import estimated
-from tests.studies.campaigns.scenes import FIELD, noise_floor
-from tests.studies.streak_bound import endpoint_bound, star_information
+from tests.support.scenes import FIELD, noise_floor
+from tests.support.streak_bound import endpoint_bound, star_information
 
 EXPOSURE = 0.2
 STARS = 4

@@ -25,7 +25,7 @@ from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.scenes import YEAR, exposed
+from tests.support.scenes import YEAR, exposed
 
 _SEED = 41_207
 _FIELD = np.radians(12.0)

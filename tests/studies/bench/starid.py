@@ -33,7 +33,7 @@ from knightcube.vision.startracker.identification.lost_in_space import identify
 from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
+from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 
 _SEED = 271_828
 _RIGHT_DEG = 0.05

@@ -25,9 +25,9 @@ from knightcube.vision.startracker.identification.lost_in_space import identify
 from knightcube.vision.startracker.identification.star_field import Identification
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
-from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
+from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 
 _SEED = 314_159
 _RIGHT_DEG = 0.05

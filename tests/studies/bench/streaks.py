@@ -38,7 +38,7 @@ from sim_hal.star_camera import StarCameraModel
 from tests.studies.bench.stage_clock import REST, WHOLE, clocked
 from tests.studies.campaigns import streaks as campaign
 from tests.studies.campaigns.failures import WRONG_SHARE, WRONG_SIGMAS
-from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable
+from tests.support.scenes import FIELD, Scene, slew, usable
 
 if TYPE_CHECKING:
     from tests.studies.bench import opencv_lines

@@ -21,8 +21,8 @@ from ground.report.knowledge import COARSE, FINE, attitude_errors
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
 from sim_hal.settings import Simulation
-from tests.scenario.flights import CONFIG, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.flights import CONFIG, fly
 
 ORBIT = CONFIG.parent / "orbit.yaml"
 SPEED, DURATION = math.radians(0.5), 120.0

@@ -26,8 +26,8 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import demo_config, demo_world, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.flights import demo_config, demo_world, fly
 
 DURATION = 20.0
 SPAN = 3.0

@@ -29,7 +29,7 @@ from knightcube.gnc.estimation.measurements import Measurement
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency_instruments import Camera, Pilot, Unit
-from tests.studies.campaigns.consistency_worlds import (
+from tests.support.consistency_worlds import (
     CYCLE_NS,
     DIPOLE,
     DRAG,

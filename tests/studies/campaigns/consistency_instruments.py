@@ -21,7 +21,7 @@ from knightcube.gnc.estimation.measurements import (
 )
 from sim_hal.emulators.vn100_sensors import NoiseProfile, Sensors
 from sim_hal.worlds.world import Motion
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS, DIPOLE, INERTIA, TESTBED_FIELD, World
+from tests.support.consistency_worlds import CYCLE_NS, DIPOLE, INERTIA, TESTBED_FIELD, World
 
 QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
 EXPOSURE, CAMERA_PERIOD = 40, 200

@@ -31,9 +31,9 @@ from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from sim_hal.settings import Simulation
-from tests.scenario.flights import demo_config, demo_world, fly, thesis_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.collocation_oracle import Slew, solve
+from tests.support.flights import demo_config, demo_world, fly, thesis_config
 
 DURATION = 700.0
 REACHED_AFTER = 10.0

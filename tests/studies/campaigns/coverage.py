@@ -22,7 +22,8 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
 from knightcube.gnc.attitude.references import sun_from
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.orbit_geometry import (
+from tests.studies.campaigns.orbit_world import FIRST_DATE
+from tests.support.orbit_geometry import (
     SUITES,
     Pass,
     in_cone,
@@ -33,8 +34,7 @@ from tests.studies.campaigns.orbit_geometry import (
     revolution,
     suite,
 )
-from tests.studies.campaigns.orbit_world import FIRST_DATE
-from tests.studies.campaigns.sensor_suite import SensorSuite
+from tests.support.sensor_suite import SensorSuite
 
 STEP = 20.0
 MOST_TILT = np.radians(15.0)

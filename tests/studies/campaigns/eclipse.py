@@ -23,10 +23,10 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.free_filter import FreeFilter
 from knightcube.gnc.estimation.free_motion import TURN
-from tests.scenario.flights import CONFIG
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.eclipse_loop import CRAFT, LAST, SETTLED, fly_loop, judged
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, STAR_SIGMA, PointingFlight
+from tests.support.flights import CONFIG
 
 LEARNED, SHORTEST, LONGEST = 3_800.0, 1_900.0, 12_000.0
 """s: with stars at least, so that a revolution has passed at the shadow's end; of a shadow at least, and of a

@@ -26,8 +26,8 @@ from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER, SEMI_MAJOR_AX
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from sim_hal.settings import FaultEntry, FreeBodySection, Simulation, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
-from tests.scenario.flights import CONFIG, fly
 from tests.studies.campaigns.campaign import Result
+from tests.support.flights import CONFIG, fly
 
 CRAFT = {"knightcube": "orbit.yaml", "cubesat_3u": "orbit_3u.yaml"}
 LIT, BLIND = 900.0, 300.0

@@ -32,7 +32,7 @@ from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable
+from tests.support.scenes import FIELD, Scene, slew, usable
 
 EXPOSURES = (0.2, 1.0)
 MOST_TURN = 0.5

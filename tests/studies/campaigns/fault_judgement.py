@@ -15,9 +15,9 @@ from ground.telemetry.reader import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.faults.bench import FaultKind
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import demo_world
 from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.fault_table import REACTION, own_events, part_of
+from tests.support.flights import demo_world
 
 DURATION = 26.0
 """s, of each flight."""

@@ -25,10 +25,10 @@ from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import demo_config, demo_world, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.fault_judgement import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, judge
 from tests.studies.campaigns.fault_table import OWN, part_of
+from tests.support.flights import demo_config, demo_world, fly
 
 MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
 LASTING = ("coil", "bridge")

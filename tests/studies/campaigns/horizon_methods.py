@@ -48,7 +48,7 @@ from tests.studies.campaigns.nadir import (
     misread,
     random_air,
 )
-from tests.studies.campaigns.orbit_geometry import suite
+from tests.support.orbit_geometry import suite
 
 ATTITUDES = {"level": np.radians(2.0), "tilted": np.radians(15.0), "any": np.pi}
 LIGHTS = ("sunlit", "terminator")

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
-from tests.studies.supersampled import Optics, coma, disc, gaussian, halo, moffat
+from tests.support.supersampled import Optics, coma, disc, gaussian, halo, moffat
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]
 """Changes electrons or counts (rows, columns); the generator draws what differs from frame to frame."""

@@ -26,8 +26,8 @@ from knightcube.reference.star_identification.methods import METHODS, StarMotion
 from knightcube.reference.star_identification.pair_table import angles
 from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.index.build import default_index
-from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, draw
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.star_lists import PIXELS, ListKind, StarList, draw
 
 NOMINAL: dict[str, float] = {
     "noise_px": 0.3,

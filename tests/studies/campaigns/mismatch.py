@@ -32,8 +32,8 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
-from tests.studies.campaigns.scenes import FIELD, catalogue, noise_floor
-from tests.studies.supersampled import Attitudes, Sky, light
+from tests.support.scenes import FIELD, catalogue, noise_floor
+from tests.support.supersampled import Attitudes, Sky, light
 
 TURNS = (10, 30)
 EXPOSURES = (0.2, 1.0)

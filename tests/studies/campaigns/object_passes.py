@@ -36,9 +36,9 @@ from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.scenes import catalogue
-from tests.studies.streak_bound import star_information
 from tests.support.object_passes import Pass, a_pass
+from tests.support.scenes import catalogue
+from tests.support.streak_bound import star_information
 
 EXPOSURE, STILL, TURNING = 0.2, 6, 10
 LONG, LONG_PERIOD = (180.0, 360.0), 5.0

@@ -24,9 +24,9 @@ from knightcube.gnc.estimation.estimate import BIAS, TURN, Estimate
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_attitude_figures import WHENS, draw, line_of, variant_facts
-from tests.studies.campaigns.orbit_geometry import suite as suite_of
 from tests.studies.campaigns.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
-from tests.studies.campaigns.sensor_suite import SensorSuite
+from tests.support.orbit_geometry import suite as suite_of
+from tests.support.sensor_suite import SensorSuite
 
 SUITE = "uw"
 LOST_AT = 600.0

@@ -22,7 +22,7 @@ from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.world import Surroundings
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
 DURATION = 100.0

@@ -24,10 +24,10 @@ from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for
 from tests.studies.campaigns.orbit_fault_judgement import judge
+from tests.support.flights import fly
 
 LASTING = ("coil", "bridge")
 ZERO = 1e-3

@@ -45,8 +45,8 @@ from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.nadir import camera_model, finder_settings, random_air
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
-from tests.studies.campaigns.orbit_geometry import suite as suite_of
 from tests.studies.campaigns.orbit_world import STEP, World
+from tests.support.orbit_geometry import suite as suite_of
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "level": {"suite": "uw", "turned": False, "period": 60.0},

@@ -27,7 +27,7 @@ from knightcube.astro.quaternion import (
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.attitude.references import sun_from
 from sim_hal.worlds import geomagnetism
-from tests.studies.campaigns.orbit_geometry import (
+from tests.support.orbit_geometry import (
     Pass,
     in_field,
     limb,
@@ -35,7 +35,7 @@ from tests.studies.campaigns.orbit_geometry import (
     local_frame,
     revolution,
 )
-from tests.studies.campaigns.sensor_suite import SensorSuite
+from tests.support.sensor_suite import SensorSuite
 
 STEP = 0.5
 """s, of the truth and of the gyros."""

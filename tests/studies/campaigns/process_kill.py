@@ -31,10 +31,10 @@ from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight
 from tests.studies.bench.executive import Load, full_load, members
-from tests.studies.bench.process_watch import answering, below, command
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.faults_kill import watch_coils
 from tests.studies.campaigns.kill_board import Board
+from tests.support.process_watch import answering, below, command
 
 LIMIT_S = 0.35
 ACTS = 10

@@ -24,8 +24,8 @@ from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.scenes import FIELD
-from tests.studies.row_exposure import row_scene
+from tests.support.row_exposure import row_scene
+from tests.support.scenes import FIELD
 
 EXPOSURES = (0.2, 1.0)
 LENGTHS = (16.0, 90.0)

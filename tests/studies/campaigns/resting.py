@@ -35,8 +35,8 @@ from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected
-from tests.studies.campaigns.scenes import FIELD, catalogue
-from tests.studies.supersampled import Sky, light
+from tests.support.scenes import FIELD, catalogue
+from tests.support.supersampled import Sky, light
 
 EXPOSURE = 0.2
 TRAILS = (0.0, 1.0, 3.0)

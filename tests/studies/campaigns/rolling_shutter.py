@@ -23,9 +23,9 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.scenes import FIELD, noise_floor
-from tests.studies.row_exposure import RowScene, row_scene
-from tests.studies.streak_bound import rate_bound
+from tests.support.row_exposure import RowScene, row_scene
+from tests.support.scenes import FIELD, noise_floor
+from tests.support.streak_bound import rate_bound
 
 EXPOSURES = (0.2, 1.0)
 LENGTHS = (20.0, 300.0)

@@ -30,7 +30,7 @@ from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames
 from tests.studies.campaigns.rso_table import thesis_table
-from tests.studies.campaigns.scenes import FIELD, SAMPLES, catalogue
+from tests.support.scenes import FIELD, SAMPLES, catalogue
 
 EXPOSURE = 0.5
 MAGNITUDES = (1.0, 3.0, 4.0, 5.0, 6.0)

@@ -24,14 +24,6 @@ from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.rso import source_tracks
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.opportunities import (
-    Opportunity,
-    Scenario,
-    constant_slew,
-    exposure_attitudes,
-    opportunities,
-    table_4_3,
-)
 from tests.studies.campaigns.rso import (
     EXPOSURE,
     MATCH_PX,
@@ -43,7 +35,15 @@ from tests.studies.campaigns.rso import (
     number,
 )
 from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames
-from tests.studies.campaigns.scenes import FIELD, catalogue
+from tests.support.opportunities import (
+    Opportunity,
+    Scenario,
+    constant_slew,
+    exposure_attitudes,
+    opportunities,
+    table_4_3,
+)
+from tests.support.scenes import FIELD, catalogue
 
 # 2026-05-18 0 h TT: with a frame a second and the Sun and Earth kept out of half the field, as in 2.17 and
 # 2.19, the thesis's number of opportunities.

@@ -24,9 +24,9 @@ from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
 from ground.telemetry.reader import Run
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.faults import faults
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 HOUR_S = 3600.0
 FLIGHT_HOURS = 6

@@ -28,8 +28,8 @@ from ground.report.performance import STEADY_STATE_S
 from ground.telemetry.reader import Run
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 STEPS = (Step(at=0.0, q2=-0.3), Step(at=65.0, q2=-0.2))
 DURATION = 130.0

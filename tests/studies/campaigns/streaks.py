@@ -25,10 +25,10 @@ from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motio
 from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.attitude_errors import attitude_error, error_in_pixels
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.scenes import FIELD, Scene, noise_floor, slew, usable
-from tests.studies.streak_bound import rate_bound
+from tests.support.attitude_errors import attitude_error, error_in_pixels
+from tests.support.scenes import FIELD, Scene, noise_floor, slew, usable
+from tests.support.streak_bound import rate_bound
 
 THETAS_DEG = (0, 3, 10, 20, 30, 45, 60, 75, 90)
 PERCENTS = (5, 10, 20, 30, 50)

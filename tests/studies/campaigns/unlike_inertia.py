@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.scenario.flights import fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_other_body, without_cameras
 
 CRAFT_FILES = ("orbit_3u", "orbit")

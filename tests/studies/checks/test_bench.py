@@ -16,7 +16,7 @@ from tests.studies.bench import streaks
 from tests.studies.bench.executive import Load, full_load
 from tests.studies.bench.mid_exposure import FITS, SOLUTIONS, Seen, attitude_row
 from tests.studies.bench.stage_clock import REST, WHOLE, clocked
-from tests.studies.campaigns.scenes import FIELD, slew
+from tests.support.scenes import FIELD, slew
 
 
 def test_every_bench_is_listed_with_one_line_and_none_is_imported(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,8 +9,8 @@ from knightcube.vision.streaks.corners.settings import DetectorName, StreakSetti
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.scenes import FIELD, slew
 from tests.studies.campaigns.streaks import EXPOSURE
+from tests.support.scenes import FIELD, slew
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import pytest
 
 from flight.schema import reader as configuration
 from sim_hal.settings import Thread
-from tests.scenario.flights import demo_config, demo_world
 from tests.studies.campaigns import controllers, step_robust
+from tests.support.flights import demo_config, demo_world
 
 
 @pytest.mark.parametrize(("stiffness", "milliwatts"), [(0.0, 3.81), (1e-5, 8.52), (2e-5, 25.05)])

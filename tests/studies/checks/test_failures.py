@@ -13,7 +13,7 @@ from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import failures
 from tests.studies.campaigns.campaign import Case, Result, fly_here
-from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable
+from tests.support.scenes import FIELD, Scene, slew, usable
 
 _SEED = 20_261_121
 _FRAMES = 6

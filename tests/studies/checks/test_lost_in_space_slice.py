@@ -11,9 +11,9 @@ import pytest
 from knightcube.reference.star_identification.methods import METHODS
 from knightcube.vision.startracker.identification.star_field import Identification, Status
 from knightcube.vision.startracker.identification.verification import nothing
-from tests.studies.bench.star_lists import ListKind, draw
 from tests.studies.campaigns import lost_in_space
 from tests.studies.campaigns.campaign import Case, Result
+from tests.support.star_lists import ListKind, draw
 
 LISTS = 6
 

@@ -13,7 +13,7 @@ from knightcube.vision.camera.lens import EXACT, Pinhole
 from tests.studies.campaigns import mismatch
 from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.imperfections import IMPERFECTIONS
-from tests.studies.supersampled import Optics, Sky, coma, disc, gaussian, halo, light, moffat, through_lens
+from tests.support.supersampled import Optics, Sky, coma, disc, gaussian, halo, light, moffat, through_lens
 
 _SEED = 20_261_123
 _PINHOLE = Pinhole.from_field_of_view(96, 80, np.radians(4.0))

@@ -14,7 +14,6 @@ from ground.telemetry.reader import Run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
-from tests.scenario.flights import fly
 from tests.studies.campaigns import orbit_fault_flights, orbit_faults
 from tests.studies.campaigns import orbit_fault_judgement as judgement
 from tests.studies.campaigns.fault_table import part_of
@@ -24,6 +23,7 @@ from tests.studies.campaigns.orbit_fault_flights import (
     old_elements,
     world_for,
 )
+from tests.support.flights import fly
 
 BRIEF, LAST = 34.0, 6.0
 """s, of a flight, and at its end in which the body must do again what it is for."""

@@ -9,8 +9,8 @@ import pytest
 
 from flight.schema.errors import ConfigError
 from knightcube.astro.arrays import FloatArray
-from tests.studies.campaigns import sensor_suite
-from tests.studies.campaigns.orbit_geometry import SUITES, suite
+from tests.support import sensor_suite
+from tests.support.orbit_geometry import SUITES, suite
 
 DOWN = np.array([0.0, 0.0, 1.0])
 

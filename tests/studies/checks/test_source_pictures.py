@@ -13,7 +13,7 @@ from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_f
 from sim_hal.star_camera import StarCameraModel
 from tests.studies import source_pictures
 from tests.studies.campaigns.rso import draw_sky
-from tests.studies.campaigns.scenes import FIELD
+from tests.support.scenes import FIELD
 
 
 @pytest.mark.slow

@@ -12,8 +12,8 @@ from knightcube.vision.startracker.identification.star_field import Identificati
 from knightcube.vision.startracker.identification.verification import nothing
 from knightcube.vision.startracker.index.build import default_index
 from tests.studies.bench import starid_hard
-from tests.studies.bench.star_lists import ListKind, draw
 from tests.studies.bench.starid_hard import drawn_list, hardships, measured
+from tests.support.star_lists import ListKind, draw
 
 _SEED = 20_261_123
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.vision.camera.lens import Pinhole
-from tests.studies.streak_bound import endpoint_bound, rate_bound
+from tests.support.streak_bound import endpoint_bound, rate_bound
 
 _ELECTRONS = 1.9e10 * np.pi / 4.0 * 0.025**2 * 0.2
 _FLOOR = 10.0**2 + 50.0 * 0.2

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from ground.link.keys import make_keys
 from ground.watch.tail import LogTail
-from tests.studies.console.browser import Page, missing, opened
+from tests.support.browser import Page, missing, opened
 
 CONFIG = Path("config/step_demo.yaml")
 

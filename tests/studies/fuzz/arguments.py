@@ -39,12 +39,12 @@ from ground.commands import camera as camera_command
 from ground.watch.socket import answers
 from knightcube.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE
-from tests.studies.fuzz.furnishings import Listener, answer, furnish
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.interrupted import Disturbance, disturbed
 from tests.studies.fuzz.logs import hostile, split
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 from tests.studies.fuzz.vocabulary import FLIGHT, NUMBERS, PATHS, RIGHT, WORDS
+from tests.support.furnishings import Listener, answer, furnish
 
 _COMMANDS = {
     name: purpose

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.studies.fuzz.furnishings import FIELD_DEG
+from tests.support.furnishings import FIELD_DEG
 
 FLIGHT = "../flight.sock"
 

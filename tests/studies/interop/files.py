@@ -23,10 +23,10 @@ import numpy as np
 
 from ground.link.keys import make_keys
 from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, write
-from tests.studies.bench.flooded_flight import free_port as free_udp_port
-from tests.studies.interop.linked_flight import free_port, service
 from tests.studies.interop.lossy_relay import lossy_relay
-from tests.studies.interop.yamcs_server import Yamcs, missing, serving
+from tests.support.flooded_flight import free_port as free_udp_port
+from tests.support.linked_flight import free_port, service
+from tests.support.yamcs_server import Yamcs, missing, serving
 
 _CONFIG = Path(__file__).resolve().parents[3] / "config" / "step_demo.yaml"
 _RATE = 200_000

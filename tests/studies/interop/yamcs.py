@@ -32,9 +32,9 @@ from flight.schema.reader import load
 from ground.telemetry.scanner import scan
 from ground.xtce import spread
 from ground.yamcs import write
-from tests.studies.interop.linked_flight import LinkedFlight, free_port, linked_flight
 from tests.studies.interop.sockets import beyond_loopback
-from tests.studies.interop.yamcs_server import Yamcs, missing, serving, troubles
+from tests.support.linked_flight import LinkedFlight, free_port, linked_flight
+from tests.support.yamcs_server import Yamcs, missing, serving, troubles
 
 _CONFIGS = Path(__file__).resolve().parents[3] / "config"
 _BROKEN = "coil-broken"

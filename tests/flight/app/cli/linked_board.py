@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ground.link.keys import make_keys
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 ROOT = Path(__file__).resolve().parents[4]
 

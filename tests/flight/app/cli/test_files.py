@@ -12,9 +12,9 @@ import pytest
 
 from flight.app.cli import main
 from ground.link.keys import make_keys
-from tests.scenario.flights import CONFIG
-from tests.studies.bench.flooded_flight import free_port
-from tests.studies.interop.linked_flight import service
+from tests.support.flights import CONFIG
+from tests.support.flooded_flight import free_port
+from tests.support.linked_flight import service
 
 LOG = "log/run-000001/flight-0001.ccsds"
 

@@ -41,7 +41,7 @@ from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
 from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
 from tests.flight.link.security.vaults import frame_with
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from flight.link.commands.codec import CommandPacker, Ping
 from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.reader import parse
-from tests.scenario.flights import CONFIG
+from tests.support.flights import CONFIG
 
 
 def networks(lines: str, commands: str = "{socket: /run/x}") -> list[str]:

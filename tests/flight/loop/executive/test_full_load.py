@@ -27,9 +27,10 @@ from flight.loop.executive.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from hal.buses.clock import SystemClock
 from tests.hal.guardian.live_flight import ROOT
-from tests.studies.bench import bare_loop, busy_jobs, process_watch
+from tests.studies.bench import bare_loop, busy_jobs
 from tests.studies.bench.executive import Load, fly
-from tests.studies.bench.executive_figures import (
+from tests.support import process_watch
+from tests.support.executive_figures import (
     ASKED,
     PERIOD_NS,
     SLOPE_SPAN,
@@ -38,8 +39,8 @@ from tests.studies.bench.executive_figures import (
     table,
     waits,
 )
-from tests.studies.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
-from tests.studies.bench.process_watch import MIB, Look
+from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
+from tests.support.process_watch import MIB, Look
 
 FIRST = 1000
 CALM = 0.05

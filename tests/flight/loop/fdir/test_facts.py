@@ -30,7 +30,7 @@ from flight.loop.fdir.facts import (
 from flight.loop.modes import Trigger
 from flight.loop.tasks.mode_control import SAFING_REACTIONS, modes_moved_by
 from knightcube.errors import FlightError
-from tests.scenario.flights import demo_config
+from tests.support.flights import demo_config
 
 
 class EventRecord:

@@ -43,8 +43,8 @@ from knightcube.gnc.estimation.rigid_body import Parameters
 from tests.flight.loop.state.disk import Disk
 from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, fly, follow
 from tests.manual_clock import ManualClock
-from tests.scenario import flights
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support import flights
+from tests.support.consistency_worlds import CYCLE_NS
 
 LABEL = "1970-01-01T00:00:00Z"
 

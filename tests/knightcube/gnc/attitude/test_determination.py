@@ -25,7 +25,7 @@ from knightcube.gnc.attitude.direction_filter import (
 )
 from knightcube.gnc.estimation.estimate import BIAS, TURN
 from tests.studies.campaigns.orbit_attitude import settings_of
-from tests.studies.campaigns.orbit_geometry import suite
+from tests.support.orbit_geometry import suite
 
 SETTINGS = settings_of(suite("uw"))
 SECOND = 1_000_000_000

@@ -20,8 +20,8 @@ from knightcube.vision.sun.direction import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_attitude import settings_of
-from tests.studies.campaigns.orbit_geometry import local_frame, suite
-from tests.studies.campaigns.sensor_suite import WideCamera
+from tests.support.orbit_geometry import local_frame, suite
+from tests.support.sensor_suite import WideCamera
 
 UW = suite("uw")
 POSITION: FloatArray = (EARTH_RADIUS + 380e3) * np.array([[0.6, -0.64, 0.48]])

@@ -21,7 +21,7 @@ from knightcube.gnc.attitude.single_frame import (
     optimum,
     with_direction,
 )
-from tests.studies.campaigns.orbit_geometry import suite
+from tests.support.orbit_geometry import suite
 
 RUNS, SEED = 150, 20_261_121
 SUN_SIGMA, NADIR_SIGMA, FIELD_SIGMA = 3e-4, 1e-3, 5e-3

@@ -14,7 +14,7 @@ from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.filter_settings import FilterSettings
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
-from tests.studies.campaigns.consistency_worlds import (
+from tests.support.consistency_worlds import (
     CYCLE_NS,
     DIPOLE,
     INERTIA,

@@ -29,7 +29,7 @@ from tests.knightcube.gnc.estimation.flights import (
     follow,
 )
 from tests.pace import ordinary_seconds
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS
 
 BOTH = pytest.mark.parametrize("suspended", [True, False], ids=["suspended", "free"])
 SECOND = 1_000_000_000

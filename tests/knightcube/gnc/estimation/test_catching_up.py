@@ -16,7 +16,7 @@ from knightcube.gnc.estimation.measurements import (
     RateMeasurement,
 )
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from tests.studies.campaigns.consistency_worlds import KNOWN_PLANT
+from tests.support.consistency_worlds import KNOWN_PLANT
 
 PERIOD_NS = 25_000_000
 BODY = RigidBody(np.diag([1.1e-3, 1.05e-3, 0.99e-3]), 0.648, np.array([0.0, 0.0, -4.5e-4]), suspended=True)

@@ -19,7 +19,7 @@ from knightcube.gnc.estimation.mekf import correct, normalised_square
 from knightcube.gnc.estimation.state import SIZE, State
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
 from tests.knightcube.gnc.estimation.test_mekf import STATE, moved
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS
 
 SIGMA = 1e-3
 REFERENCE: FloatArray = np.array([0.6, -0.48, 0.64])

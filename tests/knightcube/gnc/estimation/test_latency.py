@@ -14,7 +14,7 @@ from knightcube.gnc.estimation.filter_settings import FilterSettings
 from knightcube.gnc.estimation.latency import LONGEST_LATENCY, motion
 from knightcube.gnc.estimation.measurements import RateMeasurement
 from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPENDED, Flight, fly
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS
 
 SWING = 0.14
 """A, about the coils' limit: a slew shows the age, a hold does not."""

@@ -16,7 +16,7 @@ from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
 from knightcube.gnc.estimation.turn import Quaternion, Vector, compose, exponential
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.flights import FREE
-from tests.studies.campaigns.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
+from tests.support.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
 
 SKEWED: FloatArray = np.array([[1.1, 0.05, -0.03], [0.05, 1.05, 0.02], [-0.03, 0.02, 0.99]]) * 1e-3
 Q: Quaternion = compose(exponential(0.4, -0.7, 0.2), exponential(0.1, 0.3, 1.1))

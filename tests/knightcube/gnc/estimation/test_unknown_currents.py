@@ -13,7 +13,7 @@ from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.commands import CommandHistory
 from knightcube.gnc.estimation.measurements import RateMeasurement
 from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
-from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+from tests.support.consistency_worlds import CYCLE_NS
 
 STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
 """Cycles: the chip keeps its registers, half a second later that is found, then it obeys again."""

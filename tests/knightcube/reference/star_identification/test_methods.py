@@ -29,7 +29,7 @@ from knightcube.reference.star_identification.search import DEFAULT, FieldUnknow
 from knightcube.reference.star_identification.triangle_table import side_lengths
 from knightcube.vision.startracker.identification.star_field import Identification, Status
 from knightcube.vision.startracker.index.sky_index import SkyIndex, TriangleIndex, choose_guide_stars
-from tests.studies.bench.star_lists import ListKind, StarList, draw, draw_random
+from tests.support.star_lists import ListKind, StarList, draw, draw_random
 
 CLASSICAL = sorted(set(METHODS) - {DEFAULT_METHOD})
 LISTS = 8

@@ -19,7 +19,7 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, 
 from knightcube.vision.horizon.several_cameras import JointNadir, nadir_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from tests.studies.campaigns.nadir import camera_model, finder_settings
-from tests.studies.campaigns.orbit_geometry import suite
+from tests.support.orbit_geometry import suite
 
 MODEL = camera_model()
 SETTINGS = finder_settings(MODEL)

@@ -15,7 +15,7 @@ from knightcube.vision.objects.settings import MeasuredObjects
 from knightcube.vision.startracker.index.build import default_index
 from sim_hal.star_camera import SourceTrack
 from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
-from tests.studies.campaigns.scenes import catalogue as sky_to
+from tests.support.scenes import catalogue as sky_to
 
 HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 

@@ -14,7 +14,7 @@ from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
-from tests.studies.streak_bound import rate_bound, star_information
+from tests.support.streak_bound import rate_bound, star_information
 
 EPOCH = 2026.5
 NARROW = StarCameraModel(field_of_view=float(np.radians(12.0)))

@@ -27,7 +27,7 @@ from tests.knightcube.vision.streaks.frames import (
     star_camera,
     true_endpoints,
 )
-from tests.studies.attitude_errors import (
+from tests.support.attitude_errors import (
     attitude_error,
     error_in_pixels,
     field_fraction,

@@ -23,8 +23,8 @@ from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_places
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
-from tests.studies.attitude_errors import attitude_error
 from tests.studies.bench.sky import ARCSECONDS, photograph
+from tests.support.attitude_errors import attitude_error
 
 _KNOWN_TO_A_PERCENT = 0.99, 1.01
 _PHOTOGRAPHS = Path(__file__).parents[5] / "shared" / "data" / "sky"

@@ -16,7 +16,7 @@ from sim_hal.worlds.free_body import loads
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.craft import CRAFTS, box, build
 from sim_hal.worlds.world import World, WorldInputs, make_world
-from tests.scenario.flights import demo_config, demo_world
+from tests.support.flights import demo_config, demo_world
 
 SECOND = 1_000_000_000
 MOVING = np.array([0.02, 0.0, -0.04])

@@ -19,7 +19,7 @@ from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 from tests.studies.bench.centroids import compare, frame_of, matched, point_bound, star_places
-from tests.studies.streak_bound import star_information
+from tests.support.streak_bound import star_information
 
 SMALL = StarCameraModel(columns=320, rows=256, field_of_view=np.radians(6.25))
 MIDDLE = np.array([[160.3, 128.2]])

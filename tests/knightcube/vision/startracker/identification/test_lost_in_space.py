@@ -12,7 +12,7 @@ from knightcube.vision.startracker.identification.lost_in_space import Identific
 from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
 from knightcube.vision.startracker.index.build import default_index
 from tests.pace import ordinary_seconds
-from tests.studies.bench.star_lists import ListKind, StarList, configurations, draw, draw_random
+from tests.support.star_lists import ListKind, StarList, configurations, draw, draw_random
 
 SKY = default_index()
 ARCSECOND = np.pi / 648_000.0

@@ -10,7 +10,7 @@ from knightcube.vision.startracker.identification.star_field import Status
 from knightcube.vision.startracker.identification.tracking import track
 from knightcube.vision.startracker.identification.verification import verify
 from knightcube.vision.startracker.index.build import default_index
-from tests.studies.bench.star_lists import ListKind, StarList, draw
+from tests.support.star_lists import ListKind, StarList, draw
 
 SKY = default_index()
 

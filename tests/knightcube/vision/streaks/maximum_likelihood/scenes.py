@@ -10,7 +10,7 @@ from knightcube.astro import catalogue, quaternion
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths
 from sim_hal.star_camera import StarCameraModel, render
-from tests.studies.streak_bound import RateBound, rate_bound
+from tests.support.streak_bound import RateBound, rate_bound
 
 CAMERA = StarCameraModel()
 SATURATION = float(CAMERA.highest_count)

@@ -23,7 +23,7 @@ from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import CAMERA, SATURATION, real_sky, turn_of
 from tests.studies.campaigns import failures
-from tests.studies.campaigns.scenes import FIELD
+from tests.support.scenes import FIELD
 
 _TURN = np.array([0.02, 0.03, 0.0])
 

@@ -26,7 +26,7 @@ from tests.knightcube.vision.streaks.maximum_likelihood.scenes import (
     taken,
     turn_of,
 )
-from tests.studies.row_exposure import row_scene
+from tests.support.row_exposure import row_scene
 
 _SETTINGS = LikelihoodSettings(saturation=SATURATION)
 

@@ -17,8 +17,8 @@ from knightcube.vision.streaks.maximum_likelihood.whole_frame_scan import frame_
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.maximum_likelihood.scenes import CAMERA, SATURATION, Scene, real_sky
 from tests.studies.campaigns import failures
-from tests.studies.campaigns.scenes import FIELD, slew
-from tests.studies.campaigns.scenes import Scene as Drawn
+from tests.support.scenes import FIELD, slew
+from tests.support.scenes import Scene as Drawn
 
 _SETTINGS = LikelihoodSettings(saturation=SATURATION)
 

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run
 from tests.hal.guardian.live_flight import CoilTruth
-from tests.studies.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
-from tests.studies.bench.process_watch import MIB, Look
+from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
+from tests.support.process_watch import MIB, Look
 
 PERIOD_NS = 25_000_000
 """Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.flight`)."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from ground.telemetry.reader import read_run
 from tests.hal.guardian.live_flight import ROOT
-from tests.studies.bench.lateness import QUANTILES
+from tests.support.lateness import QUANTILES
 
 _BURST_S = 0.01
 _START_S = 20.0

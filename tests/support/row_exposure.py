@@ -16,7 +16,7 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from sim_hal.star_camera import StarCameraModel, image
-from tests.studies.campaigns.scenes import catalogue
+from tests.support.scenes import catalogue
 
 Turns = Callable[[FloatArray], FloatArray]
 """Rotation vectors (m, 3) rad since mid-exposure at times (m,) s from it, camera frame."""

@@ -15,8 +15,8 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from sim_hal.worlds.orbit import KeplerianElements, propagate
-from tests.studies.campaigns import sensor_suite
-from tests.studies.campaigns.sensor_suite import SensorSuite, WideCamera
+from tests.support import sensor_suite
+from tests.support.sensor_suite import SensorSuite, WideCamera
 
 ALTITUDE = 380e3
 INCLINATION = np.radians(51.6)
@@ -27,7 +27,7 @@ SUITES = ("vt", "uw", "usu")
 @cache
 def suite(name: str) -> SensorSuite:
     """Return one of the paper's three."""
-    return sensor_suite.load(Path(__file__).parents[3] / "config" / "sensors" / f"{name}.yaml")
+    return sensor_suite.load(Path(__file__).parents[2] / "config" / "sensors" / f"{name}.yaml")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,9 +27,9 @@ from sim_hal.star_camera import StarCameraModel
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.knightcube.vision.camera.test_fits import _file
 from tests.knightcube.vision.startracker.frames import sky_frame
-from tests.studies.campaigns.scenes import slew
+from tests.support.scenes import slew
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 FIELD_DEG = 12.0
 _PIXELS = 128
 _IDENTIFY_S = "12"

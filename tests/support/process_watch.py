@@ -78,7 +78,7 @@ def look(processes: Mapping[str, int]) -> Look:
 @contextmanager
 def answering(module: str, *words: str) -> Iterator[None]:
     """Run `python -m MODULE WORDS` from its first line on standard output on; end it with SIGTERM."""
-    root = Path(__file__).parents[3]
+    root = Path(__file__).parents[2]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     with subprocess.Popen(
         [sys.executable, "-m", module, *words], cwd=root, env=environment, stdout=subprocess.PIPE
