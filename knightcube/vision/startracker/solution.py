@@ -19,8 +19,7 @@ from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.sky_map import BENDS, SkyMap
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 
 
 class SolveStatus(Enum):

@@ -31,9 +31,9 @@ from knightcube.vision.startracker.image_fit import Unknowns, attitude_by, fit_i
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import ShortTrails, SkyMap, apparent, known_bend, usual_bend
 from knightcube.vision.startracker.solution import FrameSolution, SolveStatus, timing_covariance
-from knightcube.vision.streaks.maximum_likelihood.course import Course
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult
 
 # Position error (px) due to residual distortion of the lens or to the colour of the star.
 _LEAST_SIGMA_PX = 0.005

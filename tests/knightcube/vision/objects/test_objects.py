@@ -11,8 +11,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.vision.objects.detect import ObjectReport, SpaceObject, Verdict, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.vision.objects.space_objects import (
     add_object,

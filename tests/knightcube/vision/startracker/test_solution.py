@@ -15,8 +15,7 @@ from knightcube.vision.startracker.solution import (
     middle_covariance,
     weighting_of,
 )
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)
