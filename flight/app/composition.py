@@ -46,16 +46,15 @@ from flight.schema.sections import Config, Executive
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.gnc.tracking.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
-from knightcube.vision.camera.exposure import Exposures
-from knightcube.vision.camera.lens import CameraKnowledge
+from knightcube.vision.camera.images import KeptFrames
+from knightcube.vision.camera.lens import CameraKnowledge, Exposures
 from knightcube.vision.frame_job import TrackerSettings
-from knightcube.vision.kept_frames import KeptFrames
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
-from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodies.orbit.body:ORBIT"}
 

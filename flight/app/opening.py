@@ -32,7 +32,7 @@ from hal.buses.linux_process import ServiceManager, worker_cores
 from hal.drivers.h_bridge import DEVICE as COILS
 from hal.guardian.client import GuardianLine
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
-from knightcube.vision import kept_frames
+from knightcube.vision.camera import images
 from knightcube.vision.startracker.index.build import ensure_default_index
 
 CONTROL_PRIORITY = 50
@@ -123,7 +123,7 @@ def open_flight(
         feed, beat = supervision.feed, supervision.beat
     channels = _open_channels(config, stack)
     keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
-    frames = folder / kept_frames.FOLDER
+    frames = folder / images.KEPT_FRAMES_FOLDER
     opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))

@@ -24,11 +24,10 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.star_tracker import camera_of_field
-from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.solution import FrameSolution
-from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 _ROUNDS = 3
 _LEAST_SIGMA_PX = 0.02

@@ -14,7 +14,7 @@ from flight.link.telemetry.archive import find_runs
 from ground.link.options import add_link_options, terminal_of
 from ground.watch.tail import LogTail
 from knightcube.errors import FlightError, UsageError
-from knightcube.vision import kept_frames
+from knightcube.vision.camera import images
 
 if TYPE_CHECKING:
     from ground.console.server import Console
@@ -117,7 +117,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     folder = runs[-1] if runs else folder
     commanding = Commanding(by_socket(to) if to else None)
     place = Surroundings.of(folder / "config.yaml")
-    frames = FrameFolder(options.frames or folder / kept_frames.FOLDER)
+    frames = FrameFolder(options.frames or folder / images.KEPT_FRAMES_FOLDER)
     return Console(folder.name, LogTail(folder), history, place, commanding, frames=frames)
 
 

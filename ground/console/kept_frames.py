@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import Image
-from knightcube.vision.kept_frames import facts_of
+from knightcube.vision.camera.images import facts_of
 
 _LARGEST = 640
 """px of a picture's side: what the page has room for."""

@@ -10,14 +10,14 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.reference.horizon import ScannedHorizon
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.illumination import limb_rays
-from knightcube.vision.horizon.limb_fit import View
+from knightcube.vision.horizon.limb import LimbView
 from knightcube.vision.horizon.nadir import HorizonSolution
 
 _RADIUS = 5.0
 _DOT = 0.0
 
 
-def limb_in_picture(view: View, camera: CameraModel) -> FloatArray:
+def limb_in_picture(view: LimbView, camera: CameraModel) -> FloatArray:
     """Return pixels (m, 2) along the limb of a view, at most a pixel apart, where the camera sees it."""
     # The limb is seldom longer than the way round the picture.
     count = 8 * (camera.columns + camera.rows)

@@ -18,7 +18,7 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.images import EXTRA
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import Pointing
-from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import FrameSolution
 
 if TYPE_CHECKING:
     from PIL import ImageDraw

@@ -35,8 +35,7 @@ from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.edges import RUN, run_filtered
 from knightcube.vision.horizon.initial_guess import shortest_turn
-from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
-from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
+from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT
 
 
 def high_average(lines: Image) -> FloatArray:

@@ -23,28 +23,31 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.camera.images import KeptFrames, keep_frame
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.kept_frames import KeptFrames, keep_frame
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from knightcube.vision.startracker.index import sky_index
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import ShortTrails
-from knightcube.vision.startracker.solution import MOVED, FrameSolution, SolveStatus
 from knightcube.vision.startracker.solve import (
+    MOVED,
     PRIOR_SIGMAS,
     AttitudePrior,
+    FrameSolution,
     RatePrior,
     SolveSettings,
+    SolveStatus,
     solve_motion,
     solve_near,
     solve_points,
 )
 from knightcube.vision.startracker.two_ends import solve_ends
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
 
 Found = StreakResult | MotionResult
 
@@ -159,7 +162,7 @@ def _found(job: FrameJob) -> FrameFound:
 def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
     """Import the two estimators and return them; a worker does so before its first job."""
     from knightcube.vision.streaks.corners.streak_rate import estimate_rate  # noqa: PLC0415
-    from knightcube.vision.streaks.estimate import estimate_motion  # noqa: PLC0415
+    from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion  # noqa: PLC0415
 
     return estimate_motion, estimate_rate
 

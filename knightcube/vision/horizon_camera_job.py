@@ -17,7 +17,7 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResponse, SensedDirection
-from knightcube.vision.sun.solar_cells import SolarStrings
+from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
 """Of a pixel that the sunlit Earth lights, beyond what its scattered light gives beside it."""
@@ -43,7 +43,7 @@ class HorizonCameraJob:
     frames: Mapping[int, Image]
     cameras: tuple[MountedCamera, ...]
     knowledge: HorizonKnowledge
-    strings: tuple[SolarStrings, FloatArray] | None
+    strings: tuple[SolarStringModel, FloatArray] | None
     response: LogarithmicResponse | None = None
 
 
@@ -92,9 +92,12 @@ def run(job: HorizonCameraJob) -> HorizonCameraResult:
 
 
 def _sun(job: HorizonCameraJob) -> tuple[MeasuredDirection | None, str]:
-    from knightcube.vision.sun.direction import LINEAR, SunSettings  # noqa: PLC0415 - see the top
-    from knightcube.vision.sun.several_cameras import sun_of_cameras  # noqa: PLC0415
-    from knightcube.vision.sun.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
+    from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
+    from knightcube.vision.sun import (  # noqa: PLC0415 - see the top
+        LINEAR,
+        SunSettings,
+        sun_of_cameras,
+    )
 
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
@@ -117,7 +120,7 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 def _false(job: HorizonCameraJob) -> dict[int, str] | None:
     """Return why pictures are not of what a fine attitude puts before their cameras; None without one."""
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
-    from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
+    from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
 
     rough, position = job.knowledge.attitude, job.knowledge.position
     nadir, sun = _expected_nadir(job.knowledge), _lit_from(job.knowledge, None)
@@ -133,10 +136,9 @@ def _nadir(
     job: HorizonCameraJob, knowledge: HorizonKnowledge, sun: MeasuredDirection | None
 ) -> tuple[MeasuredDirection | None, str]:
     from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness  # noqa: PLC0415
-    from knightcube.vision.horizon.limb_fit import MEAN_RADIUS  # noqa: PLC0415 - see the top
-    from knightcube.vision.horizon.nadir import HorizonStatus  # noqa: PLC0415
+    from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
+    from knightcube.vision.horizon.nadir import HorizonStatus, nadir_of_cameras  # noqa: PLC0415
     from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings  # noqa: PLC0415
-    from knightcube.vision.horizon.several_cameras import nadir_of_cameras  # noqa: PLC0415
 
     settings = HorizonSettings(edges=EdgeSettings(response=job.response))
     found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings)

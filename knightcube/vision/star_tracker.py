@@ -23,8 +23,7 @@ from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex, load_once
 from knightcube.vision.startracker.sky_map import Pointing, SkyMap
-from knightcube.vision.startracker.solution import FrameSolution
-from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, RatePrior, SolveSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0

@@ -11,7 +11,7 @@ from hal.drivers.ads1115 import STEP, AdsSolarStrings, StringWiring, config_for
 from hal.interfaces.errors import OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
-from knightcube.vision.sun.solar_cells import CoarseSunStatus, SolarStrings, coarse_sun
+from knightcube.vision.solar_cells import CoarseSunStatus, SolarStringModel, coarse_sun
 from sim_hal.clock import SimClock
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.solar_strings import EmulatedAds1115, EmulatedStrings, SolarStringsModel
@@ -52,7 +52,7 @@ def test_the_strings_give_the_suns_direction_and_nothing_in_shadow() -> None:
     flown.wait(1.2)
     reading = flown.driver.latest()
     assert reading is not None
-    found = coarse_sun(reading.currents, SolarStrings(peaks=np.full(6, 0.5)))
+    found = coarse_sun(reading.currents, SolarStringModel(peaks=np.full(6, 0.5)))
     body = quaternion.attitude_matrix(flown.body.motion(flown.clock.now_ns()).quaternion)
     assert found.status is CoarseSunStatus.FOUND
     assert found.direction is not None

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.objects.rso_indicators import lengths, olae_residuals, slopes, star_ends
+from knightcube.vision.objects.detect import lengths, olae_residuals, slopes, star_ends
 from knightcube.vision.streaks.corners.detectors import cornerness
 from knightcube.vision.streaks.corners.grouping import centre_of_rotation
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings

@@ -25,8 +25,8 @@ from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from sim_hal.star_camera import StarCameraModel
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.knightcube.vision.camera.test_fits import _file
 from tests.knightcube.vision.startracker.frames import sky_frame
+from tests.support.fits_files import fits_file
 from tests.support.scenes import slew
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -72,7 +72,7 @@ def _take_pictures(folder: Path) -> None:
     Image.fromarray(sky).save(folder / "sky.tiff")
     (folder / "sky.raw").write_bytes(sky.tobytes())
     signed = (sky.astype(np.int32) - 32768).astype(">i2")
-    (folder / "sky.fits").write_bytes(_file(signed, 16, BZERO=32768))
+    (folder / "sky.fits").write_bytes(fits_file(signed, 16, BZERO=32768))
     streaks = slew(np.random.default_rng(20), float(np.radians(80.0)), 0.12, 0.2, model=model).pixels
     Image.fromarray(streaks).save(folder / "streaks.png")
     rows, columns = np.mgrid[:96, :96]

@@ -54,7 +54,7 @@ from knightcube.gnc.estimation.free_settings import FreeFilterSettings
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
-from knightcube.vision.sun.solar_cells import SolarStrings
+from knightcube.vision.solar_cells import SolarStringModel
 
 _BELOW = 0.8
 """Largest rate of a path, as a fraction of the rate at which the body is detumbled; the rest is a margin."""
@@ -266,9 +266,9 @@ def _filter(
     return OrbitFilter(settings, environment.at), problems
 
 
-def _strings(section: StringsSection) -> SolarStrings:
+def _strings(section: StringsSection) -> SolarStringModel:
     normals = np.array([string.normal for string in section.strings])
-    return SolarStrings(normals, np.array([string.peak for string in section.strings]))
+    return SolarStringModel(normals, np.array([string.peak for string in section.strings]))
 
 
 def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> CoarseSunFeed | None:

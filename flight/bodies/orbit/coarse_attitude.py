@@ -44,7 +44,7 @@ from knightcube.vision.horizon.settings import (
     SensedDirection,
 )
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult, MeasuredDirection
-from knightcube.vision.sun.solar_cells import FieldAndStrings, Sky, SolarStrings, StringFix
+from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
 """Interval (ns) between readings that are judged: their errors are correlated over shorter times."""
@@ -71,7 +71,7 @@ class CoarseSunFeed:
     """Gives the filter the attitude by field and strings."""
 
     def __init__(
-        self, strings: SolarStrings, period_ns: int, filter_: OrbitFilter, environment: OrbitEnvironment
+        self, strings: SolarStringModel, period_ns: int, filter_: OrbitFilter, environment: OrbitEnvironment
     ) -> None:
         """`period_ns`: of a round of readings, which are not of one instant."""
         self.strings = strings
@@ -147,11 +147,11 @@ class CoarseSunFeed:
             self._filter.measure_late([DirectionMeasurement(time_ns, seen, sun, covariance)], lambda _: None)
 
 
-def _sky(around: Around, sun: FloatArray) -> Sky:
+def _sky(around: Around, sun: FloatArray) -> KnownDirections:
     """Return the directions and the light of the Earth below, with clouds that are not known."""
     up = around.position / np.linalg.norm(around.position)
     light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
-    return Sky(around.field, sun, -up, light, CLOUDS * light)
+    return KnownDirections(around.field, sun, -up, light, CLOUDS * light)
 
 
 DIRECTIONS_START_SIGMA = math.radians(15.0)
@@ -296,7 +296,7 @@ class WideFeed:
             rough = RoughAttitude(then.quaternion, sigma) if sigma < ROUGH_SIGMA else None
         return HorizonKnowledge(position=around.position, sun=sun, attitude=rough, sensed=sensed)
 
-    def _strings(self, time_ns: int) -> tuple[SolarStrings, FloatArray] | None:
+    def _strings(self, time_ns: int) -> tuple[SolarStringModel, FloatArray] | None:
         newest = None if self._sun is None else self._sun.newest
         if self._sun is None or newest is None or abs(newest.time_ns - time_ns) > STRINGS_AGE_NS:
             return None

@@ -31,7 +31,7 @@ from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler
 from knightcube.gnc.control.three_axes.pointing_law import damping_dipole
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition
 from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.vision.sun.solar_cells import SolarStrings, coarse_sun
+from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 
 
 class FieldBrake:
@@ -92,7 +92,7 @@ class SunAcquisitionBrake:
     """Turns the body to the Sun, and reports whether a Sun is measured; implements `Brake` of the loop."""
 
     def __init__(
-        self, seeker: SunAcquisition, strings: SolarStrings, dipole_per_ampere: float, log: EventLog
+        self, seeker: SunAcquisition, strings: SolarStringModel, dipole_per_ampere: float, log: EventLog
     ) -> None:
         """Take n A of each coil, m^2."""
         self._seeker, self._strings = seeker, strings

@@ -19,22 +19,22 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from knightcube.vision.camera.exposure import Exposures
-from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.images import KeptFrames
+from knightcube.vision.camera.lens import CameraModel, Exposures
 from knightcube.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
-from knightcube.vision.kept_frames import KeptFrames
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
-from knightcube.vision.startracker.solution import (
+from knightcube.vision.startracker.solve import (
     NODES,
+    AttitudePrior,
     FrameSolution,
+    RatePrior,
     SolveStatus,
     middle_covariance,
     weighting_of,
 )
-from knightcube.vision.startracker.solve import AttitudePrior, RatePrior
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.geometry import Course
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.maximum_likelihood.course import Course
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.

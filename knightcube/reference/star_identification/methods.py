@@ -56,10 +56,10 @@ from knightcube.reference.star_identification.triangle_table import (
     ordered,
     side_lengths,
 )
-from knightcube.vision.startracker.identification import lost_in_space
-from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
-from knightcube.vision.startracker.identification.verification import nothing, verify_matrix
+from knightcube.vision.startracker import lost_in_space
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.verification import nothing, verify_matrix
 
 
 def propose_angles(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
@@ -357,7 +357,7 @@ def identify_by_rate(
     settings: ClassicalSettings = DEFAULT,
     motion: StarMotion | None = None,
     previous: PreviousAttitude | None = None,
-) -> Identification:
+) -> StarMatch:
     """Return which points of a field are which stars.
 
     Without `motion` all points are taken for stars, and a `previous` attitude is taken not to have turned.
@@ -367,7 +367,7 @@ def identify_by_rate(
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
     stars = field.subset(kept)
     if len(stars) < settings.verification.least_matches:
-        return nothing(field, Status.TOO_FEW_STARS)
+        return nothing(field, MatchStatus.TOO_FEW_STARS)
     answer = nothing(stars)
     if previous is not None:
         turn = np.zeros(3) if shared is None else shared.rate * previous.elapsed
@@ -375,11 +375,11 @@ def identify_by_rate(
         answer = verify_matrix(
             stars, sky.index, predicted, 1.0, previous.part_of_all_attitudes, settings.verification
         )
-    if answer.status is not Status.IDENTIFIED:
+    if answer.status is not MatchStatus.IDENTIFIED:
         answer = search(stars, sky, propose_pyramids, settings)
     star = np.full(len(field), -1)
     star[kept] = answer.star
-    return Identification(
+    return StarMatch(
         answer.status, star, answer.fix, answer.scale, answer.scale_sigma, answer.log10_false_alarm
     )
 
@@ -444,19 +444,19 @@ class Method:
         source: publication.
     """
 
-    identify: Callable[[StarField, KnownSky], Identification]
+    identify: Callable[[StarField, KnownSky], StarMatch]
     source: str
 
 
-def _default(field: StarField, sky: KnownSky) -> Identification:
+def _default(field: StarField, sky: KnownSky) -> StarMatch:
     return lost_in_space.identify(field, sky.index)
 
 
-def method_of(name: str) -> Callable[[StarField, SkyIndex], Identification]:
+def method_of(name: str) -> Callable[[StarField, SkyIndex], StarMatch]:
     """Return the method `name` of METHODS for `SolveSettings`; it builds its tables for each field."""
     method = METHODS[name]
 
-    def identify(field: StarField, index: SkyIndex) -> Identification:
+    def identify(field: StarField, index: SkyIndex) -> StarMatch:
         return method.identify(field, KnownSky(index, field.half_width))
 
     return identify

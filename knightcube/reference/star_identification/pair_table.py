@@ -23,8 +23,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.vision.startracker.index import table_file
-from knightcube.vision.startracker.index.sky_index import GuideStars
+from knightcube.vision.startracker.index.sky_index import GuideStars, TableKind, load_table, save_table
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +107,7 @@ def members(start: IntArray, stop: IntArray) -> tuple[IntArray, IntArray]:
     return np.arange(len(owner)) + (start - begin)[owner], owner
 
 
-KIND = table_file.Kind(b"KCPAIRS1", 1, "pair table", "make it again")
+KIND = TableKind(b"KCPAIRS1", 1, "pair table", "make it again")
 _PAIRS_A_CELL = 4
 
 
@@ -189,11 +188,11 @@ def save_pairs(table: PairTable, path: Path) -> None:
         "stars": float(table.stars),
         "widest": table.widest,
     }
-    table_file.save(path, KIND, columns, facts)
+    save_table(path, KIND, columns, facts)
 
 
 def load_pairs(path: Path) -> PairTable:
     """Return the table of a file, mapped. Raises InputError when it is missing, damaged or outdated."""
-    columns, facts = table_file.load(path, KIND)
+    columns, facts = load_table(path, KIND)
     key = KVector(columns["angle"], columns["count"], facts["slope"], facts["origin"])
     return PairTable(columns["first"], columns["second"], key, int(facts["stars"]), facts["widest"])

@@ -18,9 +18,13 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import FlightError
 from knightcube.reference.star_identification.known_sky import KnownSky
 from knightcube.reference.star_identification.pair_table import angles
-from knightcube.vision.startracker.identification.attitude_fit import stretched
-from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
-from knightcube.vision.startracker.identification.verification import (
+from knightcube.vision.startracker.attitude_fit import (
+    MatchStatus,
+    StarField,
+    StarMatch,
+    stretched,
+)
+from knightcube.vision.startracker.verification import (
     VerificationSettings,
     nothing,
     verify_matrix,
@@ -147,13 +151,13 @@ Propose = Callable[[View, KnownSky, ClassicalSettings], Iterator[Candidates]]
 
 def search(
     field: StarField, sky: KnownSky, propose: Propose, settings: ClassicalSettings = DEFAULT
-) -> Identification:
+) -> StarMatch:
     """Return the first candidate of `propose` that the whole field verifies, within the budget of work.
 
     Raises FieldUnknown when the scale of the field is known too badly.
     """
     if len(field) < settings.verification.least_matches:
-        return nothing(field, Status.TOO_FEW_STARS)
+        return nothing(field, MatchStatus.TOO_FEW_STARS)
     steps = list(views(field, settings))
     settings = replace(settings, joins=max(_LEAST_JOINS, settings.joins // len(steps)))
     for view in steps:
@@ -171,7 +175,7 @@ def search(
 
 def _best(
     view: View, sky: KnownSky, candidates: Candidates, taken: int, settings: ClassicalSettings
-) -> Identification | None:
+) -> StarMatch | None:
     """Return the first of the `taken` candidates that holds, those that most stars support first."""
     if not taken:
         return None
@@ -196,7 +200,7 @@ def _best(
             view.scale,
             settings=settings.verification,
         )
-        if answer.status is Status.IDENTIFIED:
+        if answer.status is MatchStatus.IDENTIFIED:
             return answer
     return None
 

@@ -7,6 +7,8 @@ pixel offsets count from 0.
 The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre
 (Brown 1966, radial terms). Beyond the tangent where the distorted radius stops growing the polynomial folds
 back on itself. The lens images nothing there, and a lens that folds within its own detector is rejected.
+
+How long to expose: stars that streak should do so over enough pixels to tell their rate.
 """
 
 from __future__ import annotations
@@ -315,3 +317,32 @@ class CameraKnowledge:
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
 """Knowledge of a camera that equals its description, such as an emulated camera."""
+
+
+STREAK = 20.0
+"""Wanted streak length (px): rates are poor below 5 px, and faint stars are lost above 100 px."""
+POINT = 1.0
+"""Motion in the usual exposure (px) below which a star is a point."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exposures:
+    """The exposures of a camera.
+
+    Attributes:
+        usual: s, of points.
+        least, most: s, of streaks.
+        scale: px by rad.
+    """
+
+    usual: float
+    least: float
+    most: float
+    scale: float
+
+    def at(self, rate: float) -> float:
+        """Return the exposure, s, while the camera turns at `rate` rad/s across its boresight."""
+        speed = rate * self.scale
+        if speed * self.usual < POINT:
+            return self.usual
+        return min(max(STREAK / speed, self.least), self.most)

@@ -15,7 +15,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import CameraModel, Lens
-from knightcube.vision.camera.pixel_access import PixelAccess
+from knightcube.vision.frame import PixelAccess
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
@@ -97,7 +97,7 @@ class Nearby:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Edges:
+class ScanEdges:
     """Places where a scan line changes from dark to bright.
 
     Attributes:
@@ -130,14 +130,14 @@ class Edges:
     def __len__(self) -> int:
         return len(self.points)
 
-    def chosen(self, which: BoolArray | IntArray) -> Edges:
+    def chosen(self, which: BoolArray | IntArray) -> ScanEdges:
         """Return the edges `which`, flags (n,) or indices."""
-        return Edges(*(getattr(self, each.name)[which] for each in fields(self)))
+        return ScanEdges(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 def find_edges(
     access: PixelAccess, settings: EdgeSettings, near: Nearby | None = None
-) -> tuple[Edges, ScanLines]:
+) -> tuple[ScanEdges, ScanLines]:
     """Return the edges on evenly spaced columns and rows, and these lines; no other pixel is read.
 
     `near` restricts the lines to those that cross a part of the picture.
@@ -200,11 +200,13 @@ def _samples(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 _NONE: FloatArray = np.zeros(0)
-_NOTHING = Edges(np.zeros((0, 2)), np.zeros((0, 2)), _NONE, _NONE, _NONE, _NONE, np.zeros((0, len(_PROFILE))))
+_NOTHING = ScanEdges(
+    np.zeros((0, 2)), np.zeros((0, 2)), _NONE, _NONE, _NONE, _NONE, np.zeros((0, len(_PROFILE)))
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Changes:
+class _BinaryChanges:
     """Where binary lines change, columns and rows as one row of pixels after another.
 
     Attributes:
@@ -233,7 +235,7 @@ def _line_edges(
     places: tuple[IntArray, IntArray],
     span: float,
     least: float,
-) -> Edges:
+) -> ScanEdges:
     """Return the edges of columns and rows (n, m) each, that lie at `places` (n,)."""
     parts, read = [], 0
     for direction, binary in enumerate(bright):
@@ -244,7 +246,9 @@ def _line_edges(
         read += binary.size
     begin, length, at, rising, other, axis = (np.concatenate(each) for each in zip(*parts, strict=True))
     step = np.where(rising, 1, -1)
-    changes = _Changes(np.concatenate([each.ravel() for each in light]), begin, length, at + rising, step)
+    changes = _BinaryChanges(
+        np.concatenate([each.ravel() for each in light]), begin, length, at + rising, step
+    )
     offset, scale, height = _refined(changes, least * span)
     place = changes.start + step * offset
     margin = np.maximum(_MARGIN, 0.5 * scale)
@@ -260,10 +264,10 @@ def _line_edges(
     profile[(index < 0) | (index > last[:, None])] = np.nan
     behind: IntArray = np.rint(place - step * (_REACH * scale + 4.0)).astype(int)
     background = changes.along(kept, behind[:, None])[:, 0]
-    return Edges(points, towards, scale, height, _FLOOR + _SHARE * scale, background, profile)
+    return ScanEdges(points, towards, scale, height, _FLOOR + _SHARE * scale, background, profile)
 
 
-def _refined(changes: _Changes, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _refined(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return offsets (k,) px from each start towards the bright, scales (k,), heights of the steps (k,).
 
     A step lower than `weak` is not an edge.
@@ -287,7 +291,7 @@ def _refined(changes: _Changes, weak: float) -> tuple[FloatArray, FloatArray, Fl
     return offset, scale, height
 
 
-def _steepest(changes: _Changes, which: IntArray, size: float) -> tuple[FloatArray, FloatArray]:
+def _steepest(changes: _BinaryChanges, which: IntArray, size: float) -> tuple[FloatArray, FloatArray]:
     """Return where (k,) each line is steepest near its start, and the height of a sharp step as steep."""
     window, slope, reach = _slope(size)
     index = changes.start[which, None] + changes.step[which, None] * window
@@ -367,7 +371,7 @@ class Observation:
     """
 
     space: float
-    edges: Edges
+    edges: ScanEdges
     rays: EdgeRays
     across: FloatArray
     down: FloatArray
@@ -375,7 +379,7 @@ class Observation:
 
 
 def observe(
-    edges: Edges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
+    edges: ScanEdges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
 ) -> Observation:
     """Return edges and samples as directions; edges outside the lens's image are excluded.
 

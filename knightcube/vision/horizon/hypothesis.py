@@ -31,18 +31,20 @@ from knightcube.vision.horizon.initial_guess import (
     Place,
     sun_from,
 )
-from knightcube.vision.horizon.limb_fit import (
+from knightcube.vision.horizon.limb import (
+    SCALE_HEIGHT,
+    UNIT_DEPTH_HEIGHT,
     UNKNOWN,
     FittedLimb,
+    LimbView,
     Prior,
-    View,
     crossed,
     fit_limb,
+    fit_profiles,
     limb_gradients,
     limb_residuals,
     stepped,
 )
-from knightcube.vision.horizon.limb_profile import SCALE_HEIGHT, UNIT_DEPTH_HEIGHT, fit_profiles
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
@@ -87,14 +89,14 @@ class LimbPoints:
         return LimbPoints(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
-def near_limb(view: View, observation: Observation, tolerance: float) -> BoolArray:
+def near_limb(view: LimbView, observation: Observation, tolerance: float) -> BoolArray:
     """Return which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
     near = np.abs(limb_residuals(view, observation.rays.rays)) < tolerance * observation.rays.pixel
     return np.asarray(near & (observation.rays.brighter @ view.nadir > 0.0))
 
 
 def limb_points(
-    view: View, observation: Observation, members: BoolArray, sun: FloatArray | None
+    view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
     """Return the members in daylight whose scan line is not too oblique to the limb."""
     chosen = np.flatnonzero(members)
@@ -112,7 +114,7 @@ def limb_points(
 
 
 def placed_by_profile(
-    view: View, observation: Observation, limb: LimbPoints, settings: HorizonSettings
+    view: LimbView, observation: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
     """Return the points placed by the limb's profile if pixels are coarse enough for it."""
     reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
@@ -335,7 +337,7 @@ def _chance(
     return chance + math.log10(guess.orientation.share)
 
 
-def _breadth(view: View, observation: Observation, used: BoolArray, settings: HorizonSettings) -> float:
+def _breadth(view: LimbView, observation: Observation, used: BoolArray, settings: HorizonSettings) -> float:
     """Return the breadth of the used edges over that of the air and the blur."""
     reach = math.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
     air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(observation.rays.pixel[used])))
@@ -343,7 +345,7 @@ def _breadth(view: View, observation: Observation, used: BoolArray, settings: Ho
 
 
 def _fitted(
-    view: View,
+    view: LimbView,
     observation: Observation,
     members: BoolArray,
     sun: FloatArray | None,
@@ -371,7 +373,7 @@ def _fitted(
 
 
 def _coverage(
-    view: View,
+    view: LimbView,
     observation: Observation,
     used: BoolArray,
     sun: FloatArray | None,

@@ -27,10 +27,9 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.vision.camera.lens import Lens, MountedCamera
-from knightcube.vision.camera.pixel_access import ArrayPixels, PixelAccess
+from knightcube.vision.frame import ArrayPixels, PixelAccess
 from knightcube.vision.horizon.edges import Samples
-from knightcube.vision.horizon.limb_fit import MEAN_RADIUS, View, limb_residuals
-from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
+from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
 TWILIGHT = np.radians(12.0)
 """Depression of the Sun (rad) beyond which ground and air count as night."""
@@ -58,7 +57,7 @@ class Agreement:
     lit_samples: int
 
 
-def sun_elevation(view: View, rays: FloatArray, sun: FloatArray) -> FloatArray:
+def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArray:
     """Return the Sun's elevation (n,) rad where rays (n, 3) meet the surface, or pass it nearest.
 
     `sun` (3,) is a unit vector in inertial axes.
@@ -75,7 +74,7 @@ def sun_elevation(view: View, rays: FloatArray, sun: FloatArray) -> FloatArray:
     return np.asarray(np.arcsin(np.minimum(np.maximum(sine, -1.0), 1.0)))
 
 
-def agreement(view: View, sun: FloatArray | None, samples: Samples) -> Agreement:
+def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
     """Return how a view agrees with samples; without a Sun only the sky counts."""
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
@@ -97,7 +96,7 @@ def agreement(view: View, sun: FloatArray | None, samples: Samples) -> Agreement
     )
 
 
-def limb_rays(view: View, count: int) -> FloatArray:
+def limb_rays(view: LimbView, count: int) -> FloatArray:
     """Return `count` rays (count, 3) in camera axes evenly round the limb."""
     stretching = view.surface.stretching(view.limb_height)
     centre = -(stretching @ view.position)

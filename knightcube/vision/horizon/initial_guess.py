@@ -27,17 +27,17 @@ from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.horizon.edges import EdgeRays, Observation
 from knightcube.vision.horizon.illumination import agreement
-from knightcube.vision.horizon.limb_fit import (
+from knightcube.vision.horizon.limb import (
     MEAN_RADIUS,
+    UNIT_DEPTH_HEIGHT,
     UNKNOWN,
     Ellipsoid,
-    View,
+    LimbView,
     crossed,
     earth,
     mean_sphere,
     turn,
 )
-from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _PARALLEL = 1e-12
@@ -314,7 +314,7 @@ class InitialGuess:
     """
 
     place: Place
-    view: View
+    view: LimbView
     orientation: Orientation
     members: BoolArray
 
@@ -365,13 +365,13 @@ def _first_view(
     observation: Observation,
     place: Place,
     knowledge: HorizonKnowledge,
-) -> tuple[View, Orientation]:
+) -> tuple[LimbView, Orientation]:
     """Return the first view and its orientation; on a sphere if the turn about nadir is unknown."""
     down = -place.position / np.linalg.norm(place.position)
     nothing = HorizonKnowledge()
     stand = orientation(candidate.direction, down, knowledge if place.located else nothing)
     height = UNIT_DEPTH_HEIGHT
-    view = View(stand.rotation, place.position, place.surface, height)
+    view = LimbView(stand.rotation, place.position, place.surface, height)
     if np.isfinite(stand.sigma):
         return view, stand
     distance = float(np.linalg.norm(place.position))

@@ -27,9 +27,9 @@ from knightcube.vision.objects.star_light import spread_over, spread_with_slopes
 from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
 from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
-from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 
 _REACH = 5.0
 """Half size of an object's patch, in point spreads."""
@@ -200,7 +200,7 @@ def stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: FloatA
     return Stars(middle[seen], half[seen], known.magnitude[near][seen])
 
 
-class Scene:
+class FramePatches:
     """The pixels about any place of a frame, with the stars there; places and light in px and counts."""
 
     def __init__(self, seen: Survey, stars: Stars, zero: float, psf: float) -> None:
@@ -369,7 +369,7 @@ def _among_streaks(
     if report is None or not report.objects:
         return _NOTHING
     zero = _zero_point(solution, motion)
-    scene = Scene(seen, stars, zero, detection.psf_sigma or settings.search.psf_sigma)
+    scene = FramePatches(seen, stars, zero, detection.psf_sigma or settings.search.psf_sigma)
     fits = []
     for found in report.objects:
         half = 0.5 * (found.endpoints[1] - found.endpoints[0])
@@ -412,7 +412,7 @@ def _among_points(seen: Survey, stars: Stars, settings: ObjectMeasurementSetting
     faintness = _faintness(areas.flux[strong])
     zero = float(np.median(stars.magnitude[nearest[own]] + faintness[own]))
     inside = _inside(areas, strong)
-    scene = Scene(seen, stars, zero, seen.settings.psf_sigma or settings.search.psf_sigma)
+    scene = FramePatches(seen, stars, zero, seen.settings.psf_sigma or settings.search.psf_sigma)
     fits = []
     for number in np.flatnonzero(~is_star & (zero - faintness <= settings.faintest) & inside):
         area = int(strong[number])

@@ -28,7 +28,7 @@ from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.startracker.identification.attitude_fit import (
+from knightcube.vision.startracker.attitude_fit import (
     inflation,
     scale_slope,
     stretched,
@@ -116,7 +116,7 @@ def fit_in_image(
     Raises AttitudeError if the stars do not determine the parameters.
     """
     seen = _Seen(camera.unit_vectors(points), _slopes(points, camera), covariance, reference, unknowns)
-    pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
+    pose = seen.fitted(_FittedPose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     if squares.max() > _FARTHEST:
         pose, agree = _without_outliers(seen, pose, squares)
@@ -132,7 +132,7 @@ def fit_in_image(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Pose:
+class _FittedPose:
     """Attitude (3, 3), scale, bend (6,), delay, and the covariance of these parameters."""
 
     matrix: FloatArray
@@ -174,12 +174,12 @@ class _Seen:
         """The numbers of bend and delay among the parameters, after the rotation and ln scale."""
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
-    def parameters(self, pose: _Pose) -> float:
+    def parameters(self, pose: _FittedPose) -> float:
         """Return the number of parameters that the stars determine; those with a prior count in part."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
-    def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
+    def fitted(self, start: _FittedPose, weight: FloatArray) -> _FittedPose:
         """Return the pose that minimises the squares, weighted with `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
         matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
@@ -206,10 +206,10 @@ class _Seen:
                 break
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
-    def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _Pose:
+    def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
         """Return a pose with the bend and delay in `held` (0, 1, 6 or 7,)."""
         bends = len(self.unknowns.bend)
-        return _Pose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
+        return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return d(whitened residuals)/d(turn, ln scale, bend, delay), (2n, 3 to 11)."""
@@ -222,21 +222,21 @@ class _Seen:
             slopes.append(-whitener @ self.late[:, :, None])
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
-    def directions(self, pose: _Pose) -> FloatArray:
+    def directions(self, pose: _FittedPose) -> FloatArray:
         """Return the observed unit vectors (n, 3) at mid-exposure, corrected for the lens of a pose."""
         seen = bent(stretched(self.observed, pose.scale), pose.bend)
         return seen - pose.delay * self.late if len(self.late) else seen
 
-    def squares(self, pose: _Pose) -> FloatArray:
+    def squares(self, pose: _FittedPose) -> FloatArray:
         """Return each star's squared error over its covariance (n,)."""
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
 
-    def missed(self, pose: _Pose) -> FloatArray:
+    def missed(self, pose: _FittedPose) -> FloatArray:
         """Return the difference (n, 3) between observed and predicted direction of each star."""
         return self.directions(pose) - self.reference @ pose.matrix.T
 
 
-def _without_outliers(seen: _Seen, pose: _Pose, squares: FloatArray) -> tuple[_Pose, BoolArray]:
+def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
     """Return the fit to the stars that agree, and a mask (n,) of these stars.
 
     An outlier shifts all residuals: their spread is meaningless until its influence is bounded.
@@ -255,7 +255,7 @@ def _agreeing(squares: FloatArray) -> BoolArray:
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
 
 
-def _scattered(seen: _Seen, pose: _Pose, agree: BoolArray) -> tuple[_Seen, _Pose]:
+def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
     """Return stars and fit with the variance that stars which `agree` (n,) share beside their own."""
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):

@@ -19,7 +19,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel
-from knightcube.vision.startracker.identification.attitude_fit import scale_slope
+from knightcube.vision.startracker.attitude_fit import scale_slope
 
 
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:

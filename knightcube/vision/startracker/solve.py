@@ -1,4 +1,12 @@
-"""The steps from stars in a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
+"""The result of the star tracker for one frame, and how its attitude relates to mid-exposure.
+
+At a constant rate the middle of a streak is the position of the star at mid-exposure. An acceleration a
+shifts the mean of a point's light by a T^2 / 24 and the middle of the two ends of a streak by a T^2 / 8. A
+fit that includes the acceleration is shifted only by terms beyond the square of time. White angular
+acceleration of density q adds the variance q T^3 over 320, 48 and 4743 respectively (the integrals of its
+second integral over the same weights).
+
+The steps from stars in a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
 
 Points are measured by `detection`; for streaks, the positions of their stars at mid-exposure serve as points.
 Identification searches near a prior attitude first, if there is one, then in the whole sky. The result is the
@@ -10,30 +18,169 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.attitude.wahba import AttitudeError, Solver
+from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, LensError, Pinhole
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.detection import (
     Detections,
     DetectionSettings,
     FrameKind,
     measure_near,
 )
-from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings, identify
-from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
-from knightcube.vision.startracker.identification.tracking import track
-from knightcube.vision.startracker.identification.verification import expected_stars
 from knightcube.vision.startracker.image_fit import Unknowns, attitude_by, fit_in_image
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.sky_map import ShortTrails, SkyMap, apparent, known_bend, usual_bend
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus, timing_covariance
-from knightcube.vision.streaks.geometry import Course
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
+from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
+from knightcube.vision.startracker.verification import expected_stars, track
+from knightcube.vision.streaks.maximum_likelihood.course import Course
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+
+
+class SolveStatus(Enum):
+    """The outcome of one frame."""
+
+    SOLVED = "solved"
+    NO_STARS = "no-stars"
+    TOO_FEW_STARS = "too-few-stars"
+    NO_MATCH = "no-match"
+    AMBIGUOUS = "ambiguous"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSolution:
+    """The attitude of one frame at mid-exposure, and the rate if the stars are streaks.
+
+    Attributes:
+        status: the attributes from `star` on are valid for SOLVED only.
+        reason: why the frame was not solved, in one sentence; empty if it was.
+        kind: whether the frame shows points or streaks.
+        camera: the camera, with the focal length fitted to the stars if it was free.
+        points: positions of the detected stars at mid-exposure (n, 2), px, the brightest first.
+        covariance: of the positions (n, 2, 2), px^2.
+        late: displacement of the points by one standard deviation of the line time of the shutter (n, 2), px;
+            (0, 2) if the line time is exact.
+        star: numbers of the guide stars (n,); -1 for a point without one.
+        expected: predicted positions of the guide stars (n, 2), px; NaN for a point without one.
+        fix: attitude, ICRS to camera, and its covariance; the scalar part of the quaternion is not negative.
+        scale_sigma: relative standard deviation of the focal length; 0 if it was given.
+        bend: fitted errors of an inexact lens (6,), see `sky_map`; zeros for an exact lens.
+        log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
+        tracked: whether the stars were identified near the prior attitude.
+        motion: motion from the streaks, camera frame; None for points.
+        mirrored: whether the image shows the mirrored sky. `fix` is then the attitude of the image with left
+            and right exchanged about the optical axis; `points` and `expected` refer to the original image.
+    """
+
+    status: SolveStatus
+    reason: str
+    kind: FrameKind
+    camera: CameraModel
+    points: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    late: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    star: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    expected: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    fix: AttitudeFix | None = None
+    scale_sigma: float = 0.0
+    bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
+    log10_false_alarm: float = 0.0
+    tracked: bool = False
+    motion: MotionResult | None = None
+    mirrored: bool = False
+
+    @property
+    def matched(self) -> IntArray:
+        """The numbers (m,) of the points that are guide stars."""
+        return np.flatnonzero(self.star >= 0)
+
+    def wider(self, by: FloatArray) -> FrameSolution:
+        """Return the solution with `by` (3, 3), rad^2, added to the covariance of its attitude, if any."""
+        if self.fix is None:
+            return self
+        return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
+
+    def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
+        """Return the conversion between pixels and directions; None if the frame was not solved.
+
+        `velocity` (3,), m/s, is the velocity with which the frame was solved.
+        """
+        return None if self.fix is None else SkyMap(self.camera, self.fix.quaternion, self.bend, velocity)
+
+
+NODES = (0.0, 0.25, 0.75, 1.0)
+"""Fractions of the exposure at which the rotation since mid-exposure is evaluated."""
+MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
+
+
+@dataclass(frozen=True, slots=True)
+class Weighting:
+    """The weights with which the attitude of a frame averages the attitudes during its exposure.
+
+    Attributes:
+        weights: weights of the rotations at `NODES`; the remainder to one is the weight of mid-exposure.
+        noise_share: variance due to white angular acceleration, in units of q T^3.
+    """
+
+    weights: tuple[float, float, float, float]
+    noise_share: float
+
+
+MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
+"""Points: the mean over the exposure, by Simpson's rule."""
+ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
+"""Streaks fitted at a constant rate, which their ends determine, or measured at their ends alone."""
+MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
+"""Streaks fitted with an acceleration: the middle of the parabola that fits the motion best."""
+
+
+def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
+    """Return the weighting of a frame with this motion."""
+    if motion.status not in MOVED:
+        return MEAN
+    fitted = isinstance(motion, MotionResult) and motion.rate_model == "accelerating"
+    return MIDDLE if fitted else ENDS
+
+
+def middle_covariance(
+    weighting: Weighting, turns: FloatArray, angular_acceleration_psd: FloatArray, exposure: float
+) -> FloatArray:
+    """Return the covariance (3, 3), rad^2, of the measured attitude relative to that at mid-exposure.
+
+    Args:
+        weighting: weighting of the frame.
+        turns: estimated rotations from mid-exposure to each of `NODES` (4, 3), rad.
+        angular_acceleration_psd: density of unmodelled white angular acceleration (3, 3), rad^2/s^3.
+        exposure: exposure time, s.
+    """
+    known = np.asarray(weighting.weights) @ turns
+    return np.outer(known, known) + angular_acceleration_psd * weighting.noise_share * exposure**3
+
+
+def timing_covariance(motion: MotionResult) -> FloatArray:
+    """Return the covariance (3, 3), rad^2, of the rotation error that all stars of a frame share.
+
+    If the rate changes, only the light along a streak determines its position at mid-exposure. A wrong
+    acceleration makes all stars early or late by the same time, which does not average out over the stars.
+    The uncertainty of the best star along its path bounds this error.
+    """
+    if motion.acceleration is None or motion.rate is None:
+        return np.zeros((3, 3))
+    velocity = (motion.endpoints[:, 1] - motion.endpoints[:, 0]) / motion.exposure
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = motion.used & (speed > 0.0)
+    if not moving.any():
+        return np.zeros((3, 3))
+    along = np.einsum("ni,nij,nj->n", velocity, motion.star_covariance, velocity)[moving]
+    return np.outer(motion.rate, motion.rate) * float(np.min(along / speed[moving] ** 4))
+
 
 # Position error (px) due to residual distortion of the lens or to the colour of the star.
 _LEAST_SIGMA_PX = 0.005
@@ -79,7 +226,7 @@ class SolveSettings:
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
-    method: Callable[[StarField, SkyIndex], Identification] | None = None
+    method: Callable[[StarField, SkyIndex], StarMatch] | None = None
     attitude: Solver | None = None
     velocity: FloatArray | None = None
     lens: CameraKnowledge | None = None
@@ -221,7 +368,7 @@ def solve_near(
     if trails is not None and trails.delay_sigma:
         seen = replace(seen, late=trails.delay_sigma * late)
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
-    if near.status is not Status.IDENTIFIED:
+    if near.status is not MatchStatus.IDENTIFIED:
         return None
     solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found, settings)
     return solution if _agrees(solution, prior) else None
@@ -261,7 +408,7 @@ def _identify(
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
-        if near.status is Status.IDENTIFIED:
+        if near.status is MatchStatus.IDENTIFIED:
             solution = _with_attitude(replace(seen, tracked=True), near, sky, settings)
             if _agrees(solution, prior):
                 return solution
@@ -272,7 +419,7 @@ def _identify(
         # The rate of a mirrored picture would be wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
-    if found.status is Status.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
+    if found.status is MatchStatus.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
         found = identify(star_field(seen, flux, scale, _UNTOLD_SIGMA_PX), sky, options)
     if found.mirrored:
         # The mirrored positions are fitted, and the original ones reported.
@@ -308,10 +455,10 @@ def star_field(
 
 
 def _with_attitude(
-    seen: FrameSolution, found: Identification, sky: SkyIndex, settings: SolveSettings
+    seen: FrameSolution, found: StarMatch, sky: SkyIndex, settings: SolveSettings
 ) -> FrameSolution:
     """Return `seen` with the identified stars and the attitude fitted to their positions in the image."""
-    if found.status is not Status.IDENTIFIED or found.fix is None:
+    if found.status is not MatchStatus.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
     free_lens = free_scale and settings.untold_lens
@@ -364,7 +511,7 @@ def _known_bend(
     return np.zeros(0) if free_scale or settings.lens is None else known_bend(camera, settings.lens)
 
 
-def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
+def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     """Return the camera with the fitted focal length, and a pinhole with the fitted distortion."""
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
@@ -383,9 +530,9 @@ def lens_floor(camera: CameraModel) -> FloatArray:
     return np.diag((_UNTOLD_LENS_PX * np.array([across, across, about])) ** 2)
 
 
-def _reason(status: Status, seen: FrameSolution) -> str:
+def _reason(status: MatchStatus, seen: FrameSolution) -> str:
     count = len(seen.points)
     return {
-        Status.TOO_FEW_STARS: f"{count} stars are too few to identify",
-        Status.AMBIGUOUS: f"the {count} brightest points match the sky in more than one place",
+        MatchStatus.TOO_FEW_STARS: f"{count} stars are too few to identify",
+        MatchStatus.AMBIGUOUS: f"the {count} brightest points match the sky in more than one place",
     }.get(status, f"the {count} brightest points match no part of the sky beyond chance")

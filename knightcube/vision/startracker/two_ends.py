@@ -29,8 +29,13 @@ from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
-from knightcube.vision.startracker.solve import AttitudePrior, SolveSettings, solve_places
+from knightcube.vision.startracker.solve import (
+    AttitudePrior,
+    FrameSolution,
+    SolveSettings,
+    SolveStatus,
+    solve_places,
+)
 from knightcube.vision.streaks.streak_result import StreakResult
 
 # px, of an endpoint: a residual below is luck of few streaks, not precision.

@@ -10,7 +10,7 @@ import pytest
 from ground.calibration.terms import FixedTerms, fit_terms
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import Lens, Pinhole
-from tests.knightcube.vision.startracker.test_calibration import _begun, _frames, _lens
+from tests.ground.calibration.test_calibration import _begun, _frames, _lens
 
 
 def _errors(found: FixedTerms, truth: Lens, begun: Pinhole) -> dict[str, float]:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.identification.lost_in_space import identify
-from knightcube.vision.startracker.identification.star_field import Status
+from knightcube.vision.startracker.attitude_fit import MatchStatus
 from knightcube.vision.startracker.index.sky_index import load
+from knightcube.vision.startracker.lost_in_space import identify
 from tests.ground.commands.in_process import command
 from tests.support.star_lists import ListKind, draw
 
@@ -28,7 +28,7 @@ def test_the_index_of_a_camera_serves_its_field_and_is_smaller(tmp_path: Path) -
             ListKind(field_deg=20.0, noise_px=0.3, false_stars=2), sky.stars, np.random.default_rng(seed)
         )
         found = identify(drawn.field(), sky)
-        assert found.status is Status.IDENTIFIED
+        assert found.status is MatchStatus.IDENTIFIED
         matched = found.star >= 0
         assert np.mean(found.star[matched] == drawn.star[matched]) > 0.8
 

@@ -10,7 +10,7 @@ import pytest
 
 from ground.console.kept_frames import FrameFolder, binned, pixels_of, png, stretched
 from knightcube.astro.arrays import Image
-from knightcube.vision.kept_frames import portable_grey_map
+from knightcube.vision.camera.images import portable_grey_map
 
 FACTS = {"exposure_s": 0.2, "star_points": [[3.0, 4.5]], "object_points": [], "rate_rad_s": None}
 

@@ -21,7 +21,7 @@ from knightcube.reference.horizon import (
 )
 from knightcube.vision.horizon.edges import run_filtered
 from knightcube.vision.horizon.initial_guess import shortest_turn
-from knightcube.vision.horizon.limb_fit import turn
+from knightcube.vision.horizon.limb import turn
 
 PAPER_POINTS = np.array([[258.0, 128.0], [215.0, 256.0], [200.0, 384.0]])
 """Edge points of the MAQSAT picture (Meller 3.1)."""

@@ -15,11 +15,18 @@ from knightcube.astro.quaternion import angle_between, from_rotation_vector, mul
 from knightcube.errors import InputError
 from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
-from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
+from knightcube.vision.startracker.solve import (
+    AttitudePrior,
+    FrameSolution,
+    RatePrior,
+    SolveSettings,
+    SolveStatus,
+    solve_motion,
+)
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 

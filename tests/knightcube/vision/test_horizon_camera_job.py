@@ -9,7 +9,7 @@ from knightcube.astro.quaternion import from_matrix
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude
 from knightcube.vision.horizon_camera_job import EARTHLIGHT_SIGMA, HorizonCameraJob, run
-from knightcube.vision.sun.solar_cells import SolarStrings
+from knightcube.vision.solar_cells import SolarStringModel
 
 SUN, NADIR = np.array([-0.59, 0.13, 0.80]), np.array([0.66, -0.62, -0.42])
 SHARES = np.array([0.14, 0.14, 0.83, 0.61, 0.15, 0.11])
@@ -33,7 +33,7 @@ def off_deg(sigma: float) -> float:
     """Return how far off the strings' Sun is, deg, with an attitude known to `sigma` rad."""
     knowledge = HorizonKnowledge(position=POSITION, attitude=RoughAttitude(attitude(), sigma))
     dark = np.zeros((64, 64), dtype=np.uint8)
-    found = run(HorizonCameraJob({0: dark}, (CAMERA,), knowledge, (SolarStrings(), SHARES))).sun
+    found = run(HorizonCameraJob({0: dark}, (CAMERA,), knowledge, (SolarStringModel(), SHARES))).sun
     assert found is not None
     assert not found.cameras
     return float(np.degrees(np.arccos(found.direction @ SUN / np.linalg.norm(SUN))))

@@ -19,8 +19,8 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.sun.direction import SunSettings, find_sun
+from knightcube.vision.frame import ArrayPixels
+from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.schedule import parse, put

@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.edges import find_edges, observe
 from knightcube.vision.horizon.nadir import find_nadir
 from sim_hal.earth_camera import nadir, render

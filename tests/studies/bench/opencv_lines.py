@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
-from knightcube.vision.frame.background import estimate_background
+from knightcube.vision.frame import estimate_background
 
 _WHITE_SIGMAS = 16.0
 _MASK_SIGMAS = 4.0

@@ -30,8 +30,7 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.sky_map import Pointing
-from knightcube.vision.startracker.solution import FrameSolution
-from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, RatePrior, SolveSettings
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers

@@ -28,11 +28,10 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.startracker.identification.attitude_fit import refine
-from knightcube.vision.startracker.identification.lost_in_space import identify
-from knightcube.vision.startracker.identification.star_field import Status
+from knightcube.vision.startracker.attitude_fit import MatchStatus, refine
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.lost_in_space import identify
 from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 
 _SEED = 271_828
@@ -64,7 +63,7 @@ def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
         begin = time.process_time()
         found = identify(field, sky)
         ms = 1000.0 * (time.process_time() - begin)
-        if found.status is not Status.IDENTIFIED or found.fix is None:
+        if found.status is not MatchStatus.IDENTIFIED or found.fix is None:
             answers.append(Answer(ms, None))
             continue
         matched = found.star >= 0
@@ -167,8 +166,8 @@ def memory_of_index() -> float:
     script = (
         "import resource, numpy as np\n"
         "from knightcube.vision.startracker.index.build import default_index\n"
-        "from knightcube.vision.startracker.identification.star_field import StarField\n"
-        "from knightcube.vision.startracker.identification.lost_in_space import identify\n"
+        "from knightcube.vision.startracker.attitude_fit import StarField\n"
+        "from knightcube.vision.startracker.lost_in_space import identify\n"
         "def now(): return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20\n"
         "before = now()\n"
         "sky = default_index()\n"

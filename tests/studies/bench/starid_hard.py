@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.vision.startracker.identification.lost_in_space import identify
-from knightcube.vision.startracker.identification.star_field import Identification
+from knightcube.vision.startracker.attitude_fit import StarMatch
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
+from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
 from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
@@ -96,7 +96,7 @@ def drawn_list(row: Hardship, stars: GuideStars, rng: np.random.Generator) -> St
     return draw(kind, stars, rng)
 
 
-def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[Identification, float]:
+def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[StarMatch, float]:
     """Return our answer and its milliseconds."""
     field = drawn.field()
     if row.hint:
@@ -106,7 +106,7 @@ def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[Identificat
     return found, 1000.0 * (time.process_time() - begin)
 
 
-def verdict(row: Hardship, drawn: StarList, found: Identification) -> str:
+def verdict(row: Hardship, drawn: StarList, found: StarMatch) -> str:
     """Return right, wrong or refused; of a distorted lens right, misleading or refused."""
     if found.fix is None:
         return "refused"

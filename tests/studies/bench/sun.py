@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.sun.direction import LINEAR, SunSettings, find_sun
+from knightcube.vision.frame import ArrayPixels
+from knightcube.vision.sun import LINEAR, SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
 

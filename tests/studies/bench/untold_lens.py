@@ -35,8 +35,7 @@ from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import Lens
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.detection import FrameKind
-from knightcube.vision.startracker.solution import FrameSolution
-from knightcube.vision.startracker.solve import SolveSettings, lens_floor, solve_places
+from knightcube.vision.startracker.solve import FrameSolution, SolveSettings, lens_floor, solve_places
 from tests.knightcube.vision.startracker.frames import EPOCH, sky
 from tests.studies.bench.sky import FIELD_SHARE, PHOTOGRAPHS, angle_arcsec, believed, centre_of
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from knightcube.vision.camera.pixel_access import ArrayPixels
-from knightcube.vision.sun.direction import SunSettings, find_sun
+from knightcube.vision.frame import ArrayPixels
+from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, render, sun_direction
 from tests.sim_hal.earth_camera.scenes import random_sun_scene
 

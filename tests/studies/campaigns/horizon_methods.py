@@ -32,10 +32,9 @@ from knightcube.reference.horizon import (
     scan_horizon,
 )
 from knightcube.vision.camera.lens import MountedCamera
-from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
-from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.limb import MEAN_RADIUS
+from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
-from knightcube.vision.horizon.several_cameras import nadir_of_cameras
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

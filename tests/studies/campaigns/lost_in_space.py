@@ -24,7 +24,7 @@ from knightcube.astro.quaternion import attitude_matrix
 from knightcube.reference.star_identification.known_sky import KnownSky
 from knightcube.reference.star_identification.methods import METHODS, StarMotion, identify_by_rate
 from knightcube.reference.star_identification.pair_table import angles
-from knightcube.vision.startracker.identification.star_field import Identification, StarField, Status
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.star_lists import PIXELS, ListKind, StarList, draw
@@ -108,7 +108,7 @@ def known_sky(field_deg: float) -> KnownSky:
     return sky
 
 
-def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> Identification:
+def answer_of(name: str, field: StarField, sky: KnownSky, motion: StarMotion) -> StarMatch:
     """Return the answer of a method, with all that it can use."""
     if name == "rate":
         return identify_by_rate(field, sky, motion=motion)
@@ -130,9 +130,9 @@ def moving(drawn: StarList, generator: np.random.Generator) -> StarMotion:
     return StarMotion(velocity + sigma[:, None] * generator.standard_normal(velocity.shape), sigma)
 
 
-def verdict(answer: Identification, drawn: StarList) -> str:
+def verdict(answer: StarMatch, drawn: StarList) -> str:
     """Return right, wrong or refused."""
-    if answer.status is not Status.IDENTIFIED or answer.fix is None:
+    if answer.status is not MatchStatus.IDENTIFIED or answer.fix is None:
         return "refused"
     true, found = (attitude_matrix(q) for q in (drawn.attitude, answer.fix.quaternion))
     off = float(angles(true[2], found[2]))

@@ -32,12 +32,11 @@ from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Repo
 from knightcube.gnc.attitude.single_frame import Sight
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
-from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
+from knightcube.vision.horizon.limb import MEAN_RADIUS
+from knightcube.vision.horizon.nadir import nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, SensedDirection
-from knightcube.vision.horizon.several_cameras import nadir_of_cameras
-from knightcube.vision.sun.direction import SunSettings
-from knightcube.vision.sun.several_cameras import SunOfCameras, sun_of_cameras
-from knightcube.vision.sun.solar_cells import CoarseSun, SolarStrings, coarse_sun
+from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_sun
+from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.emulators.solar_strings import SolarStringsModel
 from tests.studies.campaigns import orbit_world
@@ -109,7 +108,7 @@ class _Flight:
         self._model = camera_model()
         self._cameras = [MountedCamera(self._model.lens, np.array(one.mounting)) for one in suite.cameras]
         self._air, self._rotation = random_air(self._rng), self._rng.uniform(0.0, 2.0 * np.pi)
-        self._strings = SolarStrings()
+        self._strings = SolarStringModel()
         count = len(self._strings.peaks)
         self._currents = SolarStringsModel(
             self._strings.normals, self._strings.peaks, 0.02 * self._rng.standard_normal(count)

@@ -20,7 +20,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.shadow import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
-from knightcube.vision.sun.solar_cells import SolarStrings, coarse_sun
+from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_strings import SolarStringsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds import sun
@@ -64,7 +64,7 @@ class SafeFlight:
         release = TipOff(speed=wanted.get("speed", SPEED))
         self._flight = FreeFlight(wanted["craft"], seed, wanted["orbit"], release, disturbances)
         self._draws = np.random.default_rng([seed, _STREAM])
-        self._strings = SolarStrings()
+        self._strings = SolarStringModel()
         gains = GAIN_ERROR * self._draws.standard_normal(len(self._strings.peaks))
         self._light = SolarStringsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
         seeking = SunAcquisitionSettings(

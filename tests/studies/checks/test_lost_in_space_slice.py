@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from knightcube.reference.star_identification.methods import METHODS
-from knightcube.vision.startracker.identification.star_field import Identification, Status
-from knightcube.vision.startracker.identification.verification import nothing
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
+from knightcube.vision.startracker.verification import nothing
 from tests.studies.campaigns import lost_in_space
 from tests.studies.campaigns.campaign import Case, Result
 from tests.support.star_lists import ListKind, draw
@@ -56,10 +56,10 @@ def test_an_answer_off_by_more_than_the_noise_allows_is_wrong() -> None:
     drawn = draw(ListKind(field_deg=15.0, known_deg=0.0), sky.index.stars, np.random.default_rng(7))
     field = drawn.field()
     good = METHODS["pyramid"].identify(field, sky)
-    assert good.status is Status.IDENTIFIED
+    assert good.status is MatchStatus.IDENTIFIED
     assert good.fix is not None
     assert lost_in_space.verdict(good, drawn) == "right"
     tilt = good.fix.quaternion + np.array([0.005, 0.0, 0.0, 0.0])
     fix = replace(good.fix, quaternion=tilt / np.linalg.norm(tilt))
-    assert lost_in_space.verdict(Identification(good.status, good.star, fix), drawn) == "wrong"
+    assert lost_in_space.verdict(StarMatch(good.status, good.star, fix), drawn) == "wrong"
     assert lost_in_space.verdict(nothing(field), drawn) == "refused"

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from knightcube.vision.startracker.identification.lost_in_space import identify
-from knightcube.vision.startracker.identification.star_field import Identification, Status
-from knightcube.vision.startracker.identification.verification import nothing
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
 from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.lost_in_space import identify
+from knightcube.vision.startracker.verification import nothing
 from tests.studies.bench import starid_hard
 from tests.studies.bench.starid_hard import drawn_list, hardships, measured
 from tests.support.star_lists import ListKind, draw
@@ -44,10 +44,10 @@ def test_an_answer_to_strewn_points_is_wrong_and_none_is_refused() -> None:
         drawn_list(hardships()["unknown 10-30 deg, mirrored"], default_index().stars, rng),
         default_index(),
     )
-    assert found.status is Status.IDENTIFIED
+    assert found.status is MatchStatus.IDENTIFIED
     assert starid_hard.verdict(row, drawn, nothing(drawn.field())) == "refused"
     assert (
-        starid_hard.verdict(row, drawn, Identification(found.status, np.arange(len(drawn.star)), found.fix))
+        starid_hard.verdict(row, drawn, StarMatch(found.status, np.arange(len(drawn.star)), found.fix))
         == "wrong"
     )
 
@@ -72,5 +72,5 @@ def test_a_lens_fitted_wrongly_is_refused_and_a_hidden_half_is_not() -> None:
         drawn = draw(kind, sky.stars, np.random.default_rng([_SEED, seed]))
         left = np.flatnonzero(drawn.pixels[:, 0] < 400.0)
         found = identify(drawn.field().subset(left), sky)
-        assert found.status is Status.IDENTIFIED, seed
+        assert found.status is MatchStatus.IDENTIFIED, seed
         assert np.array_equal(found.star[found.star >= 0], drawn.star[left][found.star >= 0])

@@ -15,27 +15,27 @@ from PIL import Image as pillow
 from knightcube.astro import catalogue
 from knightcube.errors import InputError, UsageError
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.startracker.index import table_file
+from knightcube.vision.startracker.index.sky_index import Columns, TableKind, load_table, save_table
 from tests.studies.fuzz.door import Door, DoorTarget, Files
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.stored_files import Folder
 
-_KIND = table_file.Kind(b"FUZZTABL", 1, "table", "make it again")
+_KIND = TableKind(b"FUZZTABL", 1, "table", "make it again")
 _HEADER_BYTES, _CRC_AT = 20, 12
 
 
 def index() -> DoorTarget:
     """Return the door of a file of columns, as the sky index is."""
     folder = Folder()
-    columns: table_file.Columns = {
+    columns: Columns = {
         "star": np.arange(40, dtype=np.int32),
         "direction": np.linspace(-1.0, 1.0, 30).reshape(10, 3),
     }
-    table_file.save(folder.path / "table", _KIND, columns, {"year": 2026.0})
+    save_table(folder.path / "table", _KIND, columns, {"year": 2026.0})
     example = {"table": (folder.path / "table").read_bytes()}
 
     def enter(files: Files, _: bool) -> str:
-        read, facts = table_file.load(folder.fill(files) / "table", _KIND)
+        read, facts = load_table(folder.fill(files) / "table", _KIND)
         same = read.keys() == columns.keys() and all(np.array_equal(read[k], columns[k]) for k in columns)
         resealed = files["table"] != example["table"]
         if not resealed and not (same and facts == {"year": 2026.0}):

@@ -12,27 +12,29 @@ from enum import IntFlag
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
-from knightcube.vision.frame.background import MAD_TO_SIGMA
-from knightcube.vision.frame.regions import label_pixels
-from knightcube.vision.frame.saturation import saturation_level
+from knightcube.vision.frame import MAD_TO_SIGMA, label_pixels, saturation_level
 from knightcube.vision.startracker.detection.measurement import (
     FrameSpread,
-    Measured,
+    MeasuredStars,
     Shapes,
     first_look,
     frame_spread,
     measure,
 )
-from knightcube.vision.startracker.detection.psf_fit import Targets, Windows, cut, smoothed
-from knightcube.vision.startracker.detection.sky import KERNEL_NORM, Sky, correlation_of, in_counts, one_sided
+from knightcube.vision.startracker.detection.psf_fit import StarTargets, StarWindows, cut, smoothed
 from knightcube.vision.startracker.detection.survey import (
+    KERNEL_NORM,
     Areas,
     DetectionSettings,
     FrameKind,
+    SkyBackground,
     Survey,
     cluttered,
+    correlation_of,
     frame_shape,
+    in_counts,
     is_streak,
+    one_sided,
     survey,
 )
 
@@ -268,7 +270,7 @@ def measure_areas(seen: Survey) -> Detections:
     return _brightest(whole.in_order(), settings.most_stars).scaled(seen.unit)
 
 
-def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Targets) -> IntArray:
+def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, targets: StarTargets) -> IntArray:
     """Return the flags (n,) that follow from the pixels of each star."""
     sure = _SURE * shapes.error
     alone = (targets.core == 0.0) & ~found.blended
@@ -287,7 +289,7 @@ def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Ta
     )
 
 
-def plain_ones(sound: BoolArray, targets: Targets) -> BoolArray:
+def plain_ones(sound: BoolArray, targets: StarTargets) -> BoolArray:
     """Return which of the `sound` stars (n,) determine the PSF: those not saturated, if there are any."""
     plain = sound & (targets.core == 0.0)
     return plain if plain.any() else sound
@@ -306,7 +308,7 @@ def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
 
 
-def confirmed(found: Measured, targets: Targets, settings: DetectionSettings) -> BoolArray:
+def confirmed(found: MeasuredStars, targets: StarTargets, settings: DetectionSettings) -> BoolArray:
     """Return which stars (n,) have enough light, lie near their peak and inside of the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
@@ -318,10 +320,10 @@ def confirmed(found: Measured, targets: Targets, settings: DetectionSettings) ->
 
 
 def assemble(
-    found: Measured,
+    found: MeasuredStars,
     shapes: Shapes,
     quality: IntArray,
-    targets: Targets,
+    targets: StarTargets,
     spread: FrameSpread,
     prediction: IntArray,
 ) -> Detections:
@@ -340,14 +342,14 @@ def assemble(
     )
 
 
-def _targets(pixels: Image, sky: Sky, areas: Areas, peaks: Peaks) -> Targets:
+def _targets(pixels: Image, sky: SkyBackground, areas: Areas, peaks: Peaks) -> StarTargets:
     column, row = peaks.place.T
     level, noise = sky.level.at(column, row), sky.pixel_noise.at(column, row)
     still = np.zeros((len(peaks.place), 2))
-    return Targets(pixels, peaks.place, level, noise, areas.ceiling, peaks.core, still, sky.correlation)
+    return StarTargets(pixels, peaks.place, level, noise, areas.ceiling, peaks.core, still, sky.correlation)
 
 
-def _flags_of_areas(sky: Sky, areas: Areas, peaks: Peaks) -> IntArray:
+def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     """Return the flags (p,) that follow from the areas: streak and clutter."""
     noise = sky.smooth_noise
     restless = noise.at(*peaks.place.T) > _RESTLESS * np.median(noise.values)
@@ -424,8 +426,8 @@ def measure_near(
 
 
 def _peaks_near(
-    pixels: Image, windows: Windows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
-) -> tuple[Targets, IntArray]:
+    pixels: Image, windows: StarWindows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
+) -> tuple[StarTargets, IntArray]:
     """Return the highest peaks above the threshold within the search radius, and their predictions (k,)."""
     level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
@@ -442,14 +444,14 @@ def _peaks_near(
     saturated = np.count_nonzero(windows.good & (windows.light >= ceiling), axis=(1, 2))
     at_core = pixels[np.clip(middle[:, 1], 0, None), np.clip(middle[:, 0], 0, None)] >= ceiling
     core = np.where(at_core, np.sqrt(saturated / np.pi), 0.0)
-    targets = Targets(pixels, middle, level, noise, ceiling, core, windows.trail, correlation)
+    targets = StarTargets(pixels, middle, level, noise, ceiling, core, windows.trail, correlation)
     apart = np.linalg.norm(middle - predicted, axis=1)
     number = np.flatnonzero(bright)
     number = number[_nearest(middle[number], apart[number])]
     return targets.select(number), number
 
 
-def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return background (n,), noise of single (n,) and of smoothed pixels (n,), and the correlation.
 
     All are measured in the rims of the windows. The noise of smoothed pixels includes faint stars, as the

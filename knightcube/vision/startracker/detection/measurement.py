@@ -21,15 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.vision.frame.regions import are_hot
+from knightcube.vision.frame import are_hot
 from knightcube.vision.startracker.detection.psf_fit import (
     FLUX,
     WIDTH,
     NoiseModel,
     Pairs,
     PsfFit,
-    Targets,
-    Windows,
+    StarTargets,
+    StarWindows,
     fit,
     light,
     measure_noise,
@@ -75,7 +75,7 @@ class Shapes:
     error: FloatArray
     hot: BoolArray
     fitted: PsfFit
-    windows: Windows
+    windows: StarWindows
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class FrameSpread:
         return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
 
 
-def first_look(targets: Targets, gain: float | None = None) -> Shapes:
+def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     """Return the shapes of stars before their PSF is known; `gain` is in electrons per count, if known."""
     windows = targets.windows(_HALF_OF_FIRST)
     offset, flux = start(windows)
@@ -140,13 +140,13 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     return FrameSpread(psf_sigma, noise)
 
 
-def _noise_of(fitted: PsfFit, windows: Windows, settings: DetectionSettings) -> NoiseModel:
+def _noise_of(fitted: PsfFit, windows: StarWindows, settings: DetectionSettings) -> NoiseModel:
     return measure_noise(
         fitted.residual, fitted.variance, fitted.leverage, fitted.model, windows.noise, settings.gain
     )
 
 
-def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
+def start(windows: StarWindows) -> tuple[FloatArray, FloatArray]:
     """Return initial offsets (n, 2), px, and fluxes (n,), counts, from the middle 3 x 3 pixels."""
     h = windows.half
     core = np.maximum(windows.light[:, h - 1 : h + 2, h - 1 : h + 2], 0.0)
@@ -158,7 +158,7 @@ def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
     return np.clip(np.stack([x, y], axis=-1), -0.6, 0.6), flux
 
 
-def single_pixels(windows: Windows) -> BoolArray:
+def single_pixels(windows: StarWindows) -> BoolArray:
     """Return which windows (n,) hold hot pixels: one or two bright pixels with dark neighbours."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
@@ -300,7 +300,7 @@ class WindowCentroids:
 
 
 def centre_of_mass(
-    windows: Windows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
+    windows: StarWindows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
 ) -> WindowCentroids:
     """Return the centroids in `windows` (eq. 12-20) by a method of `METHODS`, or the centre of mass.
 
@@ -366,7 +366,7 @@ _FLOOR = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredStars:
     """The measurements of n stars.
 
     Attributes:
@@ -385,11 +385,13 @@ class Measured:
     blended: BoolArray
 
 
-def measure(targets: Targets, shapes: Shapes, spread: FrameSpread, settings: DetectionSettings) -> Measured:
+def measure(
+    targets: StarTargets, shapes: Shapes, spread: FrameSpread, settings: DetectionSettings
+) -> MeasuredStars:
     """Return the stars measured by the method of the settings; saturated stars are always fitted."""
     parts = [(targets.core == 0.0, False), (targets.core > 0.0, True)]
     count = len(targets)
-    out = Measured(
+    out = MeasuredStars(
         np.zeros((count, 2)),
         np.zeros((count, 2, 2)),
         np.zeros(count),
@@ -407,17 +409,19 @@ def measure(targets: Targets, shapes: Shapes, spread: FrameSpread, settings: Det
             part = _centred(some, spread, settings)
         else:
             part = _fitted(some, before, spread, spread.half, free_width=False)
-        for name in Measured.__slots__:
+        for name in MeasuredStars.__slots__:
             getattr(out, name)[chosen] = getattr(part, name)
     return out
 
 
-def _half_of(targets: Targets, spread: FrameSpread) -> int:
+def _half_of(targets: StarTargets, spread: FrameSpread) -> int:
     widest = float(targets.core.max(initial=0.0)) + REACH * spread.psf_sigma + 1.0
     return int(np.clip(np.ceil(widest), LEAST_HALF, 2 * MOST_HALF))
 
 
-def _fitted(targets: Targets, before: PsfFit, spread: FrameSpread, half: int, free_width: bool) -> Measured:
+def _fitted(
+    targets: StarTargets, before: PsfFit, spread: FrameSpread, half: int, free_width: bool
+) -> MeasuredStars:
     windows = targets.windows(half)
     offset, flux = start(windows)
     if free_width:
@@ -443,13 +447,13 @@ def _fitted(targets: Targets, before: PsfFit, spread: FrameSpread, half: int, fr
     excess = excess / (1.0 - pairs.overlap) ** 2
     covariance = found.covariance[:, :2, :2] * excess[:, None, None] + _FLOOR**2 * np.eye(2)
     flux_sigma = _flux_sigma(found, windows, spread.noise) * targets.correlation
-    return Measured(
+    return MeasuredStars(
         targets.middle + found.offset, covariance, found.flux, flux_sigma, found.sky, np.asarray(blended)
     )
 
 
 def _shared(
-    windows: Windows,
+    windows: StarWindows,
     middle: IntArray,
     found: PsfFit,
     begin: tuple[FloatArray, FloatArray],
@@ -473,7 +477,7 @@ def _shared(
     return found.replaced(some, part)
 
 
-def _flux_sigma(found: PsfFit, windows: Windows, noise: NoiseModel) -> FloatArray:
+def _flux_sigma(found: PsfFit, windows: StarWindows, noise: NoiseModel) -> FloatArray:
     """Return the standard deviation (n,) of the fluxes, counts, due to sky and photon noise only."""
     flux = np.where(found.flux > 0.0, found.flux, np.inf)[:, None, None]
     seen = np.where(windows.good, found.model / flux, 0.0)
@@ -481,7 +485,7 @@ def _flux_sigma(found: PsfFit, windows: Windows, noise: NoiseModel) -> FloatArra
     return np.asarray(np.sum(seen * seen / counted, axis=(1, 2)) + 1e-30) ** -0.5
 
 
-def _centred(targets: Targets, spread: FrameSpread, settings: DetectionSettings) -> Measured:
+def _centred(targets: StarTargets, spread: FrameSpread, settings: DetectionSettings) -> MeasuredStars:
     half = settings.window // 2
     windows = targets.windows(half)
     # The window is centred on the brightest pixel (text before eq. 12), not on the smoothed peak.
@@ -495,4 +499,6 @@ def _centred(targets: Targets, spread: FrameSpread, settings: DetectionSettings)
     flux_sigma = np.sqrt(found.flux_variance) * targets.correlation
     pairs = neighbours(middle + found.offset, found.flux, spread.psf_sigma, half)
     blended = pairs.overlap > 0.0
-    return Measured(middle + found.offset, covariance, found.flux, flux_sigma, found.sky, np.asarray(blended))
+    return MeasuredStars(
+        middle + found.offset, covariance, found.flux, flux_sigma, found.sky, np.asarray(blended)
+    )

@@ -22,7 +22,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, sele
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows:
+class StarWindows:
     """Square windows of k x k pixels around n stars, k = 2 half + 1.
 
     Attributes:
@@ -41,11 +41,11 @@ class Windows:
     noise: FloatArray
     trail: FloatArray
 
-    def select(self, chosen: BoolArray | IntArray) -> Windows:
+    def select(self, chosen: BoolArray | IntArray) -> StarWindows:
         """Return the windows that `chosen` picks."""
         return select(self, chosen, "half")
 
-    def without(self, light: FloatArray) -> Windows:
+    def without(self, light: FloatArray) -> StarWindows:
         """Return the windows with `light` (n, k, k) subtracted."""
         return replace(self, light=self.light - light)
 
@@ -61,7 +61,7 @@ def cut(
     noise: FloatArray,
     ceiling: float,
     trail: FloatArray | None = None,
-) -> Windows:
+) -> StarWindows:
     """Return the windows around the pixels `middle` (n, 2), which must be inside of the frame.
 
     Args:
@@ -81,7 +81,7 @@ def cut(
     counts = pixels[row[:, :, None], column[:, None, :]].astype(np.float64)
     light = np.where(good, counts - level[:, None, None], 0.0)
     path = np.zeros((len(middle), 2)) if trail is None else trail
-    return Windows(middle, half, light, good & (counts < ceiling), noise, path)
+    return StarWindows(middle, half, light, good & (counts < ceiling), noise, path)
 
 
 def smoothed(light: FloatArray) -> FloatArray:
@@ -93,7 +93,7 @@ def smoothed(light: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Targets:
+class StarTargets:
     """The pixels around which n stars are measured, with the sky there.
 
     Attributes:
@@ -115,12 +115,12 @@ class Targets:
     trail: FloatArray
     correlation: float
 
-    def windows(self, half: int, middle: IntArray | None = None) -> Windows:
+    def windows(self, half: int, middle: IntArray | None = None) -> StarWindows:
         """Return the windows around all targets, or around `middle` (n, 2) instead."""
         about = self.middle if middle is None else middle
         return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
-    def select(self, chosen: BoolArray | IntArray) -> Targets:
+    def select(self, chosen: BoolArray | IntArray) -> StarTargets:
         """Return the targets that `chosen` picks."""
         return select(self, chosen, "pixels", "ceiling", "correlation")
 
@@ -342,7 +342,7 @@ class PsfFit:
 
 
 def fit(
-    windows: Windows,
+    windows: StarWindows,
     offset: FloatArray,
     flux: FloatArray,
     width: FloatArray,
@@ -393,7 +393,7 @@ def fit(
     )
 
 
-def _jacobian(values: FloatArray, windows: Windows, count: int) -> tuple[FloatArray, FloatArray]:
+def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[FloatArray, FloatArray]:
     """Return the light (n, k, k) of the stars and its derivatives (n, count, k k)."""
     out: FloatArray | None = None
     for shift, share in path(windows.trail):
@@ -481,7 +481,12 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
 
 
 def neighbour_light(
-    pairs: Pairs, windows: Windows, middle: IntArray, offset: FloatArray, flux: FloatArray, width: FloatArray
+    pairs: Pairs,
+    windows: StarWindows,
+    middle: IntArray,
+    offset: FloatArray,
+    flux: FloatArray,
+    width: FloatArray,
 ) -> FloatArray:
     """Return the light (n, k, k), counts, of all neighbours in the window of each star.
 

@@ -1,4 +1,11 @@
-"""The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
+"""Table columns in one memory-mapped file with a version and a checksum.
+
+The file begins with a header: 8 bytes of magic that identify the kind of table, the version (uint32), the
+CRC-32 of everything after the header (uint32), and the length of the table of contents (uint32). The table of
+contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. The same columns give the
+same bytes.
+
+The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
 
 Guide stars are the catalogue as a given lens images it (Michalski 3.3): proper motion is applied up to the
 epoch of observation, and stars that the image cannot resolve are merged into one star at their centre of
@@ -18,25 +25,117 @@ of `CELL`; of whether the corners opposite the shortest, the middle and the long
 and of the longest side. The triangles of one cell within limits of size are one run of the sorted keys. Sides
 are chords.
 
-`python -m knightcube.vision.startracker.index.build` makes the index (file layout: `table_file`). The same
+`python -m knightcube.vision.startracker.index.build` makes the index. The same
 stars and limits give the same bytes.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import mmap
 import os
+import struct
+import zlib
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.catalogue import StarCatalogue
-from knightcube.vision.startracker.index import table_file
+from knightcube.errors import InputError
+
+Columns = dict[str, npt.NDArray[Any]]
+Facts = dict[str, float]
+_HEADER = struct.Struct("<8sIII")
+_ALIGNMENT = 64
+_UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
+"""Exceptions that invalid contents with a correct checksum may raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableKind:
+    """A kind of table file.
+
+    Attributes:
+        magic: first 8 bytes of the file.
+        version: version of the columns.
+        name: name in messages.
+        cure: advice in messages about a file that cannot be used.
+    """
+
+    magic: bytes
+    version: int
+    name: str
+    cure: str
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless the magic has 8 bytes."""
+        if len(self.magic) != 8:
+            raise ValueError(f"magic {self.magic!r}: give 8 bytes")
+
+
+def save_table(path: Path, kind: TableKind, columns: Columns, facts: Facts) -> None:
+    """Write columns and numbers to `path` atomically: a partly written file is never left there."""
+    little = {name: _little(column) for name, column in columns.items()}
+    contents: dict[str, Any] = {"facts": facts, "columns": {}}
+    offset = 0
+    for name, column in little.items():
+        contents["columns"][name] = [column.dtype.str, list(column.shape), offset]
+        offset += -(-column.nbytes // _ALIGNMENT) * _ALIGNMENT
+    table = json.dumps(contents, sort_keys=True).encode()
+    table += b" " * (-(_HEADER.size + len(table)) % _ALIGNMENT)
+    body = bytearray(table)
+    for column in little.values():
+        body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
+    # Two processes may write at once: each writes a file of its own, and the last one replaces the other.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
+    temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
+    temporary.replace(path)
+
+
+def load_table(path: Path, kind: TableKind) -> tuple[Columns, Facts]:
+    """Return the columns, memory-mapped and read-only, and the numbers.
+
+    Raises InputError if the file is missing, damaged, of another kind or of another version.
+    """
+    name, cure = kind.name, kind.cure
+    try:
+        with path.open("rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), f"the {name} cannot be read ({error}); {cure}") from error
+    if len(mapped) < _HEADER.size or mapped[: len(kind.magic)] != kind.magic:
+        raise InputError(str(path), f"the file is not a {name}; {cure}")
+    _, version, checksum, length = _HEADER.unpack_from(mapped)
+    if version != kind.version:
+        raise InputError(str(path), f"the {name} has version {version} instead of {kind.version}; {cure}")
+    if zlib.crc32(memoryview(mapped)[_HEADER.size :]) != checksum:
+        raise InputError(str(path), f"the {name} is damaged: its CRC-32 is wrong; {cure}")
+    try:
+        return _columns(mapped, _HEADER.size + length)
+    except _UNFIT as error:
+        raise InputError(str(path), f"the contents of the {name} cannot be read ({error}); {cure}") from error
+
+
+def _columns(mapped: mmap.mmap, begin: int) -> tuple[Columns, Facts]:
+    contents = json.loads(mapped[_HEADER.size : begin])
+    columns = {
+        name: np.frombuffer(mapped, np.dtype(kind), math.prod(shape), begin + offset).reshape(shape)
+        for name, (kind, shape, offset) in contents["columns"].items()
+    }
+    if any(column.dtype.hasobject for column in columns.values()):
+        raise TypeError("a column does not contain numbers")
+    return columns, {str(name): float(fact) for name, fact in contents["facts"].items()}
+
+
+def _little(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.ascontiguousarray(column, dtype=column.dtype.newbyteorder("<"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -294,7 +393,7 @@ def keys(
 
 
 _VERSION = 3
-KIND = table_file.Kind(
+KIND = TableKind(
     b"KCSKYIDX",
     _VERSION,
     "sky index",
@@ -341,7 +440,7 @@ class SkyIndex:
 
 def save(sky: SkyIndex, path: Path) -> None:
     """Write the index to `path` atomically: a partly written file is never left there."""
-    columns: table_file.Columns = {
+    columns: Columns = {
         "hip": sky.stars.hip,
         "direction": sky.stars.direction.astype(np.float32),
         "magnitude": np.round(sky.stars.magnitude * 1000.0).astype(np.int16),
@@ -349,7 +448,7 @@ def save(sky: SkyIndex, path: Path) -> None:
     }
     for field in fields(sky.triangles):
         columns[field.name] = np.asarray(getattr(sky.triangles, field.name))
-    table_file.save(path, KIND, columns, {"epoch": sky.stars.epoch})
+    save_table(path, KIND, columns, {"epoch": sky.stars.epoch})
 
 
 def load(path: Path = PATH) -> SkyIndex:
@@ -357,7 +456,7 @@ def load(path: Path = PATH) -> SkyIndex:
 
     Raises InputError if the file is missing, damaged, or of another version.
     """
-    columns, facts = table_file.load(path, KIND)
+    columns, facts = load_table(path, KIND)
     direction: FloatArray = columns["direction"].astype(np.float64)
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     stars = GuideStars(columns["hip"], direction, columns["magnitude"] / 1000.0, facts["epoch"])

@@ -15,7 +15,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.attitude.olae import OlaeSolution, gain, rotation_between
 from knightcube.astro.directions import cross_matrices
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame.background import MAD_TO_SIGMA
+from knightcube.vision.frame import MAD_TO_SIGMA
 from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
 from knightcube.vision.streaks.corners.grouping import rotation_angles, rotation_axis
 from knightcube.vision.streaks.corners.settings import StreakSettings

@@ -12,8 +12,7 @@ import numpy as np
 from scipy import ndimage
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
-from knightcube.vision.frame.background import box_sum
-from knightcube.vision.frame.regions import label_pixels, moments
+from knightcube.vision.frame import box_sum, label_pixels, moments
 
 
 @dataclass(frozen=True, slots=True)

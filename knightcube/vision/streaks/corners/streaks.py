@@ -11,9 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.vision.frame.background import Background, estimate_background
-from knightcube.vision.frame.regions import positions, repair_hot_pixels
-from knightcube.vision.frame.saturation import saturation_level
+from knightcube.vision.frame import (
+    Background,
+    estimate_background,
+    positions,
+    repair_hot_pixels,
+    saturation_level,
+)
 from knightcube.vision.streaks.corners.detectors import cornerness
 from knightcube.vision.streaks.corners.endpoints import find_corners
 from knightcube.vision.streaks.corners.segmentation import (

@@ -27,7 +27,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
-from knightcube.vision.sun.solar_cells import SolarStrings
+from knightcube.vision.solar_cells import SolarStringModel
 from sim_hal.emulators.solar_strings import SolarStringsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
@@ -56,7 +56,7 @@ class Lit:
             history_ns=12 * SECOND_NS,
         )
         self.filter = OrbitFilter(settings, self.at)
-        strings = SolarStrings(peaks=np.full(6, 0.5))
+        strings = SolarStringModel(peaks=np.full(6, 0.5))
         self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(OrbitEnvironment, self))
         self.wrong: list[str | None] = []
         self.magnet: FloatArray = np.zeros(3)

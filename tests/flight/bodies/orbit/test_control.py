@@ -13,7 +13,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.carried_sun import MEMORY
-from knightcube.vision.sun.solar_cells import SolarStrings
+from knightcube.vision.solar_cells import SolarStringModel
 
 SUN = np.array([0.36, 0.48, 0.8])
 FIELD = np.array([2e-5, 0.0, 3e-5])
@@ -28,7 +28,7 @@ class Seen:
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
             SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
-        self.seeker = SunAcquisitionBrake(law, SolarStrings(), 0.648, EventLog(self._tell))
+        self.seeker = SunAcquisitionBrake(law, SolarStringModel(), 0.648, EventLog(self._tell))
         self.seeker.begin(0)
 
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:

@@ -13,10 +13,10 @@ from knightcube.astro.quaternion import conjugate, from_matrix, from_rotation_ve
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Status, begin
 from knightcube.gnc.attitude.single_frame import Sight, camera_sight
-from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge
-from knightcube.vision.sun.direction import SunSettings, find_sun
+from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_attitude import settings_of

@@ -27,7 +27,7 @@ from knightcube.reference.star_identification.methods import (
 )
 from knightcube.reference.star_identification.search import DEFAULT, FieldUnknown, Propose, search
 from knightcube.reference.star_identification.triangle_table import side_lengths
-from knightcube.vision.startracker.identification.star_field import Identification, Status
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
 from knightcube.vision.startracker.index.sky_index import SkyIndex, TriangleIndex, choose_guide_stars
 from tests.support.star_lists import ListKind, StarList, draw, draw_random
 
@@ -54,9 +54,9 @@ def _drawn(kind: ListKind, seed: int) -> list[StarList]:
     return [draw(kind, _sky().index.stars, rng) for _ in range(LISTS)]
 
 
-def _right(answer: Identification, drawn: StarList) -> bool:
+def _right(answer: StarMatch, drawn: StarList) -> bool:
     """Tell whether all claimed stars are true and the attitude is off by less than ten sigmas of a star."""
-    if answer.status is not Status.IDENTIFIED or answer.fix is None:
+    if answer.status is not MatchStatus.IDENTIFIED or answer.fix is None:
         return False
     claimed = answer.star >= 0
     off = angle_between(answer.fix.quaternion, drawn.attitude)
@@ -83,7 +83,7 @@ def test_false_and_missing_stars_are_survived(name: str) -> None:
         (METHODS[name].identify(d.field(), _sky()), d) for d in _drawn(_kind(false_stars=2, lost=0.1), 2)
     ]
     right = [_right(answer, drawn) for answer, drawn in answers]
-    refused = [answer.status is Status.NO_MATCH for answer, _ in answers]
+    refused = [answer.status is MatchStatus.NO_MATCH for answer, _ in answers]
     assert sum(right) >= LISTS - 1
     assert sum(right) + sum(refused) == LISTS
 
@@ -112,7 +112,7 @@ def test_a_list_of_no_sky_takes_no_more_work_than_the_budget_however_badly_the_s
     monkeypatch.setattr(methods, "matching_triangles", counting)
     drawn = draw_random(_kind(known_deg=known_deg), 40, np.random.default_rng(4))
     answer = search(drawn.field(), _sky(), propose)
-    assert answer.status is Status.NO_MATCH
+    assert answer.status is MatchStatus.NO_MATCH
     assert 0.8 * DEFAULT.joins <= len(joined) <= DEFAULT.joins
 
 
@@ -121,7 +121,7 @@ def test_points_strewn_at_random_are_refused(name: str) -> None:
     rng = np.random.default_rng(3)
     for count in (3, 4, 12, 30):
         answer = METHODS[name].identify(draw_random(_kind(noise_px=0.5), count, rng).field(), _sky())
-        assert answer.status is (Status.TOO_FEW_STARS if count < 4 else Status.NO_MATCH)
+        assert answer.status is (MatchStatus.TOO_FEW_STARS if count < 4 else MatchStatus.NO_MATCH)
         assert np.all(answer.star == -1)
 
 
@@ -131,7 +131,7 @@ def test_a_mirrored_sky_is_refused(name: str) -> None:
     drawn = _drawn(_kind(), 4)[0]
     field = drawn.field()
     mirrored = replace(field, direction=field.direction * np.array([-1.0, 1.0, 1.0]))
-    assert METHODS[name].identify(mirrored, _sky()).status is Status.NO_MATCH
+    assert METHODS[name].identify(mirrored, _sky()).status is MatchStatus.NO_MATCH
 
 
 @pytest.mark.parametrize("name", CLASSICAL)
@@ -157,7 +157,7 @@ def test_two_points_within_their_errors_of_one_another_do_no_harm(name: str) -> 
     field = drawn.field()
     twice = field.subset(np.repeat(np.arange(len(field)), 2))
     answer = METHODS[name].identify(twice, _sky())
-    assert answer.status in {Status.IDENTIFIED, Status.NO_MATCH}
+    assert answer.status in {MatchStatus.IDENTIFIED, MatchStatus.NO_MATCH}
 
 
 def test_the_pyramid_takes_every_triangle_once_and_changes_its_pivot_soon() -> None:
@@ -223,7 +223,7 @@ def test_a_previous_attitude_turned_by_the_rate_names_too_few_stars_for_a_patter
     earlier = multiply(from_rotation_vector(-rate * elapsed), drawn.attitude)
     previous = PreviousAttitude(earlier, 1e-5, elapsed)
     answer = identify_by_rate(field, _sky(), motion=motion, previous=previous)
-    assert answer.status is Status.IDENTIFIED
+    assert answer.status is MatchStatus.IDENTIFIED
     np.testing.assert_array_equal(answer.star, drawn.star[few])
 
 

@@ -15,8 +15,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import InputError
 from knightcube.reference.star_identification import pair_table
 from knightcube.reference.star_identification.pair_table import PairTable
-from knightcube.vision.startracker.index import table_file
-from knightcube.vision.startracker.index.sky_index import GuideStars
+from knightcube.vision.startracker.index.sky_index import GuideStars, save_table
 
 _KEYS = arrays(
     np.float64,
@@ -154,7 +153,7 @@ def test_a_damaged_foreign_or_outdated_file_is_refused_with_its_name(
     path.write_bytes(b"\x00" * 100)
     with pytest.raises(InputError, match="the file is not a pair table"):
         pair_table.load_pairs(path)
-    table_file.save(path, replace(pair_table.KIND, version=pair_table.KIND.version + 1), {}, {})
+    save_table(path, replace(pair_table.KIND, version=pair_table.KIND.version + 1), {}, {})
     with pytest.raises(InputError, match="version"):
         pair_table.load_pairs(path)
 

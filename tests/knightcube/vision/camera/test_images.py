@@ -1,7 +1,8 @@
-"""Image files of every kind that is read, written by Pillow or by hand, and real photographs."""
+"""Image files of each supported kind: written by Pillow, by hand, or kept by the vision worker."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import sys
@@ -10,10 +11,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
-from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
+from knightcube.vision.camera.images import (
+    KeptFrames,
+    facts_of,
+    grey_stretch,
+    keep_frame,
+    primary_image,
+    read_image,
+    write_picture,
+)
+from tests.support.fits_files import fits_file
 
 pillow = pytest.importorskip("PIL.Image", reason="Pillow, the extra `images`, is not installed")
 
@@ -258,3 +270,126 @@ def test_photographs_of_the_sky_are_dark_with_bright_stars(
     assert np.median(image) < 0.25 * image.max()
     smooth = np.abs(np.diff(image.astype(float), axis=1))
     assert np.median(smooth) < 0.05 * image.max()
+
+
+PIXELS = np.array([[0, 1, 2], [127, 128, 255]])
+
+
+@pytest.mark.parametrize(
+    ("bits", "kind", "expected"),
+    [
+        (8, ">u1", np.uint8),
+        (16, ">i2", np.int16),
+        (32, ">i4", np.int32),
+        (-32, ">f4", np.float32),
+        (-64, ">f8", np.float64),
+    ],
+)
+def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expected: type) -> None:
+    image = primary_image(fits_file(PIXELS.astype(kind), bits), "x.fits")
+    assert image.dtype == expected
+    assert image.tolist() == PIXELS.tolist()
+
+
+def test_unsigned_numbers_are_what_they_are() -> None:
+    """Stored as value - BZERO (4.4.2.5): 0, 32768 and 65535 as -32768, 0 and 32767."""
+    stored = np.array([[-32768, 0, 32767]])
+    image = primary_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
+    assert image.dtype == np.uint16
+    assert image.tolist() == [[0, 32768, 65535]]
+    stored = np.array([[-(2**31), -1, 2**31 - 1]])
+    image = primary_image(fits_file(stored.astype(">i4"), 32, BZERO="2147483648.", BSCALE="1.0E0"), "x.fits")
+    assert image.dtype == np.uint32
+    assert image.tolist() == [[0, 2**31 - 1, 2**32 - 1]]
+
+
+def test_a_scale_gives_physical_values() -> None:
+    """Value = BZERO + BSCALE x stored; the exponent of a double with a D."""
+    image = primary_image(fits_file(PIXELS.astype(">i2"), 16, BZERO="-1.5", BSCALE="2.5D-1"), "x.fits")
+    assert image.dtype == np.float64
+    assert image.tolist() == (-1.5 + 0.25 * PIXELS).tolist()
+
+
+def test_the_array_is_the_machines_own_and_row_0_the_files_first() -> None:
+    image = primary_image(fits_file(PIXELS.astype(">i2"), 16), "x.fits")
+    assert image.dtype.isnative
+    assert image[0].tolist() == [0, 1, 2]
+
+
+def test_a_third_axis_of_one_plane_is_no_matter() -> None:
+    image = primary_image(fits_file(PIXELS.astype(">i2"), 16, NAXIS=3, NAXIS3=1), "x.fits")
+    assert image.shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("cards", "says"),
+    [
+        ({"BITPIX": 64}, "BITPIX = 64"),
+        ({"NAXIS": 0}, "is nothing"),
+        ({"NAXIS": 3, "NAXIS3": 3}, "3 x 2 x 3"),
+        ({"NAXIS1": 0}, "0 x 2"),
+        ({"NAXIS1": 3000}, "cut short"),
+        ({"NAXIS2": None}, "no NAXIS2"),
+        ({"NAXIS1": "'three'"}, "no whole number"),
+        ({"BZERO": "'x'"}, "BZERO"),
+        ({"BSCALE": "NaN"}, "BSCALE"),
+        ({"BLANK": 128}, "blank pixels"),
+    ],
+)
+def test_what_is_not_read_is_said_in_one_line(cards: dict[str, object], says: str) -> None:
+    with pytest.raises(UsageError, match=says) as caught:
+        primary_image(fits_file(PIXELS.astype(">i2"), 16, **cards), "night.fits")
+    assert str(caught.value).startswith("night.fits: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_blank_value_that_no_pixel_has_is_no_matter() -> None:
+    assert primary_image(fits_file(PIXELS.astype(">i2"), 16, BLANK=-32768), "x.fits").shape == (2, 3)
+
+
+def test_pixels_that_are_not_finite_are_refused() -> None:
+    with pytest.raises(UsageError, match="not finite"):
+        primary_image(fits_file(np.array([[1.0, np.nan]]).astype(">f4"), -32), "x.fits")
+
+
+def test_a_header_without_an_end_is_refused() -> None:
+    with pytest.raises(UsageError, match="no END"):
+        primary_image(fits_file(PIXELS.astype(">i2"), 16)[:400], "x.fits")
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_a_damaged_fits_file_gives_an_image_or_one_clear_line(data: st.DataObject) -> None:
+    content = bytearray(fits_file(PIXELS.astype(">i2"), 16, BZERO=32768, BSCALE=1))
+    for _ in range(data.draw(st.integers(1, 8))):
+        content[data.draw(st.integers(0, 800))] = data.draw(st.integers(0, 255))
+    with contextlib.suppress(UsageError):
+        image = primary_image(bytes(content[: data.draw(st.integers(0, len(content)))]), "x.fits")
+        assert image.ndim == 2
+        assert np.all(np.isfinite(image))
+
+
+def test_a_fits_file_is_known_by_its_content(tmp_path: Path) -> None:
+    path = tmp_path / "frame.dat"
+    path.write_bytes(fits_file(PIXELS.astype(">i2"), 16, BZERO=32768))
+    assert read_image(path).tolist() == (PIXELS + 32768).tolist()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_another_reader_opens_the_newest_frames(tmp_path: Path, kind: type[np.unsignedinteger]) -> None:
+    pixels = (np.arange(60).reshape(6, 10) * (1000 if kind is np.uint16 else 4)).astype(kind)
+    folder = tmp_path / "frames"
+    for number in range(5):
+        keep_frame(KeptFrames(folder, 3, f"frame-{number:08d}"), pixels, {"stars": "solved"})
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [f"frame-{number:08d}.pgm" for number in (2, 3, 4)]
+    with pillow.open(folder / names[0]) as picture:
+        np.testing.assert_array_equal(np.asarray(picture), pixels)
+    assert facts_of((folder / names[0]).read_bytes()) == {"stars": "solved"}
+
+
+def test_a_disk_that_takes_nothing_costs_the_frame_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    keep_frame(KeptFrames(tmp_path / "file" / "frames", 3, "a"), np.zeros((2, 2), np.uint8), {})
+    with pytest.raises(ValueError, match="no kept frame"):
+        facts_of(b"P5\n2 2\n255\n")

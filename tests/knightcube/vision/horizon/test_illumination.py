@@ -11,7 +11,7 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.illumination import image_brightness, why_false
-from knightcube.vision.horizon.limb_fit import MEAN_RADIUS
+from knightcube.vision.horizon.limb import MEAN_RADIUS
 from knightcube.vision.horizon_camera_job import SUNLIT_COUNTS
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.earth_camera.model import EarthCameraModel

@@ -11,10 +11,15 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
-from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
-from knightcube.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
-from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.startracker.solve import (
+    AttitudePrior,
+    FrameSolution,
+    SolveSettings,
+    SolveStatus,
+    solve_motion,
+)
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky, sky_frame
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from knightcube.vision.frame.background import box_sum, less_boxes
-from knightcube.vision.frame.regions import repair_hot_pixels
+from knightcube.vision.frame import box_sum, less_boxes, repair_hot_pixels
 from knightcube.vision.streaks.corners.segmentation import find_regions, threshold_local, threshold_mean
 from tests.knightcube.vision.streaks.frames import rate_at, star_camera, star_frame
 

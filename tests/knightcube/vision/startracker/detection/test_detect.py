@@ -1,22 +1,34 @@
-"""Stars of simulated frames are found, measured to the bound, and told from what is none."""
+"""Stars of simulated frames are found, measured to the bound, and told from what is none.
+
+Stars about predicted places.
+
+Real photographs: the brightest detections are stars of the catalogue, where the truth says they are.
+"""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.detection import (
     DetectionSettings,
     FrameKind,
     Quality,
     detect,
     kind_of_frame,
+    measure_near,
 )
 from knightcube.vision.startracker.detection.survey import Method
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
-from tests.knightcube.vision.streaks.scenes import real_sky
+from tests.knightcube.vision.streaks.maximum_likelihood.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 from tests.studies.bench.centroids import compare, frame_of, matched, point_bound, star_places
 from tests.support.streak_bound import star_information
@@ -238,3 +250,139 @@ def test_odd_sizes_and_cameras_do() -> None:
             camera, at_pixels(camera, place), np.array([5.5]), *still(0.2), np.random.default_rng(1)
         )
         assert np.abs(detect(pixels).points[0] - place[0]).max() < 0.2
+
+
+CAMERA = StarCameraModel()
+PLACES = star_places(np.random.default_rng(31), CAMERA.columns, 30)
+MAGNITUDE = 6.0
+
+TRAILED = np.array([[30.3, 40.2], [80.6, 35.1], [150.2, 60.7], [45.5, 120.4], [100.1, 150.9], [160.7, 140.3]])
+
+
+def test_predicted_stars_are_measured_to_the_bound_and_named_by_their_prediction() -> None:
+    rng = np.random.default_rng(1)
+    ratios, nees = [], []
+    electrons = float(np.asarray(CAMERA.electrons(np.array([MAGNITUDE]), 0.2))[0])
+    least = np.mean([np.trace(point_bound(CAMERA, place, electrons)) / 2.0 for place in PLACES])
+    for seed in range(8):
+        pixels = frame_of(CAMERA, PLACES, np.full(30, MAGNITUDE), [seed, 40])
+        found = measure_near(pixels, PLACES + rng.uniform(-2.0, 2.0, PLACES.shape))
+        assert np.sort(found.prediction).tolist() == list(range(30))
+        off = found.points - PLACES[found.prediction]
+        ratios.append(np.mean(off**2) / least)
+        nees.append(np.mean(off**2 / found.sigma[:, None] ** 2))
+    assert np.sqrt(np.mean(ratios)) < 1.15
+    assert 0.8 < np.mean(nees) < 1.25
+
+
+def test_nothing_is_found_where_there_is_no_star() -> None:
+    pixels = frame_of(CAMERA, PLACES, np.full(30, MAGNITUDE), [2, 41])
+    empty = np.array([[5.0, 5.0], [700.0, 1019.0], [-50.0, 20.0], [3000.0, 10.0]])
+    apart = np.linalg.norm(empty[:2, None] - PLACES, axis=-1).min()
+    assert apart > 15.0
+    assert len(measure_near(pixels, empty)) == 0
+    assert len(measure_near(pixels, np.zeros((0, 2)))) == 0
+
+
+def test_two_predictions_of_one_star_give_it_once_to_the_nearer() -> None:
+    pixels = frame_of(CAMERA, PLACES, np.full(30, MAGNITUDE), [3, 41])
+    found = measure_near(pixels, np.array([PLACES[4] + [2.0, 0.0], PLACES[4] - [0.3, 0.0]]))
+    assert found.prediction.tolist() == [1]
+
+
+def test_a_whole_frame_and_windows_say_the_same() -> None:
+    pixels = frame_of(CAMERA, PLACES, np.linspace(3.0, 6.5, 30), [4, 41])
+    whole, near = detect(pixels).stars(), measure_near(pixels, PLACES, DetectionSettings(saturation=4095.0))
+    apart = np.linalg.norm(near.points[:, None] - whole.points, axis=-1)
+    assert np.all(apart.min(axis=1) < 1.0 * near.sigma + 0.01)
+    saturated = (near.quality & Quality.SATURATED) > 0
+    assert saturated.any()
+    assert not saturated.all()
+
+
+def test_wrong_predictions_are_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        measure_near(np.zeros((50, 50)), np.array([[np.nan, 1.0]]))
+
+
+def test_stars_that_move_by_a_few_pixels_are_measured_where_they_are_in_the_middle() -> None:
+    """Trails of 3 px along a slope: errors as large as claimed; faint stars are no noise of the others."""
+    rng = np.random.default_rng(12)
+    trail, squares, claims = np.array([2.5, 1.5]), [], []
+    for _ in range(6):
+        pixels = np.full((200, 200), 200.0)
+        row, column = np.indices(pixels.shape)
+        faint = [(place, 500.0) for place in rng.uniform(10.0, 190.0, (120, 2))]
+        for place, flux in [*((place, 20_000.0) for place in TRAILED), *faint]:
+            for share in (np.arange(15) + 0.5) / 15.0 - 0.5:
+                x, y = place + share * trail
+                bell = np.exp(-0.5 * ((column - x) ** 2 + (row - y) ** 2))
+                pixels += flux / 15.0 * bell / (2.0 * np.pi)
+        counts = rng.poisson(pixels).astype(np.uint16)
+        settings = DetectionSettings(psf_sigma=1.0, gain=1.0, saturation=65_535.0)
+        found = measure_near(counts, TRAILED + 0.3, settings, np.tile(trail, (len(TRAILED), 1)))
+        assert len(found) == len(TRAILED)
+        off = found.points - TRAILED[found.prediction]
+        squares += np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance), off).tolist()
+        claims += found.sigma.tolist()
+    assert 0.7 < np.median(squares) < 2.3  # 1.39 of two degrees of freedom
+    assert np.median(claims) < 0.03
+
+
+SKY = Path(__file__).parents[5].parent / "shared" / "data" / "sky"
+_TOLERANCE = 0.007
+"""Of the frame's width: the lenses' distortion is not taken out."""
+_AMONG = 80
+
+pytestmark = pytest.mark.skipif(not SKY.is_dir(), reason="the photographs of ../shared/data/sky are missing")
+
+
+def catalogue_places(truth: dict[str, float], shape: tuple[int, ...]) -> FloatArray:
+    """Return the pixels of the brightest stars in the field, by cedar-solve's convention of roll."""
+    ra, dec, roll = (np.radians(truth[name]) for name in ("ra", "dec", "roll"))
+    boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
+    north = np.cross(boresight, east)
+    right = -east * np.cos(roll) - north * np.sin(roll)
+    down = east * np.sin(roll) - north * np.cos(roll)
+    stars = catalogue.load()
+    camera = stars.directions_at(2019.0) @ np.stack([right, down, boresight]).T
+    pinhole = Pinhole.from_field_of_view(shape[1], shape[0], float(np.radians(truth["fov"])))
+    places = pinhole.project(camera)
+    return places[pinhole.contains(places)][:_AMONG]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "esa_alt40_azi-135.tiff",
+        "esa_alt40_azi45.tiff",
+        "esa_alt60_azi135.tiff",
+        "hale_bopp.jpg",
+        "orion2.jpg",
+        "pleiades.jpg",
+        "polar_05sec.jpg",
+        "test2_g100_e50ms.jpg",
+    ],
+)
+def test_nearly_all_of_the_twenty_brightest_detections_are_bright_catalogue_stars(name: str) -> None:
+    pixels = read_image(SKY / name)
+    found = detect(pixels).stars()
+    places = catalogue_places(json.loads((SKY / "truth.json").read_text())[name], pixels.shape)
+    apart = np.linalg.norm(found.points[:20, None] - places, axis=-1).min(axis=1)
+    assert np.count_nonzero(apart < max(4.0, _TOLERANCE * pixels.shape[1])) >= 15
+    assert kind_of_frame(pixels).kind is FrameKind.POINTS
+
+
+def test_leaves_are_not_among_the_stars() -> None:
+    """The tree fills the picture's upper right corner."""
+    found = detect(read_image(SKY / "tree.jpg")).stars()
+    in_tree = (found.points[:, 0] > 310.0) & (found.points[:, 1] < 310.0)
+    assert np.count_nonzero(in_tree[:20]) <= 5
+    assert np.count_nonzero(~in_tree) >= 14
+    assert kind_of_frame(read_image(SKY / "tree.jpg")).kind is not FrameKind.STREAKS
+
+
+def test_a_noisy_raw_frame_gives_few_false_stars_and_a_dark_one_too() -> None:
+    for name in ("may8_50ms_gain40_0.png", "may8_100ms_gain12_3.png"):
+        assert 5 <= len(detect(read_image(SKY / name)).stars()) <= 60

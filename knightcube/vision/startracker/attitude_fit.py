@@ -1,0 +1,417 @@
+"""The input and the result of a star identification method (Michalski 3.2).
+
+Least-squares fits of attitude, scale and radial distortion to matched stars.
+
+`refine` solves Wahba's problem with one more unknown: the factor k of all tangents x/z, y/z, by which the
+assumed focal length is wrong. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation d
+about the camera axes and a small change of ln k they change by -[A r x] d + s dlnk, with
+s = (x z^2, y z^2, -z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood
+estimate for directions with errors of sigma rad along either axis across them.
+
+`fit_with_distortion` adds radial distortion, for a lens that is not calibrated. Such a lens shifts stars by
+some percent of their distance from the axis: a pinhole then fits a group of neighbours and misses the other
+stars, and its attitude error is larger than its residuals suggest. An image at the tangent t of the true
+direction appears at t (1 + c (t / R)^2), where R is the tangent of the corner (Brown 1966, the first radial
+term); c has the prior `PRIOR`. The match grows outwards from the stars that match first, as c is determined.
+Where the stars do not determine c, the covariance of the attitude includes its uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.attitude.wahba import AttitudeFix
+from knightcube.astro.directions import cross_matrices
+from knightcube.astro.quaternion import from_matrix
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StarField:
+    """The observed points of a frame, the brightest first; some of them may not be stars.
+
+    Attributes:
+        direction: unit vectors (n, 3) in the camera frame, for the assumed focal length.
+        sigma: standard deviation of each direction along one axis (n,), rad.
+        half_width: tangents of half the field of view along x and y (2,).
+        scale: lowest and highest factor by which the tangents x/z, y/z must be multiplied for the true focal
+            length; (1, 1) for a calibrated camera.
+        magnitude: instrumental magnitudes (n,), up to a common constant; None if only the order is known.
+    """
+
+    direction: FloatArray
+    sigma: FloatArray
+    half_width: tuple[float, float]
+    scale: tuple[float, float] = (1.0, 1.0)
+    magnitude: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.direction)
+
+    def rescaled(self, factor: float) -> StarField:
+        """Return the field with all tangents multiplied by `factor`, and the range of the scale adapted."""
+        stretched = self.direction * np.array([factor, factor, 1.0])
+        return replace(
+            self,
+            direction=stretched / np.linalg.norm(stretched, axis=-1, keepdims=True),
+            sigma=self.sigma * factor,
+            half_width=(self.half_width[0] * factor, self.half_width[1] * factor),
+            scale=(self.scale[0] / factor, self.scale[1] / factor),
+        )
+
+    def mirrored(self) -> StarField:
+        """Return the mirrored field: left and right are exchanged about the boresight."""
+        return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
+
+    def subset(self, chosen: IntArray) -> StarField:
+        """Return the field of the stars `chosen` (k,) by number, in that order."""
+        magnitude = None if self.magnitude is None else self.magnitude[chosen]
+        return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
+
+
+class MatchStatus(Enum):
+    """The outcome of an identification."""
+
+    IDENTIFIED = "identified"
+    TOO_FEW_STARS = "too-few-stars"
+    NO_MATCH = "no-match"
+    AMBIGUOUS = "ambiguous"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StarMatch:
+    """The guide stars assigned to the observed stars, and the attitude that follows.
+
+    Attributes:
+        status: the other attributes are valid for IDENTIFIED only.
+        star: numbers of the guide stars (n,); -1 for an observed point without one.
+        fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
+        scale: factor by which the tangents of the observed directions had to be multiplied.
+        scale_sigma: standard deviation of the scale; 0 if the scale was given.
+        log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
+            0 if unknown.
+        distortion: fitted distortion of the lens, as the relative shift of a star in the corner
+            (`attitude_fit`); 0 if the stars matched without distortion.
+        from_lens: part of the covariance of `fix` that is due to the uncertainty of `distortion` (3, 3),
+            rad^2.
+        mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the
+            attitude of that field.
+    """
+
+    status: MatchStatus
+    star: IntArray
+    fix: AttitudeFix | None = None
+    scale: float = 1.0
+    scale_sigma: float = 0.0
+    log10_false_alarm: float = 0.0
+    distortion: float = 0.0
+    from_lens: FloatArray | None = None
+    mirrored: bool = False
+
+
+# The rows of v @ _CROSS, reshaped to (3, 3), are the matrix [v x].
+_CROSS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
+)
+# Step (rad) at which the iteration ends: a step d leaves an error of about d^2, 0.002 arcsec.
+_SETTLED = 1e-4
+_MOST_STEPS = 6
+# Minimum reciprocal condition: for directions within 1e-6 rad of one line the rotation about it is undefined.
+_LEAST_INFORMATION = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Refinement:
+    """The attitude and scale of a least-squares fit.
+
+    Attributes:
+        matrix: attitude matrix A (3, 3), ICRS to camera.
+        scale: factor of the tangents.
+        covariance: of the rotation about the camera axes, rad^2, and of ln scale (4, 4); (3, 3) if the scale
+            was fixed.
+        squares: |e|^2 / sigma^2 of each star (n,).
+    """
+
+    matrix: FloatArray
+    scale: float
+    covariance: FloatArray
+    squares: FloatArray
+
+    @property
+    def scale_sigma(self) -> float:
+        """The relative standard deviation of the scale; 0 if it was fixed."""
+        return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
+
+    def fix(self) -> AttitudeFix:
+        """Return the attitude in the form of the solvers of Wahba's problem."""
+        turn = np.ascontiguousarray(self.covariance[:3, :3])
+        return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
+
+    def widened(self) -> Refinement:
+        """Return the same fit with its covariance increased according to the residuals."""
+        factor = inflation(self.squares, len(self.covariance))
+        return replace(self, covariance=self.covariance * factor)
+
+
+def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
+    """Return `direction` (n, 3) with its tangents x/z, y/z multiplied by `scale`, a number or (n,)."""
+    if isinstance(scale, float) and scale == 1.0:
+        return direction
+    x, y, z = direction.T
+    longer = np.empty_like(direction)
+    longer[:, 0], longer[:, 1], longer[:, 2] = scale * x, scale * y, z
+    longer /= np.sqrt(np.einsum("ij,ij->i", longer, longer))[:, None]
+    return longer
+
+
+def scale_slope(direction: FloatArray) -> FloatArray:
+    """Return the derivatives (n, 3) of unit vectors `direction` (n, 3) by ln scale."""
+    squared = direction[:, 2:] * direction[:, 2:]
+    slope = direction * squared
+    slope[:, 2:] -= direction[:, 2:]
+    return np.asarray(slope)
+
+
+def inflation(squares: FloatArray, parameters: float) -> float:
+    """Return the factor by which the variances must be increased to agree with the residuals.
+
+    `squares` (n,) are |e|^2 / sigma^2, each of two components. Their sum has a chi-square distribution with
+    2n - `parameters` degrees of freedom. The factor is 1 if the sum exceeds its mean by less than three
+    standard deviations.
+    """
+    freedom = 2 * len(squares) - parameters
+    if freedom <= 0:
+        return 1.0
+    excess = float(squares.sum()) / freedom
+    return excess if excess > 1.0 + 3.0 * math.sqrt(2.0 / freedom) else 1.0
+
+
+def refine(
+    observed: FloatArray,
+    reference: FloatArray,
+    sigma: FloatArray,
+    matrix: FloatArray,
+    scale: float,
+    free_scale: bool,
+) -> Refinement | None:
+    """Return the attitude and scale that best rotate `reference` into `observed`.
+
+    Returns None if the stars do not determine the parameters, or the fit diverges.
+
+    Args:
+        observed: unit vectors (n, 3), camera frame, at scale 1.
+        reference: unit vectors (n, 3), ICRS.
+        sigma: standard deviation of each observed direction (n,), rad, at scale 1.
+        matrix: initial attitude (3, 3).
+        scale: initial scale, or the fixed scale.
+        free_scale: whether the scale is fitted.
+    """
+    parameters = 4 if free_scale else 3
+    weight = (1.0 / (sigma * scale))[:, None]
+    for _ in range(_MOST_STEPS):
+        b = stretched(observed, scale)
+        predicted = reference @ matrix.T
+        residual = ((b - predicted) * weight).reshape(-1)
+        slope = np.empty((len(b), 3, parameters))
+        slope[:, :, :3] = -(predicted @ _CROSS).reshape(-1, 3, 3)
+        if free_scale:
+            slope[:, :, 3] = scale_slope(b)
+        slope *= weight[:, :, None]
+        flat = slope.reshape(-1, parameters)
+        normal = flat.T @ flat
+        try:
+            covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        step = -(covariance @ (residual @ flat))
+        longest = float(np.abs(step).max())
+        if not _determined(normal, covariance) or not longest < 1.0:
+            return None
+        matrix = turned(matrix, step[:3])
+        if free_scale:
+            scale *= math.exp(float(step[3]))
+        if longest < _SETTLED:
+            break
+    # The squares of the residuals after the last step.
+    left = (residual + flat @ step).reshape(-1, 3)
+    return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
+
+
+def _determined(normal: FloatArray, covariance: FloatArray) -> bool:
+    """Return whether every combination of parameters is determined beyond rounding.
+
+    The largest element of a positive definite matrix is on its diagonal.
+    """
+    largest = float(normal.max()) * float(covariance.max())
+    return 0.0 < largest * _LEAST_INFORMATION < 1.0
+
+
+def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return the attitude (3, 3) after a rotation `turn` (3,), rad, about the camera axes (Rodrigues)."""
+    x, y, z = (float(component) for component in turn)
+    angle = math.sqrt(x * x + y * y + z * z)
+    first = math.sin(angle) / angle if angle > 0.0 else 1.0
+    second = 2.0 * (math.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(matrix - (first * cross - second * (cross @ cross)) @ matrix)
+
+
+PRIOR = 0.05
+"""Standard deviation of c, the relative shift in the corner, of lenses that are not calibrated."""
+_MOST = 0.25
+_GROWTH_ROUNDS = 12
+_DISTORTION_STEPS = 6
+_DISTORTION_SETTLED = 1e-6
+# Half width of the gate while the match grows: in sigmas of a star, and relative to the corner's tangent.
+_GATE_SIGMAS = 8.0
+_GATE_SHARE = 0.004
+# Standard deviations of the scatter beyond which a star is excluded from the final fit.
+_OUTLIER = 4.0
+# Median of the square root of a chi-square with 2 degrees of freedom.
+_RAYLEIGH_MEDIAN = 1.1774
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DistortedFit:
+    """The matched stars and the attitude of a camera with a distorted lens.
+
+    Attributes:
+        observed: numbers of observed stars (k,).
+        star: numbers of guide stars (k,).
+        refined: attitude, scale and their covariance, increased according to the residuals.
+        distortion: the coefficient c of the module docstring.
+        seen: directions of all observed stars, corrected for the distortion (n, 3), camera frame.
+        from_lens: part of the attitude covariance that is due to the uncertainty of c (3, 3), rad^2.
+    """
+
+    observed: IntArray
+    star: IntArray
+    refined: Refinement
+    distortion: float
+    seen: FloatArray
+    from_lens: FloatArray
+
+
+def fit_with_distortion(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    observed: IntArray,
+    star: IntArray,
+    start: Refinement,
+) -> DistortedFit | None:
+    """Return the match grown from the stars `observed` and `star` (k,), starting at `start`.
+
+    `expected` are the numbers of the guide stars in and around the field, the brightest first. Returns None
+    if the matched stars do not determine the lens.
+    """
+    corner = math.hypot(*field.half_width)
+    pose = _DistortedPose(start.matrix, start.scale, 0.0)
+    reference = sky.stars.direction[expected]
+    seen: set[bytes] = set()
+    fitted = None
+    for _ in range(_GROWTH_ROUNDS):
+        fitted = _distorted_fit(field, sky, observed, star, pose, corner)
+        if fitted is None:
+            return None
+        pose = fitted[0]
+        if observed.tobytes() in seen:
+            break
+        seen.add(observed.tobytes())
+        cosines = pose.true(field.direction, corner) @ (pose.matrix @ reference.T)
+        nearest = cosines.argmax(axis=1)
+        rows = np.arange(len(field))
+        apart = np.sqrt(np.maximum(2.0 - 2.0 * cosines[rows, nearest], 0.0))
+        gate = np.maximum(_GATE_SIGMAS * field.sigma, _GATE_SHARE * corner) * pose.scale
+        within = np.flatnonzero((apart <= gate) & (cosines.argmax(axis=0)[nearest] == rows))
+        if len(within) < len(observed):
+            break
+        observed, star = within, expected[nearest[within]]
+    assert fitted is not None  # there was a round
+    squares = fitted[2]
+    spread = max(1.0, math.sqrt(float(np.median(squares))) / _RAYLEIGH_MEDIAN)
+    kept = squares <= (_OUTLIER * spread) ** 2
+    if kept.sum() >= 4 and not kept.all():
+        observed, star = observed[kept], star[kept]
+        fitted = _distorted_fit(field, sky, observed, star, pose, corner)
+        if fitted is None:
+            return None
+    pose, normal, squares = fitted
+    # Residuals beyond the sigmas increase the covariance, except for the part of the prior.
+    normal[4, 4] -= PRIOR**-2
+    normal /= inflation(squares, 5)
+    normal[4, 4] += PRIOR**-2
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    from_lens = np.outer(covariance[:3, 4], covariance[:3, 4]) / covariance[4, 4]
+    refined = Refinement(pose.matrix, pose.scale, covariance[:4, :4], squares)
+    seen_by = pose.true(field.direction, corner)
+    return DistortedFit(observed, star, refined, pose.distortion, seen_by, from_lens)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _DistortedPose:
+    """Attitude (3, 3), scale and distortion."""
+
+    matrix: FloatArray
+    scale: float
+    distortion: float
+
+    def true(self, direction: FloatArray, corner: float) -> FloatArray:
+        """Return the directions (n, 3) corrected for scale and distortion, of observed ones (n, 3)."""
+        return stretched(direction, self.scale * self.ratio(direction, corner))
+
+    def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
+        """Return true over observed tangents (n,) at the scale: Newton's method for r (1 + c s^2 r^2) = 1."""
+        squared = self.distortion * _squared_tangent(direction) / corner**2
+        ratio = np.ones(len(direction))
+        for _ in range(4):
+            ratio -= (ratio * (1.0 + squared * ratio**2) - 1.0) / (1.0 + 3.0 * squared * ratio**2)
+        return ratio
+
+
+def _squared_tangent(direction: FloatArray) -> FloatArray:
+    return np.asarray((direction[:, 0] ** 2 + direction[:, 1] ** 2) / direction[:, 2] ** 2)
+
+
+def _distorted_fit(
+    field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _DistortedPose, corner: float
+) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
+    """Return the fit to the matched stars, its normal matrix (5, 5) with the prior, and squares (k,)."""
+    direction, reference = field.direction[observed], sky.stars.direction[star]
+    weight = 1.0 / (field.sigma[observed] * pose.scale)
+    for _ in range(_DISTORTION_STEPS):
+        ratio = pose.ratio(direction, corner)
+        seen = stretched(direction, pose.scale * ratio)
+        predicted = reference @ pose.matrix.T
+        residual = weight[:, None] * (seen - predicted)
+        slope = np.empty((len(seen), 3, 5))
+        # A rotation d changes A r by -[d x] A r = [A r x] d, and the residual by the negative of it.
+        slope[:, :, :3] = -cross_matrices(predicted)
+        slope[:, :, 3] = scale_slope(seen)
+        share = _squared_tangent(direction) * ratio**2 / corner**2
+        slope[:, :, 4] = slope[:, :, 3] * (-share / (1.0 + 3.0 * pose.distortion * share))[:, None]
+        slope *= weight[:, None, None]
+        flat = slope.reshape(-1, 5)
+        normal = flat.T @ flat
+        normal[4, 4] += PRIOR**-2
+        gradient = flat.T @ residual.ravel()
+        gradient[4] += pose.distortion / PRIOR**2
+        try:
+            step = -np.linalg.solve(normal, gradient)
+        except np.linalg.LinAlgError:
+            return None
+        distortion = pose.distortion + float(step[4])
+        if not float(np.abs(step).max()) < 1.0 or abs(distortion) > _MOST:
+            return None
+        turn = np.asarray(step[:3], dtype=np.float64)
+        pose = _DistortedPose(turned(pose.matrix, turn), pose.scale * math.exp(float(step[3])), distortion)
+        if np.abs(step).max() < _DISTORTION_SETTLED:
+            break
+    missed = weight[:, None] * (pose.true(direction, corner) - reference @ pose.matrix.T)
+    return pose, np.asarray(normal), np.einsum("ij,ij->i", missed, missed)

@@ -1,1 +1,0 @@
-"""Which stars a frame shows: lost in space and tracking."""

@@ -1,0 +1,450 @@
+"""Lost in space: identification of the stars of a frame without prior information.
+
+Every triangle of the brightest observed stars is looked up by shape, orientation and size among the triangles
+of guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
+occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
+field until one is accepted. If none is, triangles spread over all stars are looked up: of a thousand, enough
+consist of true stars to win the vote even if most stars, including the brightest, are false. Finally the
+mirrored field is tried, and a scale outside of a narrow range that was given as a hint.
+
+The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of scales is
+divided into steps, each narrow enough for the side ratios to stay within the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.vision.startracker.attitude_fit import (
+    MatchStatus,
+    StarField,
+    StarMatch,
+    stretched,
+)
+from knightcube.vision.startracker.index.sky_index import (
+    CELL,
+    CELLS,
+    FINE,
+    LEAST_RATIO,
+    RUN_BITS,
+    SIZE_BITS,
+    SIZE_UNIT,
+    SkyIndex,
+)
+from knightcube.vision.startracker.verification import (
+    VerificationSettings,
+    nothing,
+    verify_matrix,
+)
+
+_BRIGHTEST = 12
+_NEIGHBOURS = 5
+_CENTRES = 40
+_MOST_STARS = 64
+# Limits of the longest side, relative to the width of the field: the index has larger triangles of bright
+# stars only, and smaller triangles are less accurate.
+_MIDDLE_SIZES = 0.3, 0.75
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSizes:
+    """Numbers of triangles that are looked up at once, batch after batch.
+
+    Attributes:
+        bright: batches of the brightest stars, at each step of scale; these solve most frames.
+        spread: batches of triangles spread over many stars, for frames whose brightest points are false.
+    """
+
+    bright: tuple[int, ...] = (60, 250)
+    spread: tuple[int, ...] = (300, 1000)
+
+
+def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
+    """Yield batches of triangles (t, 3), and whether they are spread over many stars.
+
+    With many `steps` of scale a batch of the brightest stars is smaller, by the square root of their number.
+    The last batch includes triangles of neighbours, for a list that is not sorted by brightness.
+    """
+    brightest = triples(min(len(field), _BRIGHTEST))
+    begin = 0
+    for size in sizes.bright:
+        end = min(begin + max(20, int(size / steps**0.5)), len(brightest))
+        if end > begin:
+            yield brightest[begin:end], False
+        begin = end
+    if len(field) <= _BRIGHTEST and begin == len(brightest):
+        return
+    spread = np.split(middle_sized(field)[: sum(sizes.spread)], np.cumsum(sizes.spread)[:-1])
+    if len(field) > _BRIGHTEST:
+        spread[-1] = np.concatenate([spread[-1], neighbours(field)])
+    yield from ((triangles, True) for triangles in spread if len(triangles))
+
+
+def middle_sized(field: StarField) -> IntArray:
+    """Return medium-sized triangles (t, 3) of the brightest stars, in a random order."""
+    triangles = triples(min(len(field), _MOST_STARS))
+    first, second, third = triangles.T
+    direction = field.direction[:_MOST_STARS]
+    cosine = direction @ direction.T
+    least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
+    longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
+    kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
+    # A fixed seed: the same list always gives the same result.
+    return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
+
+
+@lru_cache(maxsize=32)
+def triples(count: int) -> IntArray:
+    """Return all triangles (t, 3) of `count` stars, sorted by the faintest star of each."""
+    first, second, third = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
+    ascending = (first < second) & (second < third)
+    triangles = np.stack([first[ascending], second[ascending], third[ascending]], axis=-1)
+    return np.asarray(triangles[np.lexsort(triangles.T)])
+
+
+def neighbours(field: StarField) -> IntArray:
+    """Return triangles (t, 3) of stars and their nearest neighbours of any brightness."""
+    cosines = field.direction[:_CENTRES] @ field.direction.T
+    near = np.argsort(-cosines, axis=1)[:, 1 : _NEIGHBOURS + 1]
+    one, two = np.triu_indices(_NEIGHBOURS, 1)
+    corners = np.stack(
+        np.broadcast_arrays(np.arange(len(near))[:, None], near[:, one], near[:, two]), axis=-1
+    ).reshape(-1, 3)
+    return np.unique(np.sort(corners, axis=1), axis=0)
+
+
+_LARGEST_SIZE = (1 << SIZE_BITS) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleSteps:
+    """Ranges of scale that together cover the range of the lens, each narrow enough for one set of shapes.
+
+    Attributes:
+        middle: scale at which the shapes are computed (s,).
+        lowest, highest: ends of each range (s,).
+    """
+
+    middle: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.middle)
+
+    @classmethod
+    def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
+        """Return the steps for the scale range of a field; side ratios vary by `tolerance` within a step.
+
+        At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
+        1 + t^2 / 2 across it. The ratio of two sides half-way to the corner therefore varies by t^2 / 2.
+        """
+        lowest, highest = field.scale
+        half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
+        count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
+        edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
+        return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleMatches:
+    """Matches of observed triangles with triangles of guide stars, corner by corner.
+
+    Attributes:
+        observed: numbers of observed stars (k, 3), uint32.
+        star: numbers of guide stars (k, 3), uint32.
+        scale: factor of the tangents that makes the longest sides equal (k,).
+    """
+
+    observed: npt.NDArray[np.uint32]
+    star: npt.NDArray[np.uint32]
+    scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    @classmethod
+    def of(cls, parts: Sequence[TriangleMatches]) -> TriangleMatches:
+        """Return the concatenation of several sets of matches."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.observed for part in parts]),
+            np.concatenate([part.star for part in parts]),
+            np.concatenate([part.scale for part in parts]),
+        )
+
+    def votes(self) -> IntArray:
+        """Return for each pair of each match (k, 3) how many matches of similar scale contain it."""
+        bins = np.log(self.scale) * _BINS_PER_LN_SCALE
+        bins -= bins.min()
+        bits = max(13, self.star.size.bit_length())
+        # A multiplicative hash: two pairs rarely share a slot, and a collision is harmless.
+        code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
+        code += bins.astype(np.uint32)[:, None]
+        slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
+        return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot])
+
+
+_BINS_PER_LN_SCALE = 15.0
+
+
+def look_up(
+    field: StarField,
+    sky: SkyIndex,
+    steps: ScaleSteps,
+    triangles: IntArray,
+    tolerance: float,
+    distortion: float,
+    most: int,
+) -> tuple[TriangleMatches, int]:
+    """Return the matches of observed triangles in the index, and the number of index entries read.
+
+    Args:
+        field: the observed stars.
+        sky: the index.
+        steps: ranges of scale.
+        triangles: numbers of observed stars (t, 3).
+        tolerance: tolerance of a side ratio, in its sigmas.
+        distortion: additional error of a side ratio.
+        most: maximum number of entries to read; the first triangles take precedence.
+    """
+    corners, sides, left = _forms(field, triangles, steps)
+    size = np.maximum(sides[:, 2], SIZE_UNIT)
+    sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
+    step = np.tile(np.arange(len(steps)), len(triangles))
+    # The error of the difference of two directions, and of the side by which it is divided.
+    slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
+    ratio = sides[:, :2] / size[:, None]
+    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
+    corners, size, left = corners[usable], size[usable], left[usable]
+    slack, ratio, step = slack[usable], ratio[usable], step[usable]
+    lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
+    highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
+    query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
+    begin, count = _affordable(begin, end, most)
+    query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
+    # int32: the entries are the bulk of the work.
+    first = (begin - (np.cumsum(count) - count)).astype(np.int32)
+    entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
+    near = np.ones(len(entry), dtype=np.bool_)
+    for column, cells in enumerate((short, middle)):
+        lowest_place, width = _places(ratio[query, column], slack[query], cells)
+        place = sky.triangles.shape[:, column][entry]
+        # Below the lowest position the difference of the unsigned bytes wraps around to a large number.
+        near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
+    chosen = np.flatnonzero(near)
+    total = len(entry)
+    entry = entry[chosen]
+    query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
+    longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    # The runs contain some triangles that are too small or too large for the step.
+    fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
+    entry, query, longest = entry[fits], query[fits], longest[fits]
+    scale = longest / size[query] * steps.middle[step[query]]
+    star = sky.triangles.corners[entry].astype(np.uint32)
+    return TriangleMatches(corners[query].astype(np.uint32), star, scale), total
+
+
+def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return the beginnings and lengths of the first runs that hold at most `most` entries in total."""
+    count = end - begin
+    kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
+    return begin[:kept], count[:kept]
+
+
+def _places(
+    ratio: FloatArray, slack: FloatArray, cells: IntArray
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Return the lowest position in the cell within `slack` of each ratio, and the number of further ones."""
+    # In units of the finest division of a ratio, from the middle of the division.
+    wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
+    reach = slack * (CELLS * FINE) + 0.5
+    lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
+    highest = np.clip(np.floor(wanted + reach), lowest, FINE - 1)
+    return lowest.astype(np.uint8), (highest - lowest).astype(np.uint8)
+
+
+def _forms(
+    field: StarField, triangles: IntArray, steps: ScaleSteps
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return corners and sides (t s, 3), sorted by the opposite sides, and whether triangles turn left."""
+    x, y, z = field.direction.T
+    direction = np.empty((len(steps), len(field), 3))
+    direction[:, :, 0] = steps.middle[:, None] * x
+    direction[:, :, 1] = steps.middle[:, None] * y
+    direction[:, :, 2] = z
+    direction /= np.sqrt(np.einsum("sij,sij->si", direction, direction))[:, :, None]
+    first, second, third = triangles.T
+    one = np.stack([second, third, first], axis=-1)
+    two = np.stack([third, first, second], axis=-1)
+    cosine = (direction @ direction.transpose(0, 2, 1))[:, one, two]
+    sides = np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).transpose(1, 0, 2).reshape(-1, 3)
+    order = np.argsort(sides, axis=1)
+    rows = np.arange(len(sides))[:, None]
+    corners = np.repeat(triangles, len(steps), axis=0)[rows, order]
+    a, b, c = corners.T
+    u, v = x / z, y / z
+    left = (u[b] - u[a]) * (v[c] - v[a]) > (u[c] - u[a]) * (v[b] - v[a])
+    return corners, sides[rows, order], left
+
+
+def _runs(
+    sky: SkyIndex,
+    ratio: FloatArray,
+    slack: FloatArray,
+    left: BoolArray,
+    lowest: FloatArray,
+    highest: FloatArray,
+) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
+    """Return the runs of keys that contain triangles similar to the queries.
+
+    Each run has the number of its query, the cells of the short and of the middle ratio, and its beginning
+    and end. Each ratio of a query may lie in up to three cells.
+    """
+    low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
+    high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
+    spans = high - low
+    widest = int(spans.max(initial=0)) + 1
+    here = np.arange(widest) <= spans[:, :, None]
+    # In order of the queries: the first triangles get the first of the entries that may be read.
+    query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
+    short = low[query, 0] + along_short
+    middle = low[query, 1] + along_middle
+    form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
+    first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    below = sky.triangles.below
+    begin, end = below[(form | first) >> RUN_BITS], below[((form | last) >> RUN_BITS) + 1]
+    return query, short, middle, begin, end
+
+
+@dataclass(frozen=True, slots=True)
+class IdentificationSettings:
+    """Tolerances and limits of the search.
+
+    Attributes:
+        tolerance: tolerance of the side ratios, in their sigmas.
+        distortion: additional error of a side ratio, for a lens that is not a pinhole.
+        batches: numbers of triangles to look up.
+        work: maximum number of index entries to read.
+        verified: maximum number of candidates of each batch to verify.
+        mirror: whether the mirrored field is searched too.
+        hint_error: factor by which the scale may lie outside of a narrow range, which is considered a hint;
+            1 if the range is certain. A calibrated scale, (1, 1), is always considered certain.
+        verification: conditions under which a candidate is accepted.
+    """
+
+    tolerance: float = 3.0
+    distortion: float = 0.0015
+    batches: BatchSizes = field(default_factory=BatchSizes)
+    work: int = 600_000
+    verified: int = 12
+    mirror: bool = True
+    hint_error: float = 1.25
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+
+
+# Factor of tolerance and of verified candidates for triangles spread over many stars: some of these may be
+# missed, because there are many, and the true ones have many votes.
+_OF_SPREAD = 0.6
+# Factor by which a match of the mirrored field, or against a hint, must be less likely by chance.
+_RARE = 10.0
+DEFAULT = IdentificationSettings()
+
+
+def identify(observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT) -> StarMatch:
+    """Return the identified stars and the attitude of a frame, or why it cannot be identified."""
+    if len(observed) < settings.verification.least_matches:
+        return nothing(observed, MatchStatus.TOO_FEW_STARS)
+    answer = _search(observed, sky, settings, 1.0)
+    if answer.status is not MatchStatus.IDENTIFIED and settings.mirror:
+        answer = _search(observed.mirrored(), sky, settings, _RARE)
+        answer = replace(answer, mirrored=answer.status is MatchStatus.IDENTIFIED)
+    lowest, highest = observed.scale
+    if answer.status is not MatchStatus.IDENTIFIED and 1.0 < highest / lowest < settings.hint_error**2:
+        wider = lowest / settings.hint_error, highest * settings.hint_error
+        answer = _search(replace(observed, scale=wider), sky, settings, _RARE)
+    return answer
+
+
+def _search(
+    observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
+) -> StarMatch:
+    """Return the identification of a field without trying its mirror image or another scale."""
+    steps = ScaleSteps.of(observed, settings.distortion)
+    found: list[TriangleMatches] = []
+    tried: set[tuple[int, int]] = set()
+    work = 0
+    for triangles, spread in batches_of(observed, settings.batches, len(steps)):
+        share = _OF_SPREAD if spread else 1.0
+        finds, read = look_up(
+            observed,
+            sky,
+            steps,
+            triangles,
+            share * settings.tolerance,
+            settings.distortion,
+            settings.work - work,
+        )
+        found.append(finds)
+        most = round(share * settings.verified)
+        for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, most):
+            answer = verify_matrix(observed, sky, matrix, scale, searched, settings.verification)
+            if answer.status is MatchStatus.IDENTIFIED:
+                return answer
+        work += read
+        if work >= settings.work:
+            break
+    return nothing(observed)
+
+
+def _candidates(
+    observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: set[tuple[int, int]], most: int
+) -> Iterator[tuple[FloatArray, float]]:
+    """Yield attitudes (3, 3) and scales of the matches with the most votes, without repetition."""
+    if not len(finds):
+        return
+    votes = finds.votes().sum(axis=1)
+    # There may be a hundred thousand matches: only those with the most votes are sorted.
+    first = np.argpartition(-votes, min(8 * most, len(votes) - 1))[: 8 * most]
+    order = first[np.lexsort((first, -votes[first]))]
+    yielded = 0
+    for find in order.tolist():
+        pairs = list(zip(finds.observed[find].tolist(), finds.star[find].tolist(), strict=True))
+        if sum(pair in tried for pair in pairs) >= 2:
+            continue
+        tried.update(pairs)
+        # One triangle gives an inaccurate scale, which is limited to the range of the lens.
+        scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
+        yield _attitude_of(observed, sky, finds, find), scale
+        yielded += 1
+        if yielded == most:
+            return
+
+
+def _attitude_of(observed: StarField, sky: SkyIndex, finds: TriangleMatches, find: int) -> FloatArray:
+    """Return the attitude (3, 3) that maps a match's guide stars onto the observed ones."""
+    seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
+    return np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]]))
+
+
+def _frame(corners: FloatArray) -> FloatArray:
+    """Return the axes, as rows (3, 3), of a frame fixed in a triangle (3, 3): the first is its centre."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
+    mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
+    norm = math.sqrt(mx * mx + my * my + mz * mz)
+    mx, my, mz = mx / norm, my / norm, mz / norm
+    dx, dy, dz = ax - bx, ay - by, az - bz
+    along = mx * dx + my * dy + mz * dz
+    dx, dy, dz = dx - along * mx, dy - along * my, dz - along * mz
+    norm = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / norm, dy / norm, dz / norm
+    return np.array([[mx, my, mz], [dx, dy, dz], [my * dz - mz * dy, mz * dx - mx * dz, mx * dy - my * dx]])

@@ -1,0 +1,459 @@
+"""Verification of a candidate attitude against the whole field, and the significance of the match.
+
+The guide stars predicted in the field are compared with the observed stars; coincident stars refine attitude
+and scale, repeatedly, until the set of matched stars no longer changes. The significance is an upper bound of
+the expected number of attitudes, among those searched, at which random stars would match the guide stars as
+well or better. If it is far below one, it also bounds the probability of a false match. The bound does not
+depend on how a candidate was found. It is raised for every choice that the matching makes among gates,
+brightness limits and tests (Bonferroni).
+
+Tracking: identifies the stars of a frame with a prior attitude.
+
+A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
+an observed and a predicted star close enough to be the same, the largest set with one shift refines the
+attitude, and the whole field verifies it as in lost in space, with the prior's uncertainty in place of the
+whole sky as the searched part.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.startracker.attitude_fit import (
+    DistortedFit,
+    MatchStatus,
+    Refinement,
+    StarField,
+    StarMatch,
+    fit_with_distortion,
+    inflation,
+    refine,
+    stretched,
+)
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+
+_MOST_ORDERED = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Chance:
+    """The parameters of the probability of a chance match.
+
+    Attributes:
+        observed: number of observed stars.
+        spread: sigma^2 of a star over the area of the field.
+        fields: number of such fields in the searched part of the sky.
+        scales: ln of the highest over the lowest scale.
+        choices: number of gates from which the matching chooses.
+        least: minimum number of matched stars.
+        enough: log10 of the bound below which the exact value does not matter.
+    """
+
+    observed: int
+    spread: float
+    fields: float
+    scales: float
+    choices: int
+    least: int
+    enough: float
+
+    def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
+        """Return log10 of the bound for `observed` stars that match the expected stars `ranks` within `gate`.
+
+        Both are numbered in order of brightness. The matching chooses the faintest star that counts: for
+        the j-th choice, with j - 1 brighter expected stars missing, the bound is multiplied by j^2 pi^2/6.
+        """
+        pairs = sorted(zip(ranks, observed, strict=True))
+        best = math.inf
+        for matched in range(len(pairs), self.least - 1, -1):
+            expected = pairs[matched - 1][0] + 1
+            value = self._of_places(gate, matched, expected)
+            value += math.log10(self.choices * math.pi**2 / 6.0 * (expected - matched + 1.0) ** 2)
+            if self.enough < value < self.enough + 8.0 and matched <= _MOST_ORDERED:
+                value += min(0.0, math.log10(2.0 * order_probability([star for _, star in pairs[:matched]])))
+            best = min(best, value)
+            if best < self.enough - 2.0:
+                break
+        return best
+
+    def _of_places(self, gate: float, matched: int, expected: int) -> float:
+        """Return log10 of the expected number of chance matches of `matched` or more of `expected` stars.
+
+        The first star may be any star of the sky. The second star lies in a ring around it that the distance
+        of the two defines, with a width given by the range of the scale and the gate. Each other star must
+        lie within the gate of an expected star. This is counted for all choices of the matched stars among
+        the observed ones. The fit moves towards its own stars: excluded from the fit, each star would be
+        farther away by 1/(1 - leverage).
+        """
+        leverage = 2.0 / matched if matched > 2 else 0.5
+        chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
+        if matched <= self.observed * chance:
+            return math.log10(self.fields * expected)
+        # The mean square distance of two points of a unit square is 1/3.
+        ring = 2.0 * math.pi / 3.0 * expected * (self.scales + 2.0 * gate * math.sqrt(3.0 * self.spread))
+        lost = self.observed - matched
+        ways = math.lgamma(self.observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
+        rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
+        # The terms for more matched stars fall faster than a geometric series (Feller VI.3).
+        ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
+        return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
+
+
+def order_probability(sequence: Sequence[int]) -> float:
+    """Return the probability that a random order has as few inversions as `sequence` (Kendall's tau)."""
+    inversions = sum(a > b for place, a in enumerate(sequence) for b in sequence[place + 1 :])
+    counts = _inversion_counts(len(sequence))
+    return sum(counts[: inversions + 1]) / math.factorial(len(sequence))
+
+
+@lru_cache(maxsize=_MOST_ORDERED + 1)
+def _inversion_counts(length: int) -> tuple[int, ...]:
+    """Return how many permutations of `length` items have 0, 1, 2, ... inversions (Mahonian numbers)."""
+    counts = [1]
+    for more in range(1, length):
+        counts = [sum(counts[max(0, total - more) : total + 1]) for total in range(len(counts) + more)]
+    return tuple(counts)
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationSettings:
+    """The conditions under which a candidate is accepted.
+
+    Attributes:
+        log10_false_alarm: log10 of the maximum expected number of chance matches in the searched sky.
+        gates: half widths within which a star matches, in its sigmas; the most significant gate is used. The
+            wide gates serve a lens with distortion, or sigmas that are too small.
+        least_matches: minimum number of matched stars.
+        rounds: maximum number of rounds of matching and refinement.
+        most: number of the brightest observed stars that decide; finally all stars are matched.
+    """
+
+    log10_false_alarm: float = -4.5
+    gates: tuple[float, ...] = (3.5, 8.0, 20.0)
+    least_matches: int = 4
+    rounds: int = 5
+    most: int = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matching:
+    """Observed stars (k,), the guide stars (k,) that they match, and the significance."""
+
+    observed: IntArray
+    star: IntArray
+    log10_chance: float
+
+
+# Share of matched bright expected stars below which distortion of the lens is fitted.
+_FEW_MISSED = 0.8
+# Maximum share of bright expected stars, beyond chance, without a match although an unmatched star is near,
+# and the radius of "near" relative to the corner's tangent. A larger share means that the fit of the lens is
+# wrong; a foreground hides stars, but adds none beside them.
+_MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
+# Excess over the limit, in powers of ten, above which a new candidate is rejected at once.
+_HOPELESS = 7.0
+
+
+def verify(
+    field: StarField,
+    sky: SkyIndex,
+    attitude: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> StarMatch:
+    """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
+
+    Args:
+        field: the observed stars.
+        sky: the guide stars.
+        attitude: attitude of the candidate (4,), ICRS to camera, within some sigmas of the true attitude.
+        scale: scale of the candidate.
+        searched: share of all attitudes from which candidates were taken; 1 if lost in space.
+        settings: conditions of acceptance.
+    """
+    return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
+
+
+def verify_matrix(
+    field: StarField,
+    sky: SkyIndex,
+    matrix: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> StarMatch:
+    """Return the identification as `verify` does, for an attitude matrix (3, 3)."""
+    expected = expected_stars(sky, matrix, _half_width(field, scale), int(1.3 * len(field)) + 8)
+    deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
+    start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
+    decided = _settle(deciding, sky, expected, start, searched, settings)
+    if decided is None:
+        return nothing(field)
+    matching, refined = decided
+    if matching.log10_chance > settings.log10_false_alarm:
+        return nothing(field)
+    if deciding is not field:
+        expected = expected_stars(
+            sky, refined.matrix, _half_width(field, refined.scale), int(1.3 * len(field)) + 8
+        )
+        decided = _settle(field, sky, expected, refined, searched, settings)
+        if decided is None:
+            return nothing(field)
+        matching, refined = decided
+    # A calibrated lens has no unknown distortion. Other lenses have, if stars are missed or scatter.
+    if field.scale[1] > field.scale[0] and (
+        _share_of_bright(expected, matching.star) < _FEW_MISSED
+        or inflation(refined.squares, len(refined.covariance)) > 1.0
+    ):
+        return _distorted(field, sky, matching, refined)
+    return _identified(field, matching, refined.widened())
+
+
+def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
+    """Return the identification with distortion fitted; NO_MATCH if bright stars are displaced."""
+    width = _half_width(field, refined.scale)
+    expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
+    found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
+    if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
+        return nothing(field)
+    grown = _Matching(found.observed, found.star, matching.log10_chance)
+    answer = _identified(field, grown, found.refined)
+    return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
+
+
+def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
+    """Return the share of the bright expected stars that match."""
+    matched = _bright_matched(expected, star)
+    return float(np.mean(matched)) if len(matched) else 0.0
+
+
+def _bright_matched(
+    expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
+) -> npt.NDArray[np.bool_]:
+    """Return which bright expected stars match: those at least as bright as the median matched star."""
+    matched = np.isin(expected, star)
+    places = np.flatnonzero(matched)
+    return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
+
+
+def _share_displaced(
+    field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
+) -> float:
+    """Return the share of bright expected stars, beyond chance, without a match but with a star nearby."""
+    matched = _bright_matched(expected, found.star)
+    missed = sky.stars.direction[expected[: len(matched)][~matched]]
+    unmatched = np.delete(found.seen, found.observed, axis=0)
+    if not len(missed) or not len(unmatched):
+        return 0.0
+    across, down = _half_width(field, found.refined.scale)
+    radius = _DISPLACED_BY * math.hypot(across, down)
+    nearest = (unmatched @ (found.refined.matrix @ missed.T)).max(axis=0)
+    near = np.count_nonzero(2.0 - 2.0 * nearest < radius**2)
+    chance = len(missed) * min(1.0, len(unmatched) * math.pi * radius**2 / (4.0 * across * down))
+    return float(near - chance) / len(matched)
+
+
+def nothing(field: StarField, status: MatchStatus = MatchStatus.NO_MATCH) -> StarMatch:
+    """Return an identification without matched stars."""
+    return StarMatch(status, np.full(len(field), -1))
+
+
+def expected_stars(
+    sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
+) -> npt.NDArray[np.intp]:
+    """Return the numbers of the `count` brightest guide stars in the field, the brightest first."""
+    across, down = half_width
+    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
+    # Search twice as many of the brightest stars as an even sky would need for `count` stars in the field:
+    # the density varies between the Milky Way and the galactic poles.
+    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
+    x, y, z = matrix @ sky.stars.direction[near].T
+    inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
+    return np.asarray(near[inside][:count])
+
+
+def _half_width(field: StarField, scale: float) -> tuple[float, float]:
+    return field.half_width[0] * scale, field.half_width[1] * scale
+
+
+def _settle(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    start: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> tuple[_Matching, Refinement] | None:
+    """Return the matched stars and the refined `start` once both no longer change; None if they diverge."""
+    refined, previous = start, None
+    for _ in range(settings.rounds):
+        matching = _match(field, sky, expected, refined, searched, settings)
+        if matching is None or (
+            previous is None and matching.log10_chance > settings.log10_false_alarm + _HOPELESS
+        ):
+            return None
+        if previous is not None and np.array_equal(previous.observed, matching.observed):
+            return matching, refined
+        previous = matching
+        found = refine(
+            field.direction[matching.observed],
+            sky.stars.direction[matching.star],
+            field.sigma[matching.observed],
+            refined.matrix,
+            refined.scale,
+            field.scale[1] > field.scale[0],
+        )
+        if found is None or not _plausible(found, field):
+            return None
+        refined = found
+    return (previous, refined) if previous is not None else None
+
+
+def _match(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    at: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> _Matching | None:
+    """Return the observed stars with an expected star within a gate, for the most significant gate."""
+    if len(expected) < settings.least_matches:
+        return None
+    cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(nearest))
+    variance = (field.sigma * at.scale) ** 2
+    squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
+    squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+    area = 4.0 * field.half_width[0] * field.half_width[1] * at.scale**2
+    chance = Chance(
+        len(field),
+        float(variance.mean()) / area,
+        4.0 * math.pi / area * searched,
+        math.log(field.scale[1] / field.scale[0]),
+        len(settings.gates),
+        settings.least_matches,
+        settings.log10_false_alarm,
+    )
+    best: _Matching | None = None
+    matched = settings.least_matches - 1
+    for gate in settings.gates:
+        within = np.flatnonzero(squared <= gate * gate)
+        # A wider gate with the same stars is less significant.
+        if len(within) <= matched:
+            continue
+        matched = len(within)
+        value = chance.log10(gate, within.tolist(), nearest[within].tolist())
+        if best is None or value < best.log10_chance:
+            best = _Matching(within, expected[nearest[within]], value)
+    return best
+
+
+def _plausible(refined: Refinement, field: StarField) -> bool:
+    """Return whether the fitted scale lies in the range of the lens, within five of its sigmas."""
+    lowest, highest = field.scale
+    if lowest == highest:
+        return True
+    slack = math.exp(5.0 * refined.scale_sigma)
+    return lowest / slack <= refined.scale <= highest * slack
+
+
+def _identified(field: StarField, matching: _Matching, refined: Refinement) -> StarMatch:
+    star = np.full(len(field), -1)
+    star[matching.observed] = matching.star
+    return StarMatch(
+        MatchStatus.IDENTIFIED,
+        star,
+        refined.fix(),
+        refined.scale,
+        refined.scale_sigma * refined.scale,
+        matching.log10_chance,
+    )
+
+
+_BRIGHTEST = 16
+_PRIOR_SIGMAS = 4.0
+# More pairs are ambiguous, and comparing them takes longer than a search of the whole sky.
+_MOST_PAIRS = 400
+_DEFAULT = VerificationSettings()
+
+
+def track(
+    field: StarField,
+    sky: SkyIndex,
+    attitude: FloatArray,
+    sigma: float,
+    settings: VerificationSettings = _DEFAULT,
+) -> StarMatch:
+    """Return the identification of the frame near a prior attitude; NO_MATCH if it points elsewhere.
+
+    `attitude` (4,), ICRS to camera, has the standard deviation `sigma`, rad, about each axis. If `sigma`
+    exceeds some degrees, `identify` is faster and more reliable.
+    """
+    if len(field) < settings.least_matches:
+        return nothing(field, MatchStatus.TOO_FEW_STARS)
+    scale = math.sqrt(field.scale[0] * field.scale[1])
+    matrix = attitude_matrix(attitude)
+    observed, star = _same_shift(field, sky, matrix, scale, sigma)
+    if len(observed) >= 2:
+        free_scale = field.scale[1] > field.scale[0] and len(observed) > 2
+        found = refine(
+            field.direction[observed],
+            sky.stars.direction[star],
+            field.sigma[observed],
+            matrix,
+            scale,
+            free_scale,
+        )
+        if found is not None:
+            matrix, scale = found.matrix, found.scale
+    # Volume of the ball of rotations around the prior over that of all rotations, 8 pi^2 in this measure.
+    searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
+    return verify_matrix(field, sky, matrix, scale, searched, settings)
+
+
+def _same_shift(
+    field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float, sigma: float
+) -> tuple[IntArray, npt.NDArray[np.intp]]:
+    """Return observed and guide stars (k,), (k,) of the largest set of pairs with one shift."""
+    reach = _PRIOR_SIGMAS * sigma
+    across, down = (scale * width for width in field.half_width)
+    wider = across + reach * (1.0 + across**2), down + reach * (1.0 + down**2)
+    area = (wider[0] * wider[1]) / (across * down)
+    expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
+    seen = stretched(field.direction[:_BRIGHTEST], scale)
+    shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
+    # Roll, and an unknown scale, make the shifts of stars at the edge differ.
+    radius = math.hypot(across, down)
+    star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
+    stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
+    close = (
+        np.einsum("ijk,ijk->ij", shift, shift)
+        <= (math.sqrt(2.0) * reach + stretch * radius + 4.0 * star_sigma) ** 2
+    )
+    one, two = np.nonzero(close)
+    if not len(one) or len(one) > _MOST_PAIRS:
+        return np.empty(0, dtype=np.int64), expected[:0]
+    shifts = shift[one, two]
+    apart = shifts[:, None, :] - shifts
+    tolerance = 4.0 * star_sigma + (_PRIOR_SIGMAS * sigma + stretch) * radius
+    agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
+    # Pairs that share an observed or a guide star do not support each other.
+    agree &= (one[:, None] != one) & (two[:, None] != two)
+    best = int(agree.sum(axis=1).argmax())
+    members = np.append(np.flatnonzero(agree[best]), best)
+    nearest = members[np.argsort(np.einsum("ij,ij->i", apart[best, members], apart[best, members]))]
+    observed, first = np.unique(one[nearest], return_index=True)
+    return observed, expected[two[nearest[first]]]

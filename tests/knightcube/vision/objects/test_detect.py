@@ -1,0 +1,437 @@
+"""The three indicators: by hand, for stars at every angle, and for what is no star.
+
+Objects among the stars: found when they are there, quiet when they are not, overlaps told apart.
+
+Objects that cross in the frame, from pixels to tracks; and a crowded sky at rest has an attitude.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.olae import rotation_between
+from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
+from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
+from knightcube.vision.frame_job import run
+from knightcube.vision.objects.detect import (
+    ObjectReport,
+    SpaceObject,
+    Verdict,
+    angular_displacements,
+    centre_residuals,
+    detect,
+    evaluate,
+    lengths,
+    olae_residuals,
+    slopes,
+    star_ends,
+)
+from knightcube.vision.objects.settings import ObjectSettings
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
+from sim_hal.star_camera import SourceTrack
+from tests.flight.loop.executive.passing import passed
+from tests.knightcube.vision.objects.space_objects import (
+    add_object,
+    frame_with,
+    motion_across,
+    object_path,
+    star_field,
+)
+from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
+from tests.knightcube.vision.streaks.frames import expose, rate_at, read_out, star_camera, true_endpoints
+
+_CAMERA = star_camera()
+_PINHOLE = _CAMERA.pinhole
+_BOUNDS = (8.0, 10.0, 10.0)
+_THETAS = [2.0, 10.0, 30.0, 60.0, 80.0, 90.0]
+
+
+def _stars(theta_deg: float, seed: int = 1, n: int = 14) -> tuple[FloatArray, FloatArray]:
+    """Return the exact ends (n, 2, 2) of stars over the whole field, and the turn (3,), 100 px at most."""
+    theta = np.deg2rad(theta_deg)
+    turn = rate_at(theta, min(100.0 / _PINHOLE.focal_length / np.sin(theta), 0.3), 0.8)
+    points = np.random.default_rng(seed).uniform(60.0, 960.0, (n, 2))
+    return true_endpoints(_CAMERA, _PINHOLE.unit_vectors(points), turn), turn
+
+
+def test_the_indicators_of_a_quarter_circle_by_hand() -> None:
+    """Centre (10, 20): from (13, 20) to (10, 23), a quarter turn of radius 3."""
+    ends = np.array([[[13.0, 20.0], [10.0, 23.0]]])
+    centre = np.array([10.0, 20.0])
+    assert centre_residuals(ends, centre)[0] == pytest.approx(0.0, abs=1e-15)
+    assert angular_displacements(ends, centre)[0] == pytest.approx(0.5 * np.pi)
+    assert lengths(ends)[0] == pytest.approx(3.0 * np.sqrt(2.0))
+    assert slopes(ends)[0] == pytest.approx(0.75 * np.pi)
+    # A centre off by (1, 0) is missed by the part of it along the chord.
+    assert abs(centre_residuals(ends, centre + np.array([1.0, 0.0]))[0]) == pytest.approx(np.sqrt(0.5))
+
+
+def test_the_residual_is_that_of_olae() -> None:
+    ends, _ = _stars(60.0)
+    noisy = ends + np.random.default_rng(2).normal(0.0, 0.5, ends.shape)
+    vectors = _PINHOLE.unit_vectors(noisy)
+    solution = rotation_between(vectors[:, 0], vectors[:, 1], np.ones(len(ends)))
+    found = olae_residuals(vectors, solution.rotation_vector)
+    np.testing.assert_allclose(found, np.linalg.norm(solution.residuals, axis=-1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("theta_deg", _THETAS)
+def test_a_star_in_the_same_place_is_the_star_itself(theta_deg: float) -> None:
+    ends, turn = _stars(theta_deg)
+    vectors = _PINHOLE.unit_vectors(ends)
+    np.testing.assert_allclose(_PINHOLE.project(star_ends(vectors, turn)), ends, atol=1e-8)
+
+
+@pytest.mark.parametrize("theta_deg", _THETAS)
+def test_exact_stars_deviate_nowhere_whatever_the_axis(theta_deg: float) -> None:
+    """Over the whole field, though the projection bends slopes by 1.8 deg and lengths by 6 % across it."""
+    ends, turn = _stars(theta_deg)
+    found = evaluate(ends[:, ::-1], np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
+    np.testing.assert_allclose(found.deviations, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.endpoints, ends)
+    assert found.degenerate == (theta_deg > 71.6)
+    assert not found.fired.any()
+
+
+@pytest.mark.parametrize("theta_deg", _THETAS)
+def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg: float) -> None:
+    """Across and along a streak each difference of two ends has unit variance; the residual holds both."""
+    rng = np.random.default_rng(3)
+    ends, turn = _stars(theta_deg, n=14)
+    long = lengths(ends) > 25.0
+    sigma = rng.uniform(0.05, 0.3, len(ends))
+    deviations = [
+        evaluate(
+            ends + sigma[:, None, None] * rng.normal(size=ends.shape), sigma, turn, _PINHOLE, _BOUNDS
+        ).deviations[long]
+        for _ in range(60)
+    ]
+    spread = np.sqrt(np.mean(np.square(deviations), axis=(0, 1)))
+    # The centre is itself fitted and the field's edge is stretched: a fifth.
+    np.testing.assert_allclose(spread, [1.0, 1.0, np.sqrt(2.0)], rtol=0.2)
+
+
+@pytest.mark.parametrize("theta_deg", _THETAS)
+@pytest.mark.parametrize(
+    ("along", "across", "expected"),
+    [(6.0, 0.0, (False, True, True)), (0.0, 6.0, (True, False, True))],
+)
+def test_each_indicator_sees_its_own_part_of_a_motion(
+    theta_deg: float, along: float, across: float, expected: tuple[bool, bool, bool]
+) -> None:
+    """An object whose second end is 6 px on, or to the side: 42 standard deviations of 0.1 px."""
+    ends, turn = _stars(theta_deg)
+    one = int(np.argmax(lengths(ends)))
+    chord = ends[one, 1] - ends[one, 0]
+    chord /= np.linalg.norm(chord)
+    side = np.array([-chord[1], chord[0]])
+    # Symmetric about the middle, so that the star in the same place is the same star.
+    moved = 0.5 * (along * chord + across * side)
+    ends[one] += [-moved, moved]
+    found = evaluate(ends, np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
+    assert tuple(found.fired[one]) == expected
+    assert not np.delete(found.fired, one, axis=0).any()
+
+
+def test_a_point_has_no_direction_but_the_wrong_displacement() -> None:
+    ends, turn = _stars(60.0)
+    ends[3] = ends[3].mean(axis=0)
+    found = evaluate(ends, np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
+    assert tuple(found.fired[3]) == (False, True, True)
+    assert np.all(np.isfinite(found.deviations))
+
+
+def test_the_lower_bound_keeps_a_quiet_frame_quiet_and_the_strict_rule_a_loud_one() -> None:
+    ends, turn = _stars(60.0, n=30)
+    rng = np.random.default_rng(4)
+    noise = rng.normal(size=ends.shape)
+    sigma = np.full(len(ends), 0.1)
+    quiet = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, _BOUNDS)
+    strict_only = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, (0.0, 0.0, 0.0))
+    # 2.5 sigma of thirty streaks and three indicators: a false alarm in nearly every frame.
+    assert strict_only.fired.any()
+    assert not quiet.fired.any()
+    # Errors ten times the expected ones: the frame's own spread holds where the bound would fire.
+    loud = evaluate(ends + noise, sigma, turn, _PINHOLE, _BOUNDS)
+    assert np.count_nonzero(np.abs(loud.deviations) > _BOUNDS) > 3 * np.count_nonzero(loud.fired)
+
+
+def test_no_streaks_give_no_indicators() -> None:
+    found = evaluate(np.empty((0, 2, 2)), np.empty(0), np.array([0.0, 0.03, 0.0]), _PINHOLE, _BOUNDS)
+    assert found.deviations.shape == found.fired.shape == (0, 3)
+    assert found.degenerate
+
+
+_FRAME_CAMERA = star_camera(512)
+_FOCAL = _FRAME_CAMERA.pinhole.focal_length
+_SETTINGS = StreakSettings(saturation=_FRAME_CAMERA.full_well)
+_ROTATION = rate_at(np.deg2rad(60.0), 55.0 / _FOCAL, 0.4)
+_PLACE = _FRAME_CAMERA.pinhole.unit_vectors(np.array([[270.0, 230.0]]))[0]
+_FAINTEST = 6.0
+
+
+def _detect(pixels: FloatArray, rotation: FloatArray, exposure: float = 1.0) -> ObjectReport:
+    found = _turn(pixels, rotation, exposure)
+    report = detect(pixels, _FRAME_CAMERA.pinhole, found, exposure, _SETTINGS, ObjectSettings())
+    assert report is not None
+    return report
+
+
+def _turn(pixels: FloatArray, rotation: FloatArray, exposure: float) -> FloatArray:
+    """Return the rotation that the likelihood finds; the true one decides its sign."""
+    settings = LikelihoodSettings(saturation=_SETTINGS.saturation, gain=_SETTINGS.gain)
+    found = estimate_motion(pixels, _FRAME_CAMERA.pinhole, exposure, settings, rotation / exposure, 0.0)
+    assert found.rate is not None
+    return np.asarray(found.rate * exposure)
+
+
+def _see(
+    motion: FloatArray,
+    magnitude: float,
+    seed: int = 5,
+    rotation: FloatArray = _ROTATION,
+    exposure: float = 1.0,
+) -> tuple[ObjectReport, FloatArray]:
+    """Return what is found in a frame with one object, and its true path in the image."""
+    path = object_path(_FRAME_CAMERA, _PLACE, motion, rotation)
+    pixels = frame_with(_FRAME_CAMERA, rotation, exposure, seed, [(path, magnitude)], _FAINTEST)
+    return _detect(pixels, rotation, exposure), path
+
+
+def _only(report: ObjectReport) -> SpaceObject:
+    assert len(report.objects) == 1
+    return report.objects[0]
+
+
+@pytest.mark.parametrize(("towards", "px"), [(0.3, 25.0), (2.4, 60.0), (4.0, 25.0)])
+def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: float, px: float) -> None:
+    exposure = 0.5
+    motion = motion_across(_PLACE, px / _FOCAL, towards)
+    report, path = _see(motion, 4.0, exposure=exposure)
+    found = _only(report)
+    np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
+    # The ends' order is the one of slower motion; both rates are told.
+    assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
+    assert found.other_relative_rate > found.relative_rate
+    np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)
+    assert "residual" in found.fired
+
+
+@pytest.mark.parametrize("theta_deg", [60.0, 90.0])
+def test_a_tracked_object_is_a_point_that_moves_among_the_stars(theta_deg: float) -> None:
+    rotation = rate_at(np.deg2rad(theta_deg), 50.0 / _FOCAL / np.sin(np.deg2rad(theta_deg)), 0.9)
+    report, path = _see(rotation, 6.0, rotation=rotation)
+    found = _only(report)
+    np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.3)
+    assert set(found.fired) == {"displacement", "residual"}
+    # Against the stars, which go as -omega x v: the object goes the other way at the camera's own rate.
+    star = -np.cross(rotation, _PLACE)
+    assert found.relative_rate == pytest.approx(np.linalg.norm(star), rel=0.02)
+    np.testing.assert_allclose(found.direction, -star[:2] / np.linalg.norm(star[:2]), atol=0.05)
+
+
+def test_a_saturated_tracked_object_is_found() -> None:
+    found = _only(_see(_ROTATION, 4.0)[0])
+    np.testing.assert_allclose(found.endpoints.mean(axis=0), [270.0, 230.0], atol=0.5)
+
+
+def test_with_time_reversed_everything_moves_the_other_way() -> None:
+    motion = motion_across(_PLACE, 60.0 / _FOCAL, 2.4)
+    path = object_path(_FRAME_CAMERA, _PLACE, motion, _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
+    forward, backward = _only(_detect(pixels, _ROTATION)), _only(_detect(pixels, -_ROTATION))
+    np.testing.assert_allclose(backward.direction, -forward.direction, atol=1e-9)
+    np.testing.assert_allclose(backward.endpoints, forward.endpoints[::-1])
+    assert backward.relative_rate == pytest.approx(forward.relative_rate)
+
+
+def test_frames_without_an_object_have_none() -> None:
+    for seed, theta_deg in enumerate((90.0, 30.0, 10.0)):
+        theta = np.deg2rad(theta_deg)
+        rotation = rate_at(theta, min(60.0 / _FOCAL / np.sin(theta), 0.2), 0.7 * seed)
+        report = _detect(frame_with(_FRAME_CAMERA, rotation, 1.0, 40 + seed, [], 7.0), rotation)
+        assert report.objects == ()
+        assert Verdict.OBJECT not in report.verdicts + report.crowded
+        assert report.verdicts.count(Verdict.STAR) >= 4
+
+
+# A second star so many px along and across the first one's streak of 55 px, and its magnitude.
+@pytest.mark.parametrize(
+    ("along", "across", "magnitude"),
+    [
+        (28.0, 0.0, 4.5),
+        (40.0, 0.0, 3.6),
+        (0.0, 2.5, 4.0),
+        (30.0, 3.0, 4.0),
+        (54.0, 1.0, 4.3),
+        (10.0, -4.0, 4.6),
+    ],
+)
+def test_overlapping_streaks_of_two_stars_are_no_object(
+    along: float, across: float, magnitude: float
+) -> None:
+    directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
+    star = -np.cross(_ROTATION, _PLACE)[:2]
+    way = star / np.linalg.norm(star)
+    second = np.array([270.0, 230.0]) + along * way + across * np.array([-way[1], way[0]])
+    both = np.stack([_PLACE, _FRAME_CAMERA.pinhole.unit_vectors(second[None])[0]])
+    directions = np.concatenate([directions, both])
+    magnitudes = np.append(magnitudes, [4.0, magnitude])
+    image = expose(_FRAME_CAMERA, directions, magnitudes, _ROTATION, 1.0)
+    report = _detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(6)), _ROTATION)
+    assert report.objects == ()
+    # It was noticed, not overlooked: some region is stars, or unclear, by its pixels.
+    assert {Verdict.STARS, Verdict.UNCLEAR} & set(report.verdicts + report.crowded)
+
+
+def test_an_object_that_crosses_a_star_is_found() -> None:
+    directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
+    directions = np.concatenate([directions, _PLACE[None]])
+    image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 4.0), _ROTATION, 1.0)
+    star = -np.cross(_ROTATION, _PLACE)[:2]
+    # In the image it goes straight across the star's own path.
+    across = np.arctan2(star[0], -star[1])
+    seen = object_path(
+        _FRAME_CAMERA, _PLACE, _ROTATION + motion_across(_PLACE, 60.0 / _FOCAL, across), _ROTATION
+    )
+    add_object(image, _FRAME_CAMERA, seen, 3.5, 1.0)
+    found = _only(_detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION))
+    error = min(np.abs(found.endpoints - ends).max() for ends in (seen[[0, -1]], seen[[-1, 0]]))
+    assert error < 1.5
+    assert found.fired == ()
+
+
+@pytest.mark.parametrize("along", [8.0, 25.0])
+@pytest.mark.parametrize("magnitude", [4.0, 6.0])
+def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: float) -> None:
+    """The region of the two is long, and saturated at magnitude 4."""
+    directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
+    directions = np.concatenate([directions, _PLACE[None]])
+    image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 5.0), _ROTATION, 1.0)
+    star = -np.cross(_ROTATION, _PLACE)[:2]
+    way = star / np.linalg.norm(star)
+    place = np.array([270.0, 230.0]) + along * way + 2.0 * np.array([-way[1], way[0]])
+    direction = _FRAME_CAMERA.pinhole.unit_vectors(place[None])[0]
+    add_object(
+        image, _FRAME_CAMERA, object_path(_FRAME_CAMERA, direction, _ROTATION, _ROTATION), magnitude, 1.0
+    )
+    found = _only(_detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION))
+    np.testing.assert_allclose(found.endpoints, [place, place], atol=0.3)
+
+
+def test_a_bright_star_whose_core_is_saturated_is_no_object() -> None:
+    directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
+    directions = np.concatenate([directions, _PLACE[None]])
+    image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 0.5), _ROTATION, 1.0)
+    report = _detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION)
+    assert report.objects == ()
+
+
+def test_a_piece_of_a_faint_star_is_no_object() -> None:
+    """At the limit of segmentation a streak falls into pieces; their light is a star's."""
+    directions, magnitudes = star_field(_FRAME_CAMERA, 5, 5.5)
+    faint = np.concatenate([directions, _PLACE[None]])
+    for seed in range(3):
+        image = expose(_FRAME_CAMERA, faint, np.append(magnitudes, 7.9), _ROTATION, 1.0)
+        pixels = read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng([8, seed]))
+        assert _detect(pixels, _ROTATION).objects == ()
+
+
+def test_a_frame_without_streaks_has_no_report() -> None:
+    noise = np.rint(np.random.default_rng(9).normal(150.0, 12.0, (512, 512))).astype(np.uint16)
+    assert detect(noise, _FRAME_CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, ObjectSettings()) is None
+
+
+def test_an_object_weaker_than_asked_is_not_called_one() -> None:
+    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 60.0 / _FOCAL, 2.4), _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
+    deaf = dataclasses.replace(ObjectSettings(), improvement=1e9, crossing_improvement=1e9)
+    report = detect(pixels, _FRAME_CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, deaf)
+    assert report is not None
+    assert report.objects == ()
+    assert Verdict.UNCLEAR in report.verdicts + report.crowded
+
+
+def test_the_report_travels_between_processes() -> None:
+    report, _ = _see(motion_across(_PLACE, 60.0 / _FOCAL, 2.4), 4.0)
+    copy = passed(report)
+    np.testing.assert_array_equal(copy.objects[0].endpoints, report.objects[0].endpoints)
+
+
+def test_pixels_that_cannot_be_solved_for_leave_the_streak_unclear(monkeypatch: pytest.MonkeyPatch) -> None:
+    def give_up(*_: object, **__: object) -> None:
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr("knightcube.vision.objects.star_light.nnls", give_up)
+    report, _ = _see(motion_across(_PLACE, 60.0 / _FOCAL, 2.4), 4.0)
+    assert report.objects == ()
+    assert Verdict.UNCLEAR in report.verdicts
+
+
+HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
+MEETING = np.array([251.3, 262.8])
+"""px, where both are after 7 s."""
+MOTIONS = np.array([[8.0, 2.0], [5.0, -5.5]])
+"""px/s: 0.33 and 0.30 deg/s."""
+MAGNITUDE = 4.5
+
+
+def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArray:
+    """Return the attitude (4,) of a camera with this boresight and north up."""
+    right, up = np.radians([right_ascension_deg, declination_deg])
+    sight = np.array([np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)])
+    east = np.array([-np.sin(right), np.cos(right), 0.0])
+    return from_matrix(np.array([-east, np.cross(sight, -east), sight]))
+
+
+def _places(since: FloatArray) -> FloatArray:
+    """Return the places (k, 2, 2) px of both at times (k,) s after they meet."""
+    return np.asarray(MEETING + since[:, None, None] * MOTIONS)
+
+
+def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_tracks() -> None:
+    tracker, own = ObjectTracker(TrackSettings()), {}
+    focal = CAMERA.pinhole.focal_length
+    for second in range(15):
+        ways = _places(second - 7.0 + TIMES)
+        satellites = [
+            SourceTrack(TIMES, CAMERA.pinhole.unit_vectors(ways[:, k]) @ attitude_matrix(HELD), MAGNITUDE)
+            for k in range(2)
+        ]
+        sighted = run(frame_job(HELD, np.zeros(3), satellites, seed=second)).objects
+        assert sighted is not None
+        assert len(sighted.points) <= 2
+        frame = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
+        tracker.ingest(FrameSightings(second * 1_000_000_000, *frame))
+        true = CAMERA.pinhole.unit_vectors(_places(np.array([second - 7.0]))[0]) @ attitude_matrix(HELD)
+        away = {
+            track.number: focal * np.linalg.norm(true - track.line.direction, axis=1)
+            for track in tracker.objects
+        }
+        own[second] = {number: int(off.argmin()) for number, off in away.items()}
+        assert all(off.min() < 1.0 for off in away.values())
+    assert own[14] == own[5]
+    assert sorted(own[14].values()) == [0, 1]
+
+
+@pytest.mark.parametrize(("right", "up"), [(-131.5, -72.95), (102.7, -39.5)])
+@pytest.mark.parametrize("rate_deg", [0.0, 0.3])
+def test_a_crowded_sky_at_rest_or_nearly_so_has_an_attitude(right: float, up: float, rate_deg: float) -> None:
+    """Its faint regions run together and look long; the streaks are at most 1.5 px."""
+    held = _looking_at(right, up)
+    turn = np.array([0.0, np.radians(rate_deg), 0.0])
+    found = run(frame_job(held, turn, []))
+    assert found.motion.status is not StreakStatus.RATE
+    assert found.solution is not None
+    assert found.solution.fix is not None
+    assert angle_between(found.solution.fix.quaternion, held) < 0.3 / CAMERA.pinhole.focal_length
+    assert found.objects is not None
+    assert not len(found.objects.points)
+    assert EXPOSURE * turn[1] * CAMERA.pinhole.focal_length < 1.6

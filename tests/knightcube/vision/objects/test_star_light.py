@@ -1,0 +1,91 @@
+"""Stars are taken away from a region down to its noise; what is none of theirs is left and measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.objects.star_light import (
+    Patch,
+    brightest_left,
+    fit_stars,
+    spread_over,
+    spread_with_slopes,
+    straight_path,
+)
+from tests.knightcube.vision.streaks.frames import deposit, rate_at, rotate, star_camera
+
+_CAMERA = star_camera(512)
+_ROTATION = rate_at(np.deg2rad(90.0), 50.0 / _CAMERA.pinhole.focal_length)
+_NOISE = 12.0
+_CORNER = np.array([200.0, 220.0])
+
+
+def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | None, seed: int) -> Patch:
+    """Return a patch of 90 x 40 px of stars of `flux` counts, and of an object of 40000 along `extra`."""
+    image = np.zeros((40, 90))
+    for middle in middles:
+        direction = _CAMERA.pinhole.unit_vectors(np.array([middle]))[0]
+        parts = np.linspace(-0.5, 0.5, 1001)
+        seen = np.array([rotate(direction[None], part * _ROTATION)[0] for part in parts])
+        deposit(image, _CAMERA.pinhole.project(seen) - _CORNER, flux, 1.0)
+    if extra is not None:
+        deposit(image, extra - _CORNER, 40_000.0, 1.0)
+    signal = image + np.random.default_rng(seed).normal(0.0, np.sqrt(_NOISE**2 + image))
+    light = np.maximum(signal, 0.0)
+    weight = 1.0 / np.sqrt(_NOISE**2 + light + (0.1 * light) ** 2)
+    mask = np.ones(signal.shape, dtype=np.bool_)
+    return Patch(signal, weight, _NOISE, _CORNER, mask, ((0.0, 0.0), (0.0, 0.0)), 1.0)
+
+
+def test_overlapping_stars_leave_nothing() -> None:
+    middles = [(240.3, 238.7), (252.0, 241.2)]
+    patch = _patch(middles, 60_000.0, None, 1)
+    paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    assert len(paths) >= 2
+    # Each true star has a path of its own, to a tenth of a pixel.
+    for middle in middles:
+        assert min(np.linalg.norm(path.mean(axis=0) - middle) for path in paths) < 0.1
+    assert brightest_left(patch, left) is None
+
+
+def test_a_point_on_a_star_is_left_and_placed() -> None:
+    place = np.array([[245.4, 240.1]])
+    patch = _patch([(240.3, 238.7)], 60_000.0, place, 2)
+    _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    found = brightest_left(patch, left)
+    assert found is not None
+    np.testing.assert_allclose(found, np.tile(place, (2, 1)), atol=0.1)
+
+
+def test_a_line_across_a_star_is_left_with_its_ends() -> None:
+    ends = np.array([[230.2, 226.4], [255.7, 253.1]])
+    patch = _patch(
+        [(240.3, 238.7)], 60_000.0, ends[0] + np.linspace(0, 1, 801)[:, None] * np.diff(ends, axis=0), 3
+    )
+    _, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    found = brightest_left(patch, left)
+    assert found is not None
+    error = min(np.abs(found - truth).max() for truth in (ends, ends[::-1]))
+    assert error < 0.5
+
+
+def test_nothing_but_noise_holds_neither_star_nor_object() -> None:
+    patch = _patch([], 0.0, None, 4)
+    paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
+    assert paths == []
+    np.testing.assert_array_equal(left, patch.signal)
+    assert brightest_left(patch, left) is None
+
+
+def test_slopes_of_light_are_those_of_small_moves() -> None:
+    path = straight_path(np.array([[10.3, 8.1], [27.8, 14.6]]))
+    share = np.linspace(0.0, 1.0, len(path))
+    light, across, down = spread_with_slopes(path, share[None], 40, 24, 1.0)
+    np.testing.assert_allclose(light, spread_over(path, 40, 24, 1.0), atol=1e-12)
+    assert abs(float(light.sum()) - 1.0) < 1e-5
+    step = 1e-4 * share[:, None]
+    for slope, axis in ((across, [1.0, 0.0]), (down, [0.0, 1.0])):
+        moved = [spread_over(path + sign * step * axis, 40, 24, 1.0) for sign in (1.0, -1.0)]
+        # To the light dropped at 5 sigma over the step.
+        np.testing.assert_allclose(slope, (moved[0] - moved[1]) / 2e-4, atol=1e-5)

@@ -1,0 +1,218 @@
+"""Lost in space on synthetic lists whose truth is known: what must be named, and what must be refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.quaternion import angle_between, attitude_matrix
+from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
+from tests.pace import ordinary_seconds
+from tests.support.star_lists import ListKind, StarList, configurations, draw, draw_random
+
+SKY = default_index()
+ARCSECOND = np.pi / 648_000.0
+
+
+def _drawn(kind: ListKind, seed: int) -> StarList:
+    return draw(kind, SKY.stars, np.random.default_rng([97, seed]))
+
+
+def _right(found: StarMatch, drawn: StarList) -> bool:
+    if found.status is not MatchStatus.IDENTIFIED or found.fix is None:
+        return False
+    matched = found.star >= 0
+    named = np.mean(found.star[matched] == drawn.star[matched])
+    return bool(named > 0.8 and angle_between(found.fix.quaternion, drawn.attitude) < 0.01)
+
+
+@pytest.mark.parametrize(
+    "kind", configurations(), ids=lambda kind: f"{kind.field_deg}-{kind.noise_px}-{kind.false_stars}"
+)
+def test_every_configuration_of_the_issue_is_named(kind: ListKind) -> None:
+    """A slice of `python -m tests.studies.bench starid`."""
+    for seed in range(10):
+        drawn = _drawn(kind, seed)
+        assert _right(identify(drawn.field(), SKY), drawn), seed
+
+
+@pytest.mark.parametrize("field_deg", [11.0, 15.0, 20.0, 25.0, 29.5])
+def test_a_field_of_view_known_only_to_lie_between_10_and_30_deg_is_found(field_deg: float) -> None:
+    for seed in range(6):
+        drawn = _drawn(ListKind(field_deg=field_deg, noise_px=0.3, false_stars=2, known_deg=None), seed)
+        found = identify(drawn.field(), SKY)
+        if np.sum(drawn.star >= 0) < 6:
+            continue
+        assert _right(found, drawn), seed
+        believed = 0.5 * 1024 / drawn.field().half_width[0]
+        true = drawn.camera.focal_length
+        assert abs(believed / found.scale / true - 1.0) < max(5.0 * found.scale_sigma, 1e-4)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        ListKind(faintest=7.5, noise_px=0.5, false_stars=5),
+        ListKind(field_deg=30.0, faintest=4.8, noise_px=0.3, false_stars=3),
+        ListKind(field_deg=6.1, faintest=7.5, noise_px=0.5, false_stars=3),
+        ListKind(faintest=6.5, noise_px=0.3, false_stars=3, magnitude_error=0.5, lost=0.2),
+        ListKind(faintest=6.5, noise_px=0.3, false_stars=20),
+        ListKind(faintest=6.5, noise_px=0.3, false_stars=5, distortion_px=4.0, known_deg=0.5),
+        ListKind(faintest=6.0, noise_px=0.3, false_stars=3, order="none"),
+        ListKind(field_deg=20.0, faintest=6.0, noise_px=0.3, false_stars=3, order="none"),
+    ],
+    ids=[
+        "deep",
+        "wide-and-shallow",
+        "narrow",
+        "scrambled",
+        "half-false",
+        "distorted",
+        "unordered",
+        "unordered-20",
+    ],
+)
+def test_other_cameras_and_worse_detectors_are_served_too(kind: ListKind) -> None:
+    for seed in range(6):
+        drawn = _drawn(kind, seed)
+        assert _right(identify(drawn.field(), SKY), drawn), seed
+
+
+@pytest.mark.parametrize(("false_stars", "least"), [(3, 6), (10, 6), (20, 5)])
+def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
+    """A slice of `python -m tests.studies.bench starid --hard`; the field of view is unknown."""
+    right = 0
+    for seed in range(6):
+        drawn = _drawn(
+            ListKind(field_deg=15.0, noise_px=0.3, false_stars=false_stars, bright=True, known_deg=None), seed
+        )
+        found = identify(drawn.field(), SKY)
+        assert found.status is not MatchStatus.IDENTIFIED or _right(found, drawn), seed
+        right += found.status is MatchStatus.IDENTIFIED
+    assert right >= least
+
+
+@pytest.mark.parametrize(("field_deg", "faintest"), [(4.5, 8.0), (7.0, 7.0), (40.0, 5.5), (58.0, 5.0)])
+def test_a_field_of_view_between_4_and_60_deg_is_found(field_deg: float, faintest: float) -> None:
+    kind = ListKind(
+        field_deg=field_deg,
+        noise_px=0.3,
+        false_stars=2,
+        faintest=faintest,
+        known_deg=None,
+        searched_deg=(4.0, 60.0),
+    )
+    for seed in range(5):
+        drawn = _drawn(kind, seed)
+        assert _right(identify(drawn.field(), SKY), drawn), seed
+
+
+@pytest.mark.parametrize("known_deg", [0.1, None])
+def test_points_strewn_at_random_are_refused(known_deg: float | None) -> None:
+    kind = ListKind(known_deg=known_deg, noise_px=0.3)
+    for seed in range(25):
+        rng = np.random.default_rng([98, seed])
+        drawn = draw_random(kind, int(rng.integers(4, 41)), rng)
+        assert identify(drawn.field(), SKY).status is MatchStatus.NO_MATCH, seed
+
+
+def test_a_refusal_keeps_to_its_work() -> None:
+    """Within 20 ms by `tests.studies.bench starid` on a quiet machine; ten times that on any."""
+    drawn = draw_random(ListKind(known_deg=None), 40, np.random.default_rng(99))
+    field = drawn.field()
+    identify(field, SKY)
+    assert ordinary_seconds(lambda: identify(field, SKY)) < 0.2
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_fewer_than_four_stars_are_said_to_be_too_few(count: int) -> None:
+    drawn = draw_random(ListKind(), count, np.random.default_rng(count))
+    assert identify(drawn.field(), SKY).status is MatchStatus.TOO_FEW_STARS
+
+
+@pytest.mark.parametrize("known_deg", [0.1, None])
+def test_a_mirror_image_of_the_sky_is_named_and_said_to_be_mirrored(known_deg: float | None) -> None:
+    for seed in range(10):
+        drawn = _drawn(ListKind(known_deg=known_deg, noise_px=0.3), seed)
+        assert not identify(drawn.field(), SKY).mirrored
+        found = identify(drawn.field().mirrored(), SKY)
+        assert found.mirrored
+        assert _right(found, drawn), seed
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_field_of_view_given_ten_percent_wrong_is_found_unless_it_is_believed(factor: float) -> None:
+    believed = IdentificationSettings(hint_error=1.0)
+    for seed in range(5):
+        drawn = _drawn(ListKind(noise_px=0.3, known_deg=0.6), seed)
+        field = drawn.field().rescaled(factor)
+        hinted = replace(field, scale=drawn.field().scale)
+        assert _right(identify(hinted, SKY), drawn), seed
+        assert identify(hinted, SKY, believed).status is MatchStatus.NO_MATCH, seed
+        assert identify(replace(field, scale=(1.0, 1.0)), SKY).status is MatchStatus.NO_MATCH, seed
+
+
+def test_a_camera_that_has_no_mirror_takes_none_for_the_sky() -> None:
+    for seed in range(5):
+        field = _drawn(ListKind(), seed).field().mirrored()
+        assert identify(field, SKY, IdentificationSettings(mirror=False)).status is MatchStatus.NO_MATCH, seed
+
+
+def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
+    """The four brightest of lists whose next star is clearly fainter."""
+    named = 0
+    for seed in range(20):
+        drawn = _drawn(ListKind(noise_px=0.1, magnitude_error=0.0), seed)
+        found = identify(drawn.field().subset(np.arange(4)), SKY)
+        matched = found.star >= 0
+        assert not np.any(matched & (found.star != drawn.star[:4])), seed
+        named += found.status is MatchStatus.IDENTIFIED
+    assert named >= 15
+
+
+@pytest.mark.parametrize(("field_deg", "known_deg"), [(12.0, 0.1), (28.0, None)])
+def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> None:
+    """The squared error over its covariance has mean 3, that of a chi-square of three axes.
+
+    With the field unknown too: the given sigmas are of the believed scale, 17 deg, and not of the true one.
+    """
+    squares = []
+    for seed in range(150):
+        kind = ListKind(field_deg=field_deg, noise_px=0.2, false_stars=2, known_deg=known_deg)
+        drawn = _drawn(kind, 1000 + seed)
+        found = identify(drawn.field(), SKY)
+        assert found.fix is not None
+        turn = attitude_matrix(found.fix.quaternion) @ attitude_matrix(drawn.attitude).T
+        error = 0.5 * np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]])
+        squares.append(error @ np.linalg.solve(found.fix.covariance, error))
+    # Standard deviation of the mean of 150 chi-squares of three: sqrt(6 / 150) = 0.2.
+    assert 2.3 < np.mean(squares) < 3.8
+
+
+def test_sigmas_that_are_too_small_by_half_are_found_out() -> None:
+    """The covariance is widened when the residuals say so."""
+    drawn = _drawn(ListKind(field_deg=20.0, noise_px=0.5), 5)
+    field = drawn.field()
+    honest = identify(field, SKY)
+    proud = identify(replace(field, sigma=0.4 * field.sigma), SKY)
+    assert honest.fix is not None
+    assert proud.fix is not None
+    assert np.trace(proud.fix.covariance) > 0.6 * np.trace(honest.fix.covariance)
+
+
+def test_the_order_of_answers_is_that_of_the_observed_stars() -> None:
+    drawn = _drawn(ListKind(), 3)
+    field = drawn.field()
+    order = np.random.default_rng(1).permutation(len(field))
+    shuffled = identify(field.subset(order), SKY)
+    assert np.array_equal(shuffled.star, identify(field, SKY).star[order])
+
+
+def test_a_field_of_a_single_repeated_direction_names_nothing() -> None:
+    direction = np.tile([0.0, 0.0, 1.0], (6, 1))
+    field = StarField(direction, np.full(6, 1e-4), (0.1, 0.1), (0.99, 1.01))
+    assert identify(field, SKY).status is MatchStatus.NO_MATCH

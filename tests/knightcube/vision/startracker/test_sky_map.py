@@ -1,0 +1,91 @@
+"""Right ascension, declination and roll against known directions.
+
+Aberration against its published constant, its geometry, and the Earth's published velocity.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, SPEED_OF_LIGHT, earth_from_sun, earth_velocity
+from knightcube.astro.quaternion import IDENTITY, angle_between, attitude_matrix
+from knightcube.vision.startracker.sky_map import Pointing, apparent
+from sim_hal.worlds import sun
+
+
+def test_the_identity_looks_at_the_north_celestial_pole() -> None:
+    assert Pointing.of(IDENTITY).declination == pytest.approx(0.5 * np.pi)
+
+
+def test_north_is_up_at_no_roll_and_east_is_then_on_the_left() -> None:
+    matrix = attitude_matrix(Pointing(0.0, 0.0, 0.0).quaternion())
+    north, east = matrix @ [0.0, 0.0, 1.0], matrix @ [0.0, 1.0, 0.0]
+    np.testing.assert_allclose(north, [0.0, -1.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(east, [-1.0, 0.0, 0.0], atol=1e-15)
+
+
+def test_a_quarter_of_roll_turns_the_image_until_up_is_east() -> None:
+    matrix = attitude_matrix(Pointing(0.0, 0.0, 0.5 * np.pi).quaternion())
+    np.testing.assert_allclose(matrix @ [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], atol=1e-15)
+
+
+@given(st.floats(0.0, 6.28), st.floats(-1.57, 1.57), st.floats(0.0, 6.28))
+def test_there_and_back_is_the_same_attitude(ra: float, dec: float, roll: float) -> None:
+    q = Pointing(ra, dec, roll).quaternion()
+    assert angle_between(Pointing.of(q).quaternion(), q) < 1e-9
+
+
+_ARCSECOND = np.radians(1.0 / 3600.0)
+
+
+def test_a_star_across_the_motion_is_displaced_by_the_constant_of_aberration() -> None:
+    """IAU 1976: 20.49552" = n a / (c sqrt(1 - e^2)), with n a = 29,784.69 m/s and e = 0.01670862."""
+    speed = 29_784.69 / np.sqrt(1.0 - 0.01670862**2)
+    seen = apparent(np.array([[0.0, 0.0, 1.0]]), np.array([speed, 0.0, 0.0]))[0]
+    assert np.arctan2(seen[0], seen[2]) == pytest.approx(20.49552 * _ARCSECOND, abs=1e-3 * _ARCSECOND)
+
+
+def test_stars_ahead_and_behind_stay_and_lengths_stay_one() -> None:
+    velocity = np.array([0.0, 2.0e5, 0.0])
+    seen = apparent(np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]]), velocity)
+    np.testing.assert_allclose(seen[:2], [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 1.0, atol=1e-15)
+
+
+def test_the_angle_to_the_apex_follows_the_half_angle_formula() -> None:
+    """tan(theta'/2) = sqrt((1 - beta)/(1 + beta)) tan(theta/2): exact at any speed (Einstein 1905)."""
+    beta = 0.5
+    theta = np.array([0.3, 1.0, 2.0, 3.0])
+    stars = np.stack([np.sin(theta), np.zeros(4), np.cos(theta)], axis=-1)
+    seen = apparent(stars, np.array([0.0, 0.0, beta * SPEED_OF_LIGHT]))
+    expected = 2.0 * np.arctan(np.sqrt((1.0 - beta) / (1.0 + beta)) * np.tan(0.5 * theta))
+    np.testing.assert_allclose(np.arctan2(seen[:, 0], seen[:, 2]), expected, rtol=1e-12)
+
+
+def test_an_impossible_velocity_is_refused() -> None:
+    with pytest.raises(ValueError, match="below the speed of light"):
+        apparent(np.array([[0.0, 0.0, 1.0]]), np.array([np.nan, 0.0, 0.0]))
+
+
+def test_the_earths_velocity_is_the_published_one() -> None:
+    """ERFA's own test of epv00 (barycentric, au a day) at MJD 53411.52501161."""
+    published = np.array([-0.01091874268116823295, -0.01246525461732861538, -0.005404773180966231279])
+    found = earth_velocity(2_453_412.02501161) * DAY / ASTRONOMICAL_UNIT
+    np.testing.assert_allclose(found, published, atol=1e-11)
+
+
+def test_the_earths_velocity_is_the_slope_of_the_suns_place_by_another_series() -> None:
+    """The Almanac's, over a day: 0.1 % of 30 km/s, and the Sun's own 16 m/s about the barycentre."""
+    for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
+        before, after = sun.position(np.array([date - 0.5, date + 0.5]))
+        assert np.linalg.norm(earth_velocity(date) - (before - after) / DAY) < 46.0
+
+
+def test_the_earth_is_opposite_the_sun() -> None:
+    """Meeus, Astronomical Algorithms, Example 26.b: the Sun at 1992 October 13.0 TD, J2000, by VSOP87, au."""
+    published = np.array([-0.93739691, -0.31316824, -0.13577924])
+    place, _ = earth_from_sun(2_448_908.5)
+    np.testing.assert_allclose(-place / ASTRONOMICAL_UNIT, published, atol=1e-6)

@@ -1,0 +1,134 @@
+"""The bound on chance matches against strewn stars, and the order statistic against enumeration.
+
+Tracking from a prior, and the verification that it shares with every other method.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply, normalise
+from knightcube.vision.startracker.attitude_fit import MatchStatus
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.verification import Chance, order_probability, track, verify
+from tests.support.star_lists import ListKind, StarList, draw
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 5])
+def test_the_probability_of_an_order_is_that_of_enumeration(length: int) -> None:
+    orders = list(itertools.permutations(range(length)))
+
+    def inversions(order: tuple[int, ...]) -> int:
+        return sum(a > b for a, b in itertools.combinations(order, 2))
+
+    for order in orders[:: max(1, len(orders) // 20)]:
+        fewer = sum(inversions(other) <= inversions(order) for other in orders)
+        assert math.isclose(order_probability(order), fewer / len(orders))
+
+
+def _chance(observed: int, spread: float) -> Chance:
+    return Chance(observed, spread, 1.0, 0.0, 1, 3, 0.0)
+
+
+def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
+    """One field, all turns and shifts, scale known: sky and image both strewn, ten stars of a unit square.
+
+    Every pair of the image is laid on every pair of the sky that is as long, and the best number of matches
+    counted; how often it reaches five is compared with the bound for five.
+    """
+    rng = np.random.default_rng(5)
+    sigma, gate, stars, trials, reached = 0.004, 3.0, 10, 120, 0
+    for _ in range(trials):
+        sky, seen = (rng.uniform(size=stars) + 1j * rng.uniform(size=stars) for _ in range(2))
+        best = 0
+        for a, b in itertools.permutations(range(stars), 2):
+            side = seen[b] - seen[a]
+            turn = (sky[None, :] - sky[:, None]) / side + 10.0 * np.eye(stars)
+            for i, j in np.argwhere(np.abs(np.abs(turn) - 1.0) * abs(side) < 2.0 * gate * sigma):
+                rotation = turn[i, j] / abs(turn[i, j])
+                laid = rotation * (seen - 0.5 * (seen[a] + seen[b])) + 0.5 * (sky[i] + sky[j])
+                best = max(best, int((np.abs(laid[:, None] - sky).min(axis=1) < gate * sigma).sum()))
+        reached += best >= 5
+    bound = 10.0 ** _chance(stars, sigma**2).log10(gate, range(5), range(5, 10))
+    assert reached / trials < min(bound, 1.0) + 0.05
+
+
+def test_more_matches_are_less_likely_and_wider_gates_more() -> None:
+    chance = _chance(20, 1e-8)
+    values = [chance._of_places(3.5, matched, 20) for matched in range(4, 15)]
+    assert np.all(np.diff(values) < 0.0)
+    assert chance._of_places(8.0, 6, 20) > chance._of_places(3.5, 6, 20)
+
+
+SKY = default_index()
+
+
+def _drawn(kind: ListKind, seed: int) -> StarList:
+    return draw(kind, SKY.stars, np.random.default_rng([96, seed]))
+
+
+@pytest.mark.parametrize("sigma_deg", [0.005, 0.02, 0.1, 0.3])
+def test_a_prior_within_its_uncertainty_is_followed(sigma_deg: float) -> None:
+    sigma = float(np.deg2rad(sigma_deg))
+    for seed in range(20):
+        drawn = _drawn(ListKind(noise_px=0.3, false_stars=3), seed)
+        off = from_rotation_vector(sigma * np.random.default_rng(seed).standard_normal(3))
+        found = track(drawn.field(), SKY, multiply(off, drawn.attitude), sigma)
+        assert found.status is MatchStatus.IDENTIFIED, seed
+        assert found.fix is not None
+        assert angle_between(found.fix.quaternion, drawn.attitude) < 0.003
+        matched = found.star >= 0
+        assert np.mean(found.star[matched] == drawn.star[matched]) > 0.8
+
+
+def test_a_prior_that_looks_elsewhere_is_refused() -> None:
+    for seed in range(60):
+        drawn = _drawn(ListKind(noise_px=0.5, false_stars=5), seed)
+        elsewhere = normalise(np.random.default_rng(seed).standard_normal(4))
+        assert track(drawn.field(), SKY, elsewhere, np.deg2rad(0.3)).status is MatchStatus.NO_MATCH
+
+
+def test_a_prior_of_no_use_is_refused_and_not_searched_forever() -> None:
+    drawn = _drawn(ListKind(faintest=7.0), 1)
+    assert track(drawn.field(), SKY, np.array([0.0, 0.0, 0.0, 1.0]), 0.2).status is MatchStatus.NO_MATCH
+
+
+def test_three_stars_are_too_few_to_track() -> None:
+    drawn = _drawn(ListKind(), 2)
+    field = drawn.field().subset(np.arange(3))
+    assert track(field, SKY, drawn.attitude, 0.001).status is MatchStatus.TOO_FEW_STARS
+
+
+def test_the_truth_verifies_and_its_false_stars_are_left_out() -> None:
+    drawn = _drawn(ListKind(noise_px=0.2, false_stars=5, known_deg=0.1), 4)
+    field = drawn.field()
+    scale = 0.5 * 1024 / drawn.camera.focal_length / field.half_width[0]
+    found = verify(field, SKY, drawn.attitude, scale)
+    assert found.status is MatchStatus.IDENTIFIED
+    wrong = (found.star >= 0) & (found.star != drawn.star)
+    assert wrong.sum() <= 1
+    assert np.mean(found.star[drawn.star >= 0] >= 0) > 0.9
+
+
+def test_an_attitude_off_by_half_a_degree_does_not_verify() -> None:
+    drawn = _drawn(ListKind(noise_px=0.2), 6)
+    off = from_rotation_vector(np.deg2rad([0.5, 0.0, 0.0]))
+    assert verify(drawn.field(), SKY, multiply(off, drawn.attitude), 1.0).status is MatchStatus.NO_MATCH
+
+
+def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> None:
+    """What was searched enters: four blurred stars convince a tracker and not one that is lost."""
+    convinced = {"tracking": 0, "lost": 0}
+    for seed in range(15):
+        drawn = _drawn(ListKind(noise_px=1.0, magnitude_error=0.0, known_deg=0.1), seed)
+        field = drawn.field().subset(np.arange(4))
+        scale = 0.5 * 1024 / drawn.camera.focal_length / field.half_width[0]
+        for case, searched in (("tracking", 1e-9), ("lost", 1.0)):
+            found = verify(field, SKY, drawn.attitude, scale, searched)
+            convinced[case] += found.status is MatchStatus.IDENTIFIED
+    assert convinced["tracking"] >= 12
+    assert convinced["lost"] <= 5

@@ -1,1 +1,0 @@
-"""Tests of the Sun sensor: frames and strings."""

@@ -1,0 +1,160 @@
+"""Solar strings, simulated and read: coarse Sun, eclipse, the Earth's light; which camera comes first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.errors import UsageError
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
+from knightcube.vision.sun import cameras_by_sun
+from sim_hal.emulators.solar_strings import SolarStringsModel
+from tests.sim_hal.earth_camera.scenes import pointing, random_direction
+
+STRINGS = SolarStringModel()
+IDEAL = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0, albedo=0.0)
+CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
+
+
+def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray, FloatArray, int, int]:
+    """Return errors (n,) rad and normalised squares (n,) of sunlit readings, and mistakes about darkness."""
+    generator = np.random.default_rng(seed)
+    errors, squares, false_dark, false_light = [], [], 0, 0
+    for _ in range(count):
+        model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, 0.02 * generator.standard_normal(6))
+        position = (EARTH_RADIUS + generator.uniform(200e3, 2000e3)) * random_direction(generator)
+        sun = ASTRONOMICAL_UNIT * random_direction(generator)
+        body = quaternion.attitude_matrix(quaternion.normalise(generator.standard_normal(4)))
+        nadir = -body @ position / np.linalg.norm(position) if nadir_known else None
+        reading = coarse_sun(model.currents(position, sun, body, generator), STRINGS, nadir)
+        lit = float(sunlit_share(position, sun))
+        false_dark += lit > 0.9 and reading.status is CoarseSunStatus.DARK
+        false_light += lit == 0.0 and reading.status is not CoarseSunStatus.DARK
+        if reading.direction is None or reading.basis is None or reading.tangent_covariance is None:
+            continue
+        truth = body @ (sun - position) / np.linalg.norm(sun - position)
+        off = reading.basis @ truth
+        errors.append(np.arccos(np.clip(truth @ reading.direction, -1.0, 1.0)))
+        squares.append(off @ np.linalg.solve(reading.tangent_covariance, off))
+    return np.array(errors), np.array(squares), false_dark, false_light
+
+
+@pytest.mark.parametrize(("nadir_known", "limit"), [(True, 2.0), (False, 3.5)])
+def test_the_coarse_sun_is_good_to_a_few_degrees_and_knows_how_good(nadir_known: bool, limit: float) -> None:
+    """400 random orbits' points and attitudes, seed 5; 2 % of gain error a string, albedo 0.3."""
+    errors, squares, false_dark, false_light = _reading(5, nadir_known)
+    assert len(errors) > 250
+    assert np.degrees(np.sqrt(np.mean(errors**2))) < limit
+    assert np.mean(squares) < 2.3
+    assert np.percentile(squares, 95) < 6.0  # what 95 of 100 honest ones keep
+    assert false_dark == 0
+    assert false_light == 0
+
+
+def test_ideal_strings_have_the_cosine_law_and_give_the_direction_back() -> None:
+    generator = np.random.default_rng(6)
+    position = np.array([0.0, 0.0, 7e6])
+    for _ in range(20):
+        to_sun = random_direction(generator)
+        to_sun[2] = abs(to_sun[2])
+        sun = position + ASTRONOMICAL_UNIT * to_sun
+        currents = IDEAL.currents(position, sun, np.eye(3), generator)
+        assert currents == pytest.approx(np.maximum(STRINGS.normals @ to_sun, 0.0), abs=1e-9)
+        reading = coarse_sun(currents, SolarStringModel(albedo=1e-3, albedo_sigma=1e-3), None)
+        assert reading.direction is not None
+        assert np.degrees(np.arccos(min(1.0, float(reading.direction @ to_sun)))) < 3.0
+
+
+def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_the_view_factor() -> None:
+    """Close above the subsolar point of a matt sphere: of the plate's half of the sky it fills (R/r)^2.
+
+    The mean solar cosine of the ground, weighted by the plate's, is near one: within some percent at 200 km.
+    """
+    position = np.array([EARTH_RADIUS + 200e3, 0.0, 0.0])
+    model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
+    sun = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
+    currents = model.currents(position, sun, np.eye(3), np.random.default_rng(0))
+    view = (EARTH_RADIUS / position[0]) ** 2
+    assert currents[0] == pytest.approx(1.0, abs=1e-4)
+    assert currents[3] == pytest.approx(0.3 * view, rel=0.05)
+    # On a plate upright to the ground half of that or less, alike on all four sides.
+    sides = currents[[1, 2, 4, 5]]
+    assert np.ptp(sides) < 2e-3
+    assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]
+
+
+def test_in_eclipse_the_strings_say_dark() -> None:
+    model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6))
+    position = np.array([-7e6, 0.0, 0.0])
+    sun = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
+    reading = coarse_sun(model.currents(position, sun, np.eye(3), np.random.default_rng(1)), STRINGS)
+    assert reading.status is CoarseSunStatus.DARK
+    assert reading.sigma == np.inf
+
+
+def test_currents_that_no_sun_makes_are_uncertain() -> None:
+    """A string that gives half as much again as the Sun can; full currents on faces back to back."""
+    towards = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
+    good = np.maximum(STRINGS.normals @ towards, 0.0)
+    assert coarse_sun(good, STRINGS).status is CoarseSunStatus.FOUND
+    for broken in (np.where(np.arange(6) == 1, 1.5, good), np.array([0.9, 0.1, 0.0, 0.9, 0.0, 0.0])):
+        assert coarse_sun(broken, STRINGS).status is CoarseSunStatus.UNCERTAIN
+
+
+def test_wrong_currents_and_strings_are_refused() -> None:
+    with pytest.raises(ValueError, match="6 finite"):
+        coarse_sun(np.array([1.0, 2.0]), STRINGS)
+    with pytest.raises(ValueError, match="finite"):
+        coarse_sun(np.full(6, np.nan), STRINGS)
+    with pytest.raises(UsageError, match="normals"):
+        SolarStringModel(normals=np.eye(3))
+    with pytest.raises(UsageError, match="peaks"):
+        SolarStringModel(peaks=np.zeros(6))
+    with pytest.raises(UsageError, match="sigma"):
+        SolarStringModel(sigma=0.0)
+
+
+def _mountings() -> list[FloatArray]:
+    """Return UW's: three sides 120 deg apart about z, and the top (Meller 4.2)."""
+    angles = np.radians([0.0, 120.0, 240.0])
+    sides = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
+    down = np.array([0.0, 0.0, -1.0])
+    return [pointing(side, down) for side in sides] + [pointing(-down, np.array([1.0, 0.0, 0.0]))]
+
+
+def test_the_camera_that_has_the_sun_is_read_first() -> None:
+    mountings = _mountings()
+    for index, mounting in enumerate(mountings):
+        boresight = quaternion.attitude_matrix(mounting)[2]
+        shares = np.maximum(STRINGS.normals @ boresight, 0.0)
+        order = cameras_by_sun(coarse_sun(shares, STRINGS), [CAMERA] * 4, mountings)
+        assert order[0].index == index
+        assert order[0].likely
+        assert [choice.index for choice in order if choice.likely] == [index]
+        assert sorted(choice.index for choice in order) == [0, 1, 2, 3]
+
+
+def test_a_sun_between_the_fields_is_likely_in_none_and_possible_in_the_nearest() -> None:
+    """2 deg beyond a field's edge with a coarse Sun of 3 deg."""
+    towards = np.array([np.cos(np.radians(35.5)), np.sin(np.radians(35.5)), 0.0])
+    basis = np.array([[-towards[1], towards[0], 0.0], [0.0, 0.0, 1.0]])
+    sun = CoarseSun(CoarseSunStatus.FOUND, towards, basis, np.radians(3.0) ** 2 * np.eye(2))
+    order = cameras_by_sun(sun, [CAMERA] * 4, _mountings())
+    assert not any(choice.likely for choice in order)
+    assert [choice.index for choice in order if choice.possible] == [0]
+
+
+def test_in_the_dark_no_camera_is_read_and_in_doubt_all_are() -> None:
+    dark = cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), [CAMERA] * 4, _mountings())
+    assert dark == []
+    doubt = cameras_by_sun(CoarseSun(CoarseSunStatus.UNCERTAIN), [CAMERA] * 4, _mountings())
+    assert [choice.index for choice in doubt] == [0, 1, 2, 3]
+    assert all(choice.possible for choice in doubt)
+    with pytest.raises(ValueError, match="mountings"):
+        cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), [CAMERA], _mountings())
