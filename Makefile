@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 READY  := $(VENV)/.ready
+TOOLS  := $(VENV)/.tools
 TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -13,9 +14,15 @@ help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 # Python compiles a module when it first imports it, and keeps that: most of what is installed is never imported.
-$(READY): pyproject.toml requirements.lock
+INSTALL := $(VENV)/bin/pip --disable-pip-version-check install --quiet --no-compile
+$(READY): pyproject.toml knightcube/pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --no-compile --config-settings editable_mode=compat --constraint requirements.lock --editable '.[plots,images,test,docs,interop]'
+	$(INSTALL) --require-hashes --no-deps -r requirements.lock
+	$(INSTALL) --no-deps --no-build-isolation --editable ./knightcube --editable .
+	@touch $@
+
+$(TOOLS): $(READY) requirements-test.lock
+	$(INSTALL) --require-hashes --no-deps -r requirements-test.lock
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
@@ -47,51 +54,56 @@ console: $(READY) ## the demonstration flying in real time in the browser, with 
 	@rm -rf runs/console
 	$(RUN) -m flight console runs/console --fly config/step_demo.yaml --open
 
-quick: $(READY) ## style, import arrows and the fast tests: under 90 s on two cores
+quick: $(TOOLS) ## style, import arrows and the fast tests: under 90 s on two cores
 	@$(MAKE) --no-print-directory lint arrows fast
 
-test: $(READY)  ## every check, two at a time
+test: $(TOOLS)  ## every check, two at a time
 	@$(MAKE) --no-print-directory --jobs 2 lint types arrows docs unit
 
-test-container: $(READY)  ## the service installed and booted under systemd in a container; needs root and nspawn
+test-container: $(TOOLS)  ## the service installed and booted under systemd in a container; needs root and nspawn
 	$(RUN) -m pytest -rs tests/deploy/test_container.py
 
-lint: $(READY)  ## style
+lint: $(TOOLS)  ## style
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .
 
-types: $(READY) ## strict types
+types: $(TOOLS) ## strict types
 	$(VENV)/bin/mypy
 
-arrows: $(READY) ## which package may import which
+arrows: $(TOOLS) ## which package may import which
 	$(VENV)/bin/lint-imports --no-cache
 
-docs: $(READY)  ## the documentation site, strict, into build/site
+docs: $(TOOLS)  ## the documentation site, strict, into build/site
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
 	$(RUN) -m tests.docs.built_site build/site
 
-house: $(READY) ## packages, layers, imports and sizes, drawn from the source
+house: $(TOOLS) ## packages, layers, imports and sizes, drawn from the source
 	$(RUN) -m tests.studies.house
 
-unit: $(READY)  ## the tests, on all cores
+unit: $(TOOLS)  ## the tests, on all cores
 	$(TESTS) --dist loadfile
 
-fast: $(READY)  ## the tests that are not slow, on all cores
+fast: $(TOOLS)  ## the tests that are not slow, on all cores
 	$(TESTS) --dist worksteal -m "not slow"
 
-slow-list: $(READY)  ## measure every test alone and write tests/slow.txt
+slow-list: $(TOOLS)  ## measure every test alone and write tests/slow.txt
 	$(RUN) -m pytest --write-slow-list
 
-pictures: $(READY) ## the README's pictures
+pictures: $(TOOLS) ## the README's pictures
 	$(RUN) -m tests.studies.pictures
 
-lock: $(READY)  ## write down the versions in use, and with hashes those of a board
-	$(VENV)/bin/pip freeze --all --exclude pip --exclude-editable | LC_ALL=C sort --ignore-case > requirements.lock
-	$(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet pip-tools
-	build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras --no-annotate \
-	  --no-header --no-emit-options --constraint requirements.lock --output-file - pyproject.toml > build/lock/board
-	{ echo '# What a board needs, by hash: written by `make lock`, used by deploy/install.sh with --require-hashes.'; \
-	  grep -E '^([A-Za-z]|    --hash)' build/lock/board; \
-	} > deploy/requirements.lock
+lock:           ## choose versions of all packages and write them down with their hashes; keeps those that still fit
+	$(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet pip-tools hatchling
+	build/lock/bin/pip wheel --quiet --no-deps --wheel-dir build/lock/wheels ./knightcube
+	@# Each list takes the versions of the one before it, so that a board flies what the tests tested.
+	$(call COMPILE,requirements-test.lock,pyproject.toml $(foreach extra,plots watch ground $(CHECKS),--extra $(extra)))
+	$(call COMPILE,requirements.lock,pyproject.toml --constraint requirements-test.lock --extra plots --extra watch --extra ground)
+	$(call COMPILE,deploy/requirements.lock,pyproject.toml --constraint requirements-test.lock)
+
+CHECKS  := images parquet test docs interop
+# The library of this repository is installed from the clone: its entry goes.
+COMPILE = build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras \
+  --no-annotate --no-header --no-emit-options --find-links build/lock/wheels --output-file $(1) $(2) && \
+  sed -i -e '/^knightcube==/,/[^\\]$$/d' -e '/^\#/d' $(1)
 
 clean:          ## forget the virtual environment and the runs
 	rm -rf $(VENV) runs build *.egg-info

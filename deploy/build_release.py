@@ -69,15 +69,16 @@ class Build:
         found = ["--no-index", "--find-links", options.wheels] if options.wheels else []
         quiet = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
         self._run([options.python, "-m", "venv", venv])
-        # setuptools is among them, by hash like the rest: the build of ours takes nothing from elsewhere.
+        # The lock has the build backend too, with its hash: nothing that was not checked builds a release.
         self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
         with tempfile.TemporaryDirectory() as folder:
             # Of a copy: a build that was killed leaves files in its source, which a later one would ship.
             source = Path(folder) / "source" if not options.dry_run else self._source
             if not options.dry_run:
                 shutil.copytree(self._source, source, symlinks=True, ignore=_NOT_BUILT)
-            self._run([*quiet, "--no-index", "--no-deps", "--no-build-isolation", source])
-        # The distribution carries the ground tools too, which have no place on a board.
+            ours = ["--no-index", "--no-deps", "--no-build-isolation", source / "knightcube", source]
+            self._run([*quiet, *ours])
+        # The application's distribution has the ground tools too, which have no place on a board.
         for ground in venv.glob("lib/python3*/site-packages/ground"):
             shutil.rmtree(ground)
         return python

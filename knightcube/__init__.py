@@ -38,12 +38,28 @@ _MODULE_OF = {
 }
 __all__ = list(_MODULE_OF)
 
+_EXTRA_OF = {"erfa": "orbit", "nlopt": "vmc", "pygeomag": "orbit", "sgp4": "orbit"}
+"""Optional packages, and the extra of this distribution that installs each."""
+
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, imported now. Raises AttributeError for another name."""
+    """Return a public name, imported now.
+
+    Raises AttributeError for another name. Raises ImportError if an optional package is missing, with the
+    command that installs it.
+    """
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
+    try:
+        module = import_module(_MODULE_OF[name])
+    except ModuleNotFoundError as error:
+        if error.name not in _EXTRA_OF:
+            raise
+        raise ImportError(
+            f"{name} needs the package {error.name}: pip install 'knightcube[{_EXTRA_OF[error.name]}]'",
+            name=error.name,
+        ) from None
+    value = globals()[name] = getattr(module, name)
     return value
 
 

@@ -19,7 +19,7 @@ pytestmark = [
 ]
 
 _SOURCES = ("knightcube", "flight", "hal", "sim_hal", "ground", "deploy", "config")
-_FILES = ("pyproject.toml", "requirements.lock", "README.md")
+_FILES = ("pyproject.toml", "README.md", "LICENSE")
 
 
 class Board:

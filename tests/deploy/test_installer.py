@@ -181,17 +181,28 @@ def _pins(path: Path) -> dict[str, str]:
     return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
 
 
-def test_the_boards_lock_has_all_that_a_board_needs_each_with_hashes_and_the_versions_of_the_tests() -> None:
-    board, tested = _pins(DEPLOY / "requirements.lock"), _pins(ROOT / "requirements.lock")
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    wanted = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
-    names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=~!]", line)[0]).lower() for line in wanted}
-    assert names <= board.keys(), "run `make lock`"
-    assert {name: board[name] for name in board.keys() & tested.keys()} == {
-        name: tested[name] for name in board.keys() & tested.keys()
+LOCKS = [DEPLOY / "requirements.lock", ROOT / "requirements.lock", ROOT / "requirements-test.lock"]
+
+
+@pytest.mark.parametrize("lock", LOCKS, ids=["board", "demo", "test"])
+def test_a_lock_has_all_requirements_each_with_hashes(lock: Path) -> None:
+    needed = set()
+    for path in (ROOT / "pyproject.toml", ROOT / "knightcube" / "pyproject.toml"):
+        text = tomllib.loads(path.read_text(encoding="utf-8"))
+        needed |= {*text["project"]["dependencies"], *text["build-system"]["requires"]}
+    extras = tomllib.loads((ROOT / "knightcube" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    needed |= {line for lines in extras["optional-dependencies"].values() for line in lines}
+    names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=~!\[]", line)[0]).lower() for line in needed} - {
+        "knightcube"
     }
-    blocks = re.split(r"^(?=\S)", (DEPLOY / "requirements.lock").read_text(encoding="utf-8"), flags=re.M)
+    assert names <= _pins(lock).keys(), "run `make lock`"
+    blocks = re.split(r"^(?=\S)", lock.read_text(encoding="utf-8"), flags=re.M)
     assert all("--hash=sha256:" in block for block in blocks if "==" in block)
+
+
+def test_board_and_demonstration_have_the_versions_that_the_tests_have() -> None:
+    board, demo, tested = (_pins(lock) for lock in LOCKS)
+    assert board.items() <= demo.items() <= tested.items()
 
 
 @pytest.mark.parametrize(

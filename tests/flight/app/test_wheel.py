@@ -1,4 +1,4 @@
-"""The wheel is complete: installed elsewhere it flies its carried configuration and reports on the run."""
+"""Installed elsewhere, the wheels fly a configuration and report on it, and the library works alone."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 from pathlib import Path
 
 import pytest
 
+import flight
 from flight.schema.carried import FOLDER, config_path, names
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -27,35 +29,48 @@ def test_the_repository_s_folder_is_the_one_source_of_the_carried_configurations
     assert names() == sorted(path.stem for path in (ROOT / "config").glob("*.yaml"))
 
 
+PIP: list[str | Path] = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+ALONE = ["--no-deps", "--no-index"]
+
+
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a virtual environment of the wheel alone; other packages are those of this environment."""
-    place = tmp_path_factory.mktemp("wheel")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the wheels of both distributions, built from a copy of the sources."""
+    folder = tmp_path_factory.mktemp("wheels")
+    source = folder / "source"
     for name in ("knightcube", "flight", "ground", "hal", "sim_hal", "config"):
         leave = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(ROOT / name, place / "source" / name, symlinks=True, ignore=leave)
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=leave)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, place / "source")
-    pip: list[str | Path] = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    without = ["--no-deps", "--no-index"]
+        shutil.copy(ROOT / name, source)
     build: list[str | Path] = [
         "wheel",
-        *without,
+        *ALONE,
         "--no-build-isolation",
         "--wheel-dir",
-        place,
-        place / "source",
+        folder,
+        source / "knightcube",
+        source,
     ]
-    subprocess.run([*pip, *build], check=True, timeout=60)
-    (wheel,) = place.glob("*.whl")
-    home = place / "venv"
+    subprocess.run([*PIP, *build], check=True, timeout=60)
+    return folder
+
+
+def _installed(home: Path, wheels: list[Path], packages: Path) -> Path:
+    """Return a new virtual environment with these wheels, and the packages of a folder beside them."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", home], check=True, timeout=30)
     python = home / "bin" / "python"
-    subprocess.run([*pip, "--python", python, "install", *without, wheel], check=True, timeout=60)
+    subprocess.run([*PIP, "--python", python, "install", *ALONE, *wheels], check=True, timeout=60)
     # A .pth in a folder that a .pth adds is not read: an editable installation stays out.
     (site,) = home.glob("lib/python*/site-packages")
-    (site / "others.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    (site / "others.pth").write_text(f"{packages}\n", encoding="utf-8")
     return home
+
+
+@pytest.fixture(scope="module")
+def environment(wheels: Path) -> Path:
+    """Return a virtual environment of both wheels; other packages are those of this environment."""
+    return _installed(wheels / "venv", sorted(wheels.glob("*.whl")), Path(sysconfig.get_path("purelib")))
 
 
 def _type(environment: Path, folder: Path, *words: str) -> str:
@@ -88,3 +103,40 @@ def test_the_installed_wheel_carries_the_sensor_suites(environment: Path, tmp_pa
     script = "from flight.schema.carried import FOLDER as f; print(*sorted(p.name for p in f.glob('*/*')))"
     carried = _type(environment, tmp_path, "python", "-c", script).split()
     assert carried == sorted(path.name for path in (ROOT / "config" / "sensors").iterdir())
+
+
+def test_the_library_alone_needs_numpy_and_scipy_only(wheels: Path, tmp_path: Path) -> None:
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    for path in Path(sysconfig.get_path("purelib")).iterdir():
+        if path.name.partition(".")[0] in {"numpy", "scipy"}:
+            (packages / path.name).symlink_to(path)
+    (library,) = wheels.glob("knightcube-*.whl")
+    home = _installed(tmp_path / "venv", [library], packages)
+    script = """
+import numpy as np
+from knightcube import StarTracker
+print(StarTracker(fov_deg=11.4).solve(np.zeros((480, 640))).reason)
+try:
+    from knightcube import plan_step
+except ImportError as error:
+    print(error)
+try:
+    import flight
+except ImportError as error:
+    print(error)
+"""
+    reason, extra, application = _type(home, tmp_path, "python", "-c", script).splitlines()
+    assert "star" in reason
+    assert "pip install 'knightcube[" in extra
+    assert application == "No module named 'flight'"
+
+
+def test_both_distributions_have_one_version() -> None:
+    library, application = (
+        tomllib.loads((ROOT / path).read_text(encoding="utf-8"))["project"]
+        for path in ("knightcube/pyproject.toml", "pyproject.toml")
+    )
+    assert library["version"] == application["version"] == flight.__version__
+    (requirement,) = (text for text in application["dependencies"] if text.startswith("knightcube"))
+    assert requirement == f"knightcube[{','.join(library['optional-dependencies'])}]=={library['version']}"
