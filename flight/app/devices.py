@@ -30,8 +30,7 @@ from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.guardian import CoilReach
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
-from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:

@@ -31,7 +31,7 @@ from ground.sky.facts import sky_facts, sky_text
 from ground.sky.world_coordinates import header_text
 from knightcube.astro.arrays import Image
 from knightcube.astro.attitude.solvers import SOLVERS
-from knightcube.astro.catalogue.names import PROPER_NAMES
+from knightcube.astro.catalogue import PROPER_NAMES
 from knightcube.astro.earth.sun import julian_date
 from knightcube.errors import UsageError
 from knightcube.reference.star_identification.methods import DEFAULT_METHOD, METHODS, method_of

@@ -17,8 +17,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.geomagnetism import GeomagneticError, field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import DAY, earth_from_sun
+from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
 from knightcube.errors import FlightError
 
 Object = dict[str, Any]

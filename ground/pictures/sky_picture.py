@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ground.pictures.overlay import OBJECT, STREAK, UNUSED, Colour, draw_ring, outlined
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.catalogue.names import PROPER_NAMES
+from knightcube.astro.catalogue import PROPER_NAMES
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import EXTRA

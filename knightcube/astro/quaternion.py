@@ -1,8 +1,13 @@
 """Quaternion algebra: scalar last, unit, `q` rotates reference into body: v_body = A(q) v_reference.
 
-The convention of Sease 2013 and Wertz 1978. Composition follows the matrices: A(multiply(p, q)) = A(p) A(q).
-The attitude matrix is 4.8 corrected (its printed lower triangle repeats the upper one), the kinematics 2.12
-corrected (the upper left block is minus the cross-product matrix). No other module repeats these formulas.
+The convention is that of Sease 2013 and Wertz 1978. Composition follows the matrices: A(multiply(p, q)) =
+A(p) A(q). The attitude matrix is 4.8 corrected (its printed lower triangle repeats the upper one), the
+kinematics 2.12 corrected (the upper left block is minus the cross-product matrix). No other module repeats
+these formulas.
+
+`NED_TO_TESTBED` and `attitude_map` rotate between the frames of the mission. The testbed frame T has y down
+along the thread and the field along -z. Magnetic north is the direction of the field, so N = -z, D = y and
+E = D x N = -x: v_T = [[0, -1, 0], [0, 0, 1], [-1, 0, 0]] v_NED.
 """
 
 from __future__ import annotations
@@ -133,3 +138,15 @@ def angle_about_axis_y(q: FloatArray) -> float:
     """Return the rotation of q (4,) about the y axis, its twist about the thread: rad, [-pi, pi)."""
     angle = 2.0 * np.arctan2(q[1], q[3])
     return float(np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi)
+
+
+NED_TO_TESTBED: FloatArray = np.array([0.5, -0.5, -0.5, 0.5])
+
+
+def attitude_map(mounting: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the matrix M (4, 4) that maps the attitude of a unit to that of the body.
+
+    The unit measures q (4,), NED into sensor. With `mounting` (4,) sensor into body and `reference` (4,) NED
+    into the mission's reference frame, M q = mounting q conj(reference), the reference frame into the body.
+    """
+    return np.asarray(multiply(multiply(mounting, np.eye(4)), conjugate(reference)).T)

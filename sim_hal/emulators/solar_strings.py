@@ -23,8 +23,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from sim_hal.worlds import sun
 from sim_hal.worlds.world import OrbitingWorld
 

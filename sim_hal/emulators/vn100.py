@@ -23,8 +23,7 @@ import numpy as np
 
 from hal.drivers.vn100.protocol import Checksum, Sentence, build, parse
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.frames import NED_TO_TESTBED
-from knightcube.astro.quaternion import IDENTITY, from_rotation_vector, multiply, normalise
+from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_vector, multiply, normalise
 from sim_hal.device import NEVER, SerialEnd
 from sim_hal.emulators.vn100_registers import (
     ASYNC_RATES_HZ,

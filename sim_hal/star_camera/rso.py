@@ -29,8 +29,7 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.shadow import Shadow, sunlit_share
-from knightcube.astro.earth.sun import DAY, SUN_RADIUS
+from knightcube.astro.earth.sun import DAY, SUN_RADIUS, Shadow, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera import SourceTrack
 from sim_hal.worlds import sun

@@ -19,8 +19,7 @@ import numpy as np
 from hal.interfaces.errors import OutOfRange
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.astro.earth.shadow import Shadow, sunlit_share
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, Shadow, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera.rso import (
     ResidentSpaceObject,

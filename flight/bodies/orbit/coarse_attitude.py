@@ -24,6 +24,7 @@ from hal.interfaces.devices import Frame, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import chi_square
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import (
@@ -32,7 +33,6 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
 from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
@@ -216,7 +216,7 @@ class WideFeed:
             return False, False
         down = -around.position / np.linalg.norm(around.position)
         seen = [
-            None if one is None else Sight(one.direction, reference, one.covariance + self._lens)
+            None if one is None else VectorObservation(one.direction, reference, one.covariance + self._lens)
             for one, reference in ((found.sun, sun), (found.nadir, down))
         ]
         if not self._filter.runs or self._against >= CONTRADICTED:
@@ -236,21 +236,21 @@ class WideFeed:
         )
         return sun_used, nadir_used
 
-    def _judge(self, seen: Sequence[Sight | None], refused: Sequence[bool]) -> None:
+    def _judge(self, seen: Sequence[VectorObservation | None], refused: Sequence[bool]) -> None:
         """Count the rounds in a row that contradict an estimate that no stars made fine."""
         if self._filter.knowledge is Knowledge.FINE:
             self._against = 0
         elif any(one is not None for one in seen):
             self._against = self._against + 1 if any(refused) else 0
 
-    def _begin(self, time_ns: int, seen: list[Sight]) -> bool:
+    def _begin(self, time_ns: int, seen: list[VectorObservation]) -> bool:
         """Start the filter from the attitude of all directions, where they fix one and agree."""
         field = self._field_sight(time_ns)
         sights = seen if field is None else [*seen, field]
         if not seen or len(sights) < 2:
             return False
         try:
-            fix = optimum(sights)
+            fix = weighted_fit(sights)
         except (AttitudeError, np.linalg.LinAlgError):
             return False
         if 2.0 * fix.loss > chi_square.bound(IMPROBABLE, 2 * len(sights) - 3):
@@ -261,13 +261,13 @@ class WideFeed:
         attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
         return self._filter.begin(attitude, doubted=doubted)
 
-    def _use(self, time_ns: int, sight: Sight) -> bool:
+    def _use(self, time_ns: int, sight: VectorObservation) -> bool:
         measured = DirectionMeasurement(time_ns, sight.observed, sight.reference, sight.covariance)
         taken: list[bool] = []
         self._filter.measure_late([measured], taken.extend)
         return any(taken)
 
-    def _field_sight(self, time_ns: int) -> Sight | None:
+    def _field_sight(self, time_ns: int) -> VectorObservation | None:
         """Return the direction of the magnetic field at a time, None without a recent one."""
         measured_field = self._filter.newest_field()
         turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
@@ -275,7 +275,7 @@ class WideFeed:
         if measured_field is None or turned is None or around is None:
             return None
         try:
-            return field_sight(
+            return field_observation(
                 attitude_matrix(turned) @ measured_field[0].field, around.field, measured_field[0].covariance
             )
         except AttitudeError:
@@ -322,7 +322,9 @@ def _is_of_strings(sun: MeasuredDirection | None) -> bool:
     return sun is not None and not sun.cameras
 
 
-def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _spread(
+    sight: VectorObservation, turn: FloatArray, claim: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a direction's departure (2,) from an attitude (3, 3), and the covariances (2, 2) of both."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
@@ -331,14 +333,14 @@ def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArr
     return across @ sight.observed, across @ sight.covariance @ across.T, rows @ claim @ rows.T
 
 
-def _contradicts(sight: Sight, turn: FloatArray, claim: FloatArray) -> bool:
+def _contradicts(sight: VectorObservation, turn: FloatArray, claim: FloatArray) -> bool:
     """Return whether a direction contradicts an attitude (3, 3) with its covariance (3, 3)."""
     off, own, known = _spread(sight, turn, claim)
     behind = float(sight.observed @ turn @ sight.reference) < 0.0
     return behind or float(off @ np.linalg.solve(own + known, off)) > chi_square.bound(IMPROBABLE, 2)
 
 
-def _says_more(sight: Sight, claim: FloatArray) -> bool:
+def _says_more(sight: VectorObservation, claim: FloatArray) -> bool:
     """Return whether a direction is more accurate than an attitude's covariance (3, 3) about some axis."""
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T

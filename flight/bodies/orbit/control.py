@@ -24,7 +24,7 @@ from flight.loop.body import CoilCommand
 from flight.loop.fdir.facts import EventLog
 from hal.interfaces.devices import StringReading
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.earth.ephemeris import FieldAhead
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler

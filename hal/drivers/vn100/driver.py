@@ -3,8 +3,8 @@
 Attitude: the unit sends (q0, q1, q2, q3), scalar last, a Hamilton quaternion that rotates body into NED. In
 this project's convention the same four numbers rotate NED into the sensor frame. Two constant linear maps of
 the settings convert it to the mission's reference frame and the body's axes
-(`knightcube.astro.frames.attitude_map`). Readings that are not finite or physically impossible are rejected
-and counted.
+(`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically impossible are
+rejected and counted.
 """
 
 from __future__ import annotations

@@ -7,9 +7,8 @@ v' = -omega x v (4.8-4.10 corrected).
 
 `solve` gives an attitude of any size: sequential rotation, started from TRIAD, keeps the angle at 120 deg or
 less, |g| below 1.74. An error e of b enters the equation as (1 + [g x]) e, larger than e by up to the root of
-1 + g^2 and different in each direction, so the weights 1/sigma^2 are not the best ones. The result therefore
-differs from Wahba's by an amount of the order of the noise, and the covariance is that of this estimator.
-Because Wahba's is efficient, the difference of the two attitudes has the difference of the two covariances.
+1 + g^2 and different in each direction, so that the weights 1/sigma^2 are not the best ones. The result
+therefore differs from Wahba's by an amount of the order of the noise; the covariance is that of OLAE.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, J. Guidance, Control, and Dynamics
 30 (2007).
@@ -22,12 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.attitude.profile import half_turn
-from knightcube.astro.attitude.triad import attitude_of_pair, best_pair
 from knightcube.astro.attitude.wahba import (
     AttitudeError,
     AttitudeFix,
-    Sightings,
+    attitude_of_pair,
+    best_pair,
+    half_rotation,
     profile_matrix,
     sightings,
     upright,
@@ -44,7 +43,7 @@ class OlaeSolution:
 
     Attributes:
         rodrigues: (3,) axis times tan of half the angle, g of 4.4.
-        quaternion: (4,) A(q) turns `starts` into `ends` (4.5, 4.6).
+        quaternion: (4,) A(q) rotates `starts` into `ends` (4.5, 4.6).
         residuals: (n, 3) [s x] g - d, of each pair; their lengths are 4.7.
         sums: (n, 3) s = b + r of 4.1.
         normal: (3, 3) sum of w [s x]^T [s x], minus twice the printed M of 4.3.
@@ -74,7 +73,7 @@ class OlaeSolution:
 
 
 def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) -> OlaeSolution:
-    """Return the rotation that best turns `starts` into `ends` (n, 3), with weights (n,): 4.1-4.7.
+    """Return the rotation that best takes `starts` to `ends` (n, 3), with weights (n,): 4.1-4.7.
 
     Raises numpy.linalg.LinAlgError when the directions do not fix a rotation (fewer than two distinct ones).
     """
@@ -91,21 +90,21 @@ def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) 
 
 
 def gain(solution: OlaeSolution, weights: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) by which an error of each d moves the rotation vector."""
+    """Return the matrices (n, 3, 3) from the error of each d to the error of the rotation vector."""
     cross = cross_matrices(solution.sums)
     inverse = np.linalg.inv(solution.normal)
-    turned = np.swapaxes(cross, 1, 2) * weights[:, None, None]
-    return np.asarray(np.einsum("ij,jk,nkl->nil", solution.jacobian(), inverse, turned))
+    transposed = np.swapaxes(cross, 1, 2) * weights[:, None, None]
+    return np.asarray(np.einsum("ij,jk,nkl->nil", solution.jacobian(), inverse, transposed))
 
 
 def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+    """Return the attitude that rotates `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
 
     Raises AttitudeError when the directions fix no attitude.
     """
     seen = sightings(observed, reference, sigma)
     rough = attitude_of_pair(seen, *best_pair(seen, sigma))
-    signs, turn = half_turn(int(np.argmax(np.abs(rough))))
+    signs, rotation = half_rotation(int(np.argmax(np.abs(rough))))
     try:
         found = rotation_between(reference * signs, observed, seen.weight)
     except np.linalg.LinAlgError as error:
@@ -113,24 +112,17 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
     inverse = np.asarray(np.linalg.inv(found.normal), dtype=np.float64)
     # Forming the normal equations costs digits; one step from the equations' own residuals restores them.
     gibbs = found.rodrigues - inverse @ (seen.weight @ np.cross(found.residuals, found.sums))
-    quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), turn))
-    return AttitudeFix(quaternion, _covariance(seen, found, gibbs, inverse), seen.loss(quaternion))
-
-
-def _covariance(seen: Sightings, found: OlaeSolution, gibbs: FloatArray, inverse: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) rad^2 of small turns about the observer's axes.
-
-    Each error e enters as (1 + [g x]) e; the normal equations make a change dg of it, which is a turn of
-    2 (1 - [g x]) dg/(1 + g^2).
-    """
+    quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), rotation))
+    # Each error e enters as (1 + [g x]) e, and has no part along its direction. The normal equations make a
+    # change dg of it, a small rotation of 2 (1 - [g x]) dg/(1 + g^2).
     square = 1.0 + gibbs @ gibbs
     across = np.cross(found.sums, gibbs)
-    # An error has no part along its direction.
-    along = np.cross(found.sums, seen.observed + np.cross(gibbs, seen.observed))
+    along = np.cross(found.sums, observed + np.cross(gibbs, observed))
     spread = (
         square * found.normal
         - profile_matrix(across, across, seen.weight)
         - profile_matrix(along, along, seen.weight)
     )
-    turn = 2.0 / square * (np.eye(3) - np.cross(gibbs, np.eye(3)).T) @ inverse
-    return np.asarray(turn @ spread @ turn.T / seen.total)
+    by_error = 2.0 / square * (np.eye(3) - np.cross(gibbs, np.eye(3)).T) @ inverse
+    covariance = np.asarray(by_error @ spread @ by_error.T / seen.total)
+    return AttitudeFix(quaternion, covariance, seen.loss(quaternion))

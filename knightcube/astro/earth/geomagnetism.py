@@ -1,8 +1,8 @@
 """The geomagnetic field in orbit: the World Magnetic Model of 2025.
 
 NOAA NCEI and British Geological Survey, The US/UK World Magnetic Model for 2025-2030 (2025), degree 12,
-through pygeomag. It models the field of the core, without crust, ionosphere and ring current; its own error
-model, for the ground, is 89..141 nT per component. Valid until 2030.
+through pygeomag. It models the field of the core, without crust, ionosphere and ring current. Its stated
+error on the ground is 89 to 141 nT per component. It is valid until 2030.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NANOTESLA = 1e-9
 
 
 class GeomagneticError(FlightError):
-    """A time or place outside the model."""
+    """Raised for a time or a position outside the model."""
 
 
 def field_on_ground_axes(year: float, latitude: float, longitude: float, height: float) -> FloatArray:
@@ -36,10 +36,12 @@ def field_on_ground_axes(year: float, latitude: float, longitude: float, height:
     Raises GeomagneticError outside 2025.0..2030.0, for values that are not finite and for invalid latitudes.
     """
     if not FIRST_YEAR <= year <= LAST_YEAR:
-        raise GeomagneticError(f"year {year:.2f}: WMM2025 is good from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
+        raise GeomagneticError(f"year {year:.2f}: WMM2025 is valid from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
     if not (abs(latitude) <= 0.5 * math.pi and math.isfinite(longitude) and math.isfinite(height)):
-        raise GeomagneticError(f"no place: latitude {latitude}, longitude {longitude} rad, height {height} m")
-    # pygeomag wants (-180, 180] deg and km.
+        raise GeomagneticError(
+            f"invalid position: latitude {latitude}, longitude {longitude} rad, height {height} m"
+        )
+    # pygeomag takes longitudes in (-180, 180] deg and heights in km.
     east = math.degrees(math.remainder(longitude, 2.0 * math.pi))
     found = _model().calculate(math.degrees(latitude), east, 1e-3 * height, year)
     return NANOTESLA * np.array([found.x, found.y, found.z])
@@ -52,11 +54,13 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
     """
     to_ground = celestial_to_terrestrial(julian_date)
     longitude, latitude, height = (float(part) for part in geodetic(to_ground @ position))
-    down_there = field_on_ground_axes(float(julian_epoch(julian_date)), latitude, longitude, height)
-    return np.asarray(down_there @ north_east_down(longitude, latitude) @ to_ground)
+    north_east_down_field = field_on_ground_axes(
+        float(julian_epoch(julian_date)), latitude, longitude, height
+    )
+    return np.asarray(north_east_down_field @ north_east_down(longitude, latitude) @ to_ground)
 
 
 @cache
 def _model() -> GeoMag:
-    # By name, because pygeomag's default depends on its release.
+    # The file is named, because pygeomag's default depends on its release.
     return GeoMag(coefficients_file="wmm/WMM_2025.COF")

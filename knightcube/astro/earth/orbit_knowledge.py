@@ -27,12 +27,12 @@ _LONGEST_STEP = 30.0
 
 
 class OrbitError(FlightError):
-    """No orbit is known at this time: it has decayed, or the fix is too old."""
+    """Raised if no orbit is known at a time: it has decayed, or the fix is too old."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitState:
-    """Position (3,) m and velocity (3,) m/s, ICRS, at a Julian date UTC; `sigma` m is of each axis."""
+    """Position (3,) m and velocity (3,) m/s, ICRS, at a Julian date UTC; `sigma` m is the error per axis."""
 
     julian_date: float
     position: FloatArray
@@ -49,8 +49,8 @@ class OrbitState:
 class GpsFix:
     """A GPS receiver's fix, ITRS axes: position (3,) m, velocity (3,) m/s with respect to the ground.
 
-    `sigma` m is of the position, `velocity_sigma` m/s of the velocity; the fix is not used after
-    `longest_age` s.
+    `sigma` m is the error of the position, `velocity_sigma` m/s that of the velocity. The fix is not used
+    after `longest_age` s.
     """
 
     julian_date: float
@@ -61,7 +61,7 @@ class GpsFix:
     longest_age: float = 1500.0
 
     def __post_init__(self) -> None:
-        """Raise OrbitError for values that no receiver in orbit would send."""
+        """Raise OrbitError for values that no receiver in orbit measures."""
         numbers = np.array([self.julian_date, *self.position, *self.velocity])
         if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
             raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
@@ -72,29 +72,29 @@ class GpsFix:
         """Return the state propagated to a Julian date UTC. Raises OrbitError for an old fix."""
         age = (julian_date - self.julian_date) * DAY
         if not abs(age) <= self.longest_age:
-            raise OrbitError(f"the last fix is {age:.0f} s old: none is of use after {self.longest_age:g} s")
+            raise OrbitError(f"the last fix is {age:.0f} s old: fixes are used for {self.longest_age:g} s")
         to_ground = celestial_to_terrestrial(self.julian_date)
         with_ground = self.velocity + np.cross([0.0, 0.0, ROTATION_RATE], self.position)
         state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
-        carried = carried_on(state, age)
-        # Along the orbit an error of velocity grows three times as fast as in free space.
+        later = propagated(state, age)
+        # An along-track velocity error moves the satellite three times as far as in free space.
         sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
-        return OrbitState(julian_date, carried[:3], carried[3:], sigma)
+        return OrbitState(julian_date, later[:3], later[3:], sigma)
 
 
 class TwoLineElements:
-    """A two-line element set; `sigma` m of an axis grows by `growth` m a day from its epoch."""
+    """A two-line element set; its error `sigma` m per axis grows by `growth` m per day from its epoch."""
 
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
-        """Read the two lines. Raises UsageError for invalid lines and elements of no orbit."""
+        """Read the two lines. Raises UsageError for invalid lines and for elements that describe no orbit."""
         for number, line in (("1", first), ("2", second)):
             _check_line(number, line)
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
         if not 1.0 <= self._satellite.epochdays < 367.0:
-            # SGP4 steps from the epoch of a resonant orbit in half days: one of 1e12 days never ends.
-            raise UsageError(f"{first.rstrip()!r}: its epoch's day of the year must be from 1 to 366")
-        code, *place = self._satellite.sgp4_tsince(0.0)
-        if code or not np.all(np.isfinite(place)):
+            # SGP4 propagates resonant orbits from their epoch in steps of half a day: 1e12 days never end.
+            raise UsageError(f"{first.rstrip()!r}: the day of the year of its epoch must be from 1 to 366")
+        code, *state = self._satellite.sgp4_tsince(0.0)
+        if code or not np.all(np.isfinite(state)):
             reason = SGP4_ERRORS[code] if code else "a column holds no number"
             raise UsageError(
                 f"{second.rstrip()!r}: these elements describe no orbit at their epoch: {reason}"
@@ -107,15 +107,15 @@ class TwoLineElements:
         code, position, velocity = self._satellite.sgp4(whole, julian_date - whole)
         if code:
             raise OrbitError(f"SGP4 at {julian_date}: {SGP4_ERRORS[code]}")
-        turn = mean_equator_to_celestial(julian_date)
+        to_icrs = mean_equator_to_celestial(julian_date)
         age = abs(julian_date - self._satellite.jdsatepoch - self._satellite.jdsatepochF)
         sigma = self._sigma + self._growth * age
         return OrbitState(
-            julian_date, 1e3 * (turn @ np.array(position)), 1e3 * (turn @ np.array(velocity)), sigma
+            julian_date, 1e3 * (to_icrs @ np.array(position)), 1e3 * (to_icrs @ np.array(velocity)), sigma
         )
 
 
-def carried_on(state: FloatArray, duration: float) -> FloatArray:
+def propagated(state: FloatArray, duration: float) -> FloatArray:
     """Return position and velocity (6,), m and m/s, after `duration` s, by classical Runge-Kutta."""
     steps = max(1, math.ceil(abs(duration) / _LONGEST_STEP))
     dt = duration / steps
@@ -143,9 +143,11 @@ def _check_line(number: str, line: str) -> None:
     """Raise UsageError unless `line` is that line of a two-line element set."""
     line = line.rstrip()
     if len(line) != 69 or not line.startswith(f"{number} "):
-        raise UsageError(f"{line!r}: line {number} of a two-line element set has 69 columns and begins so")
+        raise UsageError(
+            f"{line!r}: line {number} of a two-line element set has 69 columns and starts with {number}"
+        )
     if not (line.isascii() and line.isprintable()):
-        raise UsageError(f"{line!r}: a two-line element set is of printable ASCII characters")
+        raise UsageError(f"{line!r}: a two-line element set has printable ASCII characters only")
     total = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if str(total) != line[68]:
-        raise UsageError(f"{line!r}: checksum {line[68]}, its columns add up to {total}")
+        raise UsageError(f"{line!r}: checksum {line[68]}, the sum of its columns gives {total}")

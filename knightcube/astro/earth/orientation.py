@@ -1,8 +1,9 @@
-"""The Earth's orientation: rotations between ICRS (GCRS, the stars) and ITRS (the ground).
+"""The Earth's orientation: rotations between ICRS (GCRS, the stars) and ITRS (the ground), and time scales.
 
-IAU 2006/2000B through ERFA, to a milliarcsecond of the pole. UT1 is assumed equal to UTC unless given (they
-differ by at most 0.9 s, 13" of rotation), polar motion (0.3") zero. Julian dates are UTC; TT is 69.184 s
-ahead of UTC since 2017. A Julian date as a float resolves 40 us, 0.3 m along a low orbit.
+The model is IAU 2006/2000B through ERFA, with an error of a milliarcsecond of the pole. UT1 is assumed equal
+to UTC unless given (they differ by at most 0.9 s, 13" of rotation), and polar motion (0.3") zero. Julian
+dates are UTC; TT is 69.184 s ahead of UTC since 2017. A Julian date as a float has a resolution of 40 us,
+0.3 m along a low orbit.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import DAY, J2000
 
 TT_MINUS_UTC = 69.184
-"""s: 32.184 and 37 leap seconds (IERS Bulletin C 52 and since)."""
+"""TT - UTC, s: 32.184 and 37 leap seconds (IERS Bulletin C 52 and later)."""
 ROTATION_RATE = 7.292115e-5
-"""rad/s, of the Earth (WGS 84)."""
+"""Rotation rate of the Earth, rad/s (WGS 84)."""
 JULIAN_YEAR = 365.25
-"""days."""
+"""Length of a Julian year, days."""
 
 
 def terrestrial_time(julian_date: npt.ArrayLike) -> FloatArray:
@@ -33,9 +34,9 @@ def julian_epoch(julian_date: npt.ArrayLike) -> FloatArray:
 
 
 def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
-    """Return the matrices (..., 3, 3) that take vectors from ICRS to ITRS at Julian dates UTC (...)."""
+    """Return the matrices (..., 3, 3) that rotate vectors from ICRS to ITRS at Julian dates UTC (...)."""
     date = np.asarray(julian_date, dtype=float)
-    # TT and UT1 in two parts, whole and fraction, as ERFA recommends.
+    # ERFA recommends TT and UT1 in two parts, whole and fraction.
     whole = np.floor(date)
     day = date - whole
     return np.asarray(
@@ -44,17 +45,17 @@ def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 
 
 
 def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
-    """Return the matrices (..., 3, 3) that take vectors from TEME, the frame of SGP4, to ICRS.
+    """Return the matrices (..., 3, 3) that rotate vectors from TEME, the frame of SGP4, to ICRS.
 
-    Through ITRS: TEME differs from it by the mean sidereal time of 1982 alone (Vallado, Crawford,
-    Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
+    The rotation leads through ITRS, from which TEME differs by the mean sidereal time of 1982 only (Vallado,
+    Crawford, Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
     """
     date = np.asarray(julian_date, dtype=float)
     whole = np.floor(date)
     sidereal = np.asarray(erfa.gmst82(whole, date - whole + ut1_minus_utc / DAY), dtype=float)
     cosine, sine = np.cos(sidereal), np.sin(sidereal)
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
-    turn = np.stack(
+    to_itrs = np.stack(
         [
             np.stack([cosine, sine, zero], axis=-1),
             np.stack([-sine, cosine, zero], axis=-1),
@@ -63,7 +64,7 @@ def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float =
         axis=-2,
     )
     to_ground = celestial_to_terrestrial(date, ut1_minus_utc)
-    return np.asarray(np.swapaxes(to_ground, -1, -2) @ turn)
+    return np.asarray(np.swapaxes(to_ground, -1, -2) @ to_itrs)
 
 
 def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -78,7 +79,7 @@ def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def north_east_down(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> FloatArray:
     """Return the matrices (..., 3, 3) whose rows are north, east and down in ITRS.
 
-    Geodetic latitude gives those of the ellipsoid, geocentric latitude those of the sphere.
+    A geodetic latitude gives the axes of the ellipsoid, a geocentric latitude those of the sphere.
     """
     along, up = np.asarray(longitude, dtype=float), np.asarray(latitude, dtype=float)
     ca, sa, cu, su = np.cos(along), np.sin(along), np.cos(up), np.sin(up)

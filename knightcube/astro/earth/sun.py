@@ -1,27 +1,33 @@
-"""The Earth's place from the Sun and its velocity, by ERFA's epv00 (VSOP2000: Moisson & Bretagnon 2001).
+"""The Sun as seen from the Earth and from a satellite: position, constants, and the Earth's shadow.
 
-0.35 ms a call. The Almanac's series that stood here took 0.18 ms and was 31 m/s off, 0.02" of aberration.
+The Earth's position and velocity relative to the Sun are those of ERFA's epv00 (VSOP2000: Moisson &
+Bretagnon 2001), 0.35 ms a call.
+
+The shadow is Sease 2.15 corrected: it is evaluated at the object's own position and by default includes the
+penumbra. The Earth is a sphere of its equatorial radius without an atmosphere.
 """
 
 from __future__ import annotations
 
 import math
 from datetime import UTC, datetime
+from typing import Literal
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
 
 SPEED_OF_LIGHT = 299_792_458.0
-"""m/s."""
+"""Speed of light, m/s."""
 ASTRONOMICAL_UNIT = 149_597_870_700.0
-"""m (IAU 2012)."""
+"""Astronomical unit, m (IAU 2012)."""
 SUN_RADIUS = 695_700_000.0
-"""m (IAU 2015)."""
+"""Radius of the Sun, m (IAU 2015)."""
 J2000 = 2_451_545.0
-"""The Julian date of 2000 January 1.5 TT."""
+"""Julian date of 2000 January 1.5 TT."""
 DAY = 86_400.0
-"""s."""
+"""Length of a day, s."""
 
 
 def julian_date(utc: datetime) -> float:
@@ -34,22 +40,68 @@ def julian_date(utc: datetime) -> float:
 
 
 def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
-    """Return the Earth's place from the Sun (3,) m and its velocity (3,) m/s about the barycentre, ICRS.
+    """Return the Earth's position relative to the Sun (3,) m and its barycentric velocity (3,) m/s, ICRS.
 
-    At a Julian date TT; from 1900 to 2100 within 12 km and 5 mm/s of JPL's DE405 (documentation of epv00).
+    `julian_date` is TT. From 1900 to 2100 the errors against JPL's DE405 are below 12 km and 5 mm/s
+    (documentation of epv00).
     """
-    # Most users of this module need its constants only.
+    # Imported here, because most users of this module need its constants only.
     import erfa  # noqa: PLC0415
 
     whole = math.floor(julian_date)
     heliocentric, barycentric = erfa.epv00(float(whole), julian_date - whole)
-    place = ASTRONOMICAL_UNIT * np.asarray(heliocentric["p"])
-    return place, ASTRONOMICAL_UNIT / DAY * np.asarray(barycentric["v"])
+    position = ASTRONOMICAL_UNIT * np.asarray(heliocentric["p"])
+    return position, ASTRONOMICAL_UNIT / DAY * np.asarray(barycentric["v"])
 
 
 def earth_velocity(julian_date: float) -> FloatArray:
-    """Return the Earth's velocity (3,) m/s about the barycentre, ICRS, at a Julian date TT: for aberration.
+    """Return the Earth's barycentric velocity (3,) m/s, ICRS, at a Julian date TT.
 
-    A satellite's own about the Earth, 7.6 km/s or 5", comes on top.
+    It gives the annual aberration. The orbital velocity of a satellite, 7.6 km/s or 5", adds to it.
     """
     return earth_from_sun(julian_date)[1]
+
+
+Shadow = Literal["conical", "cylindrical"]
+
+
+def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> FloatArray:
+    """Return the share (...) of the Sun's disc visible from `position` (..., 3) m: 0 in the umbra.
+
+    `sun` (..., 3) m is the geocentric position of the Sun. "conical" uses the overlap of the discs of Sun
+    and Earth (Montenbruck & Gill 2000, 3.4.2); "cylindrical" gives 0 or 1 (Sease 2.15 corrected).
+    """
+    position, sun = np.asarray(position, dtype=float), np.asarray(sun, dtype=float)
+    distance = np.linalg.norm(position, axis=-1)
+    if shadow == "cylindrical":
+        towards = sun / np.linalg.norm(sun, axis=-1, keepdims=True)
+        cosine = np.sum(position * towards, axis=-1) / distance
+        tangent = np.sqrt(np.maximum(0.0, distance**2 - EARTH_RADIUS**2)) / distance
+        return np.where(cosine <= -tangent, 0.0, 1.0)
+    if shadow != "conical":
+        raise ValueError(f"shadow = {shadow!r}: give conical or cylindrical")
+    to_sun = sun - position
+    sun_distance = np.linalg.norm(to_sun, axis=-1)
+    sun_disc = np.arcsin(SUN_RADIUS / sun_distance)
+    earth_disc = np.arcsin(np.minimum(1.0, EARTH_RADIUS / distance))
+    cosine = -np.sum(position * to_sun, axis=-1) / (distance * sun_distance)
+    # By the cross product, because the arc cosine is imprecise near zero.
+    sine = np.linalg.norm(np.cross(position, to_sun), axis=-1) / (distance * sun_distance)
+    return 1.0 - _covered_share(sun_disc, earth_disc, np.arctan2(sine, cosine))
+
+
+def _covered_share(disc: FloatArray, cover: FloatArray, apart: FloatArray) -> FloatArray:
+    """Return the share (...) of a disc of radius `disc` that a disc of radius `cover` hides.
+
+    The centres are `apart`; all are angles, rad. The hidden area of two plane discs consists of the two
+    segments beyond their common chord. A plane is accurate enough because the Sun's disc is small and the
+    Earth's limb nearly straight across it.
+    """
+    crossing = (apart < disc + cover) & (apart > np.abs(disc - cover))
+    safe = np.where(crossing, apart, disc + cover)
+    chord = np.clip((safe**2 + disc**2 - cover**2) / (2.0 * safe * disc), -1.0, 1.0)
+    other = np.clip((safe**2 + cover**2 - disc**2) / (2.0 * safe * cover), -1.0, 1.0)
+    first = disc**2 * (np.arccos(chord) - chord * np.sqrt(1.0 - chord**2))
+    second = cover**2 * (np.arccos(other) - other * np.sqrt(1.0 - other**2))
+    within = np.where(apart <= cover - disc, 1.0, np.where(apart <= disc - cover, (cover / disc) ** 2, 0.0))
+    return np.asarray(np.where(crossing, (first + second) / (np.pi * disc**2), within))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.attitude import esoq2
+from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import (
@@ -79,8 +79,8 @@ def attitudes_of_ends(
         raise FlightError(f"exposure of {exposure} s: must be finite and positive")
     vectors = pinhole.unit_vectors(endpoints)
     errors = sigma / pinhole.focal_length
-    start = esoq2.solve(vectors[:, 0], reference, errors)
-    end = esoq2.solve(vectors[:, 1], reference, errors)
+    start = SOLVERS["esoq2"](vectors[:, 0], reference, errors)
+    end = SOLVERS["esoq2"](vectors[:, 1], reference, errors)
     turn = multiply(end.quaternion, conjugate(start.quaternion))
     rotation = to_rotation_vector(turn)
     # The start's error is seen from the end's axes; both then turn the rotation vector.

@@ -22,8 +22,7 @@ from scipy.interpolate import CubicSpline
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orientation import ROTATION_RATE
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, sunlit_share
 from sim_hal.settings import Disturbances
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate

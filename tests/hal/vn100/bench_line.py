@@ -9,8 +9,7 @@ import numpy as np
 
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.devices import ImuReading
-from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
-from knightcube.astro.quaternion import IDENTITY
+from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings

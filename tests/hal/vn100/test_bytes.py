@@ -20,8 +20,7 @@ from hal.drivers.vn100.protocol import (
     measurement,
     parse,
 )
-from knightcube.astro.frames import NED_TO_TESTBED
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_matrix
 
 DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "vn100_packets.json"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason=f"published packets not here: {DATA.name}")

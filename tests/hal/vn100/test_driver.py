@@ -14,8 +14,14 @@ from hal.drivers.vn100.driver import OUTPUT_SET, Vn100, Vn100Settings
 from hal.drivers.vn100.protocol import build, layout_of
 from hal.drivers.vn100.setup import Question
 from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
-from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
-from knightcube.astro.quaternion import about_axis_y, attitude_matrix, from_rotation_vector, multiply
+from knightcube.astro.quaternion import (
+    NED_TO_TESTBED,
+    about_axis_y,
+    attitude_map,
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+)
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES

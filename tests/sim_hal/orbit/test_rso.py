@@ -12,8 +12,7 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, sunlit_share
 from sim_hal.star_camera import StarCameraModel, expected_electrons
 from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.worlds import sun

@@ -7,8 +7,7 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS, sunlit_share
 
 SUN = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
 

@@ -21,11 +21,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.attitude import singular_values
-from knightcube.astro.attitude.solvers import DEFAULT, SOLVERS
-from knightcube.astro.attitude.wahba import information, sightings
+from knightcube.astro.attitude.solvers import DEFAULT, SOLVERS, singular_values
+from knightcube.astro.attitude.wahba import sightings
 from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
-from tests.knightcube.astro.attitude.sights import Sight, sight
+from tests.knightcube.astro.attitude.sights import Sight, information, sight
 
 _SEED = 20_412
 _SIGMA = np.radians(5.0 / 3600.0)
@@ -77,7 +76,7 @@ def measure(family: Family, cases: int, seed: int) -> list[Row]:
         seen = _case(rng, family)
         settled = SOLVERS["svd"](seen.observed, seen.reference, seen.sigma)
         profile = sightings(seen.observed, seen.reference, seen.sigma).profile
-        alone = singular_values.optimal_quaternion(profile)
+        alone = singular_values(profile)
         for name, taken in times.items():
             quaternion, covariance = _timed(name, seen, taken)
             error = to_rotation_vector(multiply(quaternion, conjugate(seen.quaternion)))

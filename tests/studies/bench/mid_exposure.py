@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.attitude import esoq2
+from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import FlightError
@@ -115,7 +115,7 @@ class Seen:
     def attitude(self) -> FloatArray:
         """Return the attitude (4,) by ESOQ2; raises AttitudeError when the stars fix none."""
         sigma = np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)) / self.pinhole.focal_length
-        return esoq2.solve(self.pinhole.unit_vectors(self.places), self.reference, sigma).quaternion
+        return SOLVERS["esoq2"](self.pinhole.unit_vectors(self.places), self.reference, sigma).quaternion
 
     def disagreement(self, quaternion: FloatArray) -> FloatArray:
         """Return each star's squared distance (n,) from where the attitude puts it, in its deviations."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from flight.bodies.testbed.thread import about_thread
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
-from knightcube.astro.quaternion import IDENTITY, from_rotation_vector, multiply
+from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map, from_rotation_vector, multiply
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,

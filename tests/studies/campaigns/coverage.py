@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from knightcube.astro.almanac import apparent_sun
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
-from knightcube.gnc.attitude.references import sun_from
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_world import FIRST_DATE
 from tests.support.orbit_geometry import (
@@ -118,7 +117,7 @@ def _attitudes(kind: str, n: int, rng: np.random.Generator) -> FloatArray:
 
 def _sun(way: Pass) -> FloatArray:
     """Return the Sun's directions (n, 3); in a revolution it moves by 0.06 deg, and is held."""
-    seen, _ = sun_from(way.julian_date, way.positions[0], way.velocities[0])
+    seen, _ = apparent_sun(way.julian_date, way.positions[0], way.velocities[0])
     return np.broadcast_to(seen, way.positions.shape)
 
 

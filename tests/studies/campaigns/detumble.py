@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.ephemeris import predict
-from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.earth.ephemeris import FieldAhead, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule

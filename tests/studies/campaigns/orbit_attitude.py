@@ -1,7 +1,7 @@
 """Campaign `orbit-attitude`: attitude, sigma and NEES of the flight filter over one orbit with eclipse.
 
 Each run is one revolution from sunrise to sunrise (`orbit_world`) through
-`knightcube.gnc.attitude`; its last 36 minutes are dark. Variants lose a sensor for good after ten
+`direction_filter`; its last 36 minutes are dark. Variants lose a sensor for good after ten
 minutes, or all cameras; one has worse gyros.
 NEES is of attitude and gyro bias, six errors, over independent runs; 1 is honest.
 """
@@ -19,10 +19,10 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, DeterminationSettings
 from knightcube.gnc.estimation.estimate import BIAS, TURN, Estimate
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
 from tests.studies.campaigns.orbit_attitude_figures import WHENS, draw, line_of, variant_facts
 from tests.studies.campaigns.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
 from tests.support.orbit_geometry import suite as suite_of

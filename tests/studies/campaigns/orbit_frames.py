@@ -25,11 +25,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.attitude.solvers import VectorObservation
 from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, normalise, to_rotation_vector
-from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Report, begin
-from knightcube.gnc.attitude.single_frame import Sight
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
 from knightcube.vision.horizon.limb import MEAN_RADIUS
@@ -42,6 +41,7 @@ from sim_hal.emulators.solar_strings import SolarStringsModel
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band
+from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
 from tests.studies.campaigns.nadir import camera_model, finder_settings, random_air
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
 from tests.studies.campaigns.orbit_world import STEP, World
@@ -197,8 +197,8 @@ class _Flight:
         down = -position / np.linalg.norm(position)
         fix = begin(
             [
-                Sight(sun.direction, self.truth.sun[k], sun.covariance),
-                Sight(found.direction, down, found.covariance),
+                VectorObservation(sun.direction, self.truth.sun[k], sun.covariance),
+                VectorObservation(found.direction, down, found.covariance),
             ]
         )
         off = float(np.arccos(np.clip(found.direction @ (body @ down), -1.0, 1.0)))

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from knightcube.astro.almanac import apparent_sun
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -25,7 +25,6 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.attitude.references import sun_from
 from sim_hal.worlds import geomagnetism
 from tests.support.orbit_geometry import (
     Pass,
@@ -133,7 +132,9 @@ def _sun(pass_: Pass) -> FloatArray:
     """Return the Sun's apparent directions (n, 3), computed every 10 s and drawn straight between."""
     every = max(1, len(pass_.times) // 600)
     nodes = np.unique(np.append(np.arange(0, len(pass_.times), every), len(pass_.times) - 1))
-    known = np.array([sun_from(dates(pass_)[k], pass_.positions[k], pass_.velocities[k])[0] for k in nodes])
+    known = np.array(
+        [apparent_sun(dates(pass_)[k], pass_.positions[k], pass_.velocities[k])[0] for k in nodes]
+    )
     between = np.stack([np.interp(pass_.times, pass_.times[nodes], part) for part in known.T], axis=-1)
     return np.asarray(between / np.linalg.norm(between, axis=-1, keepdims=True))
 

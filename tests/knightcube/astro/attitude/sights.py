@@ -20,6 +20,12 @@ class Sight:
     quaternion: FloatArray
 
 
+def information(observed: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return the Fisher information (3, 3) of small rotations, 1/rad^2: the sum of (1 - b b^T)/sigma^2."""
+    weighted = observed / sigma[:, None]
+    return np.asarray(np.sum(1.0 / sigma**2) * np.eye(3) - weighted.T @ weighted)
+
+
 def unit(vectors: FloatArray) -> FloatArray:
     """Return the vectors (..., 3) at unit length."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

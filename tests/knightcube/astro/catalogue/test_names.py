@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro import catalogue
-from knightcube.astro.catalogue.names import PROPER_NAMES
+from knightcube.astro.catalogue import PROPER_NAMES
 
 
 def test_every_named_star_is_in_the_catalogue_and_names_are_not_shared() -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from knightcube.astro.earth.dipole_field import dipole_field_ahead
-from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.ephemeris import dipole_field_ahead, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 
 STATE = OrbitState(2_461_120.0, np.array([6.878e6, 0.0, 0.0]), np.array([0.0, -988.0, 7548.0]), 10.0)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth import field_ahead, geomagnetism
-from knightcube.astro.earth.ephemeris import predict
-from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.earth import ephemeris, geomagnetism
+from knightcube.astro.earth.ephemeris import FieldAhead, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.earth.sun import DAY
 
@@ -33,7 +32,7 @@ def state_after(seconds: float) -> OrbitState:
 def test_call_by_call_the_whole_model_reaches_farther_and_the_dipole_goes_on_from_there() -> None:
     ahead = FieldAhead()
     first = apart(ahead.along(STATE, TIMES), 0.0)
-    near = field_ahead.STEP * field_ahead.MORE
+    near = ephemeris.NODE_STEP * ephemeris.NODES_PER_CALL
     assert first[near > TIMES].max() < 5e-3
     assert 0.03 < first[near + 600.0 < TIMES].max() < 0.5
     for k in range(1, 12):
@@ -60,9 +59,9 @@ def test_no_call_makes_more_knots_than_the_loop_has_time_for(monkeypatch: pytest
         made.append(date)
         return whole(date, place)
 
-    monkeypatch.setattr(field_ahead, "field", counted)
+    monkeypatch.setattr(ephemeris, "field", counted)
     ahead = FieldAhead()
     for k in range(3):
         made.clear()
         ahead.along(state_after(5.0 * k), TIMES)
-        assert 0 < len(made) <= field_ahead.MORE + 1
+        assert 0 < len(made) <= ephemeris.NODES_PER_CALL + 1

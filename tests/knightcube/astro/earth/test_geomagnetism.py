@@ -110,9 +110,9 @@ def test_the_ring_current_weakens_the_field_at_the_magnetic_equator() -> None:
 
 
 def test_years_and_places_that_no_model_knows_are_refused() -> None:
-    with pytest.raises(believed.GeomagneticError, match=r"year 2031\.00: WMM2025 is good from 2025 to 2030"):
+    with pytest.raises(believed.GeomagneticError, match=r"year 2031\.00: WMM2025 is valid from 2025 to 2030"):
         believed.field_on_ground_axes(2031.0, 0.0, 0.0, 0.0)
-    with pytest.raises(believed.GeomagneticError, match="no place"):
+    with pytest.raises(believed.GeomagneticError, match="invalid position"):
         believed.field_on_ground_axes(2026.0, float("nan"), 0.0, 0.0)
     with pytest.raises(OutOfRange, match="year"):
         true.field(julian_date(2031.0), np.array([7e6, 0.0, 0.0]))

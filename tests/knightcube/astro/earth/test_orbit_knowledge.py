@@ -7,18 +7,15 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
+from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, TwoLineElements
 from knightcube.astro.earth.orientation import (
     ROTATION_RATE,
     celestial_to_terrestrial,
     geodetic,
     mean_equator_to_celestial,
     north_east_down,
-    terrestrial_time,
 )
 from knightcube.errors import UsageError
-from knightcube.gnc.attitude.references import references, sun_from
-from sim_hal.worlds import sun
 from sim_hal.worlds.orbit import KeplerianElements, propagate
 
 DATE = 2_461_365.8
@@ -112,7 +109,7 @@ def test_an_old_fix_and_one_within_the_earth_are_refused() -> None:
 def test_lines_that_are_no_elements_are_refused() -> None:
     with pytest.raises(UsageError, match="69 columns"):
         TwoLineElements(FIRST[:-3], SECOND)
-    with pytest.raises(UsageError, match="checksum 4, its columns add up to 3"):
+    with pytest.raises(UsageError, match="checksum 4, the sum of its columns gives 3"):
         TwoLineElements(FIRST[:-1] + "4", SECOND)
     with pytest.raises(UsageError, match="line 2"):
         TwoLineElements(FIRST, FIRST)
@@ -123,7 +120,7 @@ def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
     """In an orbit of half a day a place 1e12 days from the epoch is found in half days, and so never."""
     first = FIRST[:20] + day + FIRST[32:]
     high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
-    with pytest.raises(UsageError, match="day of the year must be from 1 to 366"):
+    with pytest.raises(UsageError, match="day of the year of its epoch must be from 1 to 366"):
         TwoLineElements(_summed(first), _summed(high))
 
 
@@ -138,27 +135,3 @@ def test_a_decayed_orbit_is_reported() -> None:
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"
     with pytest.raises(OrbitError, match="SGP4"):
         TwoLineElements(first, second).at(2_453_703.5 + 0.02012661 + 2.0)
-
-
-def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
-    """`sim_hal.worlds.sun` is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
-    for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
-        apparent, distance = sun_from(date, np.zeros(3), np.zeros(3))
-        almanac = sun.position(terrestrial_time(date))
-        assert (
-            np.degrees(np.linalg.norm(np.cross(apparent, almanac / np.linalg.norm(almanac)))) < 45.0 / 3600.0
-        )
-        assert distance == pytest.approx(float(np.linalg.norm(almanac)), rel=1e-4)
-    across = np.cross(apparent, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    leant, _ = sun_from(date, np.zeros(3), 7.6e3 * across)
-    assert (leant - apparent) @ across == pytest.approx(7.6e3 / 299_792_458.0, rel=1e-3)
-
-
-def test_references_are_what_an_orbit_state_sees() -> None:
-    state = OrbitState(DATE, np.array([6.8e6, 0.0, 0.0]), np.array([0.0, 7.6e3, 0.0]), 680.0)
-    seen = references(state)
-    np.testing.assert_allclose(seen.nadir, (-1.0, 0.0, 0.0), atol=1e-12)
-    assert seen.nadir_sigma == pytest.approx(1e-4)
-    assert 2e-5 < np.linalg.norm(seen.field) < 5e-5
-    assert np.degrees(seen.sun_radius) == pytest.approx(0.267, abs=0.005)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.solvers import VectorObservation, weighted_fit
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
-from knightcube.gnc.attitude.single_frame import Sight, optimum
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN
 from knightcube.gnc.estimation.innovation import innovation
@@ -110,7 +110,7 @@ def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
         for measurement in seen:
             found = innovation(state, measurement, False)
             state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
-    fix = optimum([Sight(m.observed, m.reference, m.covariance) for m in seen])
+    fix = weighted_fit([VectorObservation(m.observed, m.reference, m.covariance) for m in seen])
     assert float(angle_between(as_array(state), fix.quaternion)) < 2e-2 * SIGMA
     np.testing.assert_allclose(covariance[TURN, TURN], fix.covariance, atol=0.02 * SIGMA**2)
 

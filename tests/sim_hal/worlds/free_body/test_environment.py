@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.earth.figure import EARTH_RADIUS
-from knightcube.astro.earth.shadow import sunlit_share
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, sunlit_share
 from sim_hal.settings import Disturbances, OrbitSection
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.body import elements, julian_date

@@ -17,13 +17,13 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.attitude.direction_filter import (
+from knightcube.gnc.estimation.estimate import BIAS, TURN
+from tests.studies.campaigns.direction_filter import (
     AttitudeDetermination,
     Report,
     Status,
     field_bias,
 )
-from knightcube.gnc.estimation.estimate import BIAS, TURN
 from tests.studies.campaigns.orbit_attitude import settings_of
 from tests.support.orbit_geometry import suite
 

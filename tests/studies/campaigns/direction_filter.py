@@ -1,9 +1,11 @@
-"""Attitude determination of Fig. 3: gyros propagate the attitude, directions correct attitude and bias.
+"""Attitude from gyros, Sun, nadir and magnetic field (Meller et al., section 2 and Fig. 3).
 
-The filter is the flight application's MEKF (`knightcube.gnc.estimation`) for a body free in orbit. It starts
-from the first directions that fix an attitude well enough and agree; then each measurement of Sun, nadir and
-field is used at its own time, alone or not. The magnetometer's bias is estimated beside the gyros' (with the
-field model's error, which changes as slowly): the estimate from sunlight is used in eclipse.
+Gyros propagate the attitude; directions correct attitude and bias. The filter is `AttitudeFilter` of
+`knightcube.gnc.estimation` for a free body in orbit. No flight uses it there: the campaigns `orbit-attitude`
+and `orbit-frames` measure it. It starts from the first directions that agree and fix an attitude accurately
+enough. Then each measurement of Sun, nadir and field is used at its own time. The magnetometer's bias is
+estimated together with the error of the field model, which changes as slowly: the estimate from sunlight is
+used in eclipse.
 """
 
 from __future__ import annotations
@@ -17,8 +19,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
-from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN, Estimate
 from knightcube.gnc.estimation.filter_settings import FilterSettings
@@ -106,7 +108,7 @@ class _Waiting:
     """A direction measured before there was an attitude."""
 
     time_ns: int
-    sight: Sight
+    observation: VectorObservation
 
 
 class AttitudeDetermination:
@@ -151,7 +153,7 @@ class AttitudeDetermination:
         elif self._filter.started:
             self._ingest(sensor, DirectionMeasurement(time_ns, observed, reference, covariance))
         else:
-            self._wait(sensor, time_ns, Sight(observed, reference, covariance))
+            self._wait(sensor, time_ns, VectorObservation(observed, reference, covariance))
 
     def field(self, time_ns: int, field: FloatArray, reference: FloatArray) -> None:
         """Accept the magnetometer's field (3,) T, body axes, and the model's `reference` (3,) T."""
@@ -167,7 +169,7 @@ class AttitudeDetermination:
             # bias's sigma keeps the attitude's weight right.
             spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
             try:
-                self._wait(FIELD, time_ns, field_sight(field, reference, spread * np.eye(3)))
+                self._wait(FIELD, time_ns, field_observation(field, reference, spread * np.eye(3)))
             except AttitudeError:
                 self._refuse(FIELD)
 
@@ -196,9 +198,9 @@ class AttitudeDetermination:
     def _refuse(self, sensor: str) -> None:
         self.refused[sensor] = self.refused.get(sensor, 0) + 1
 
-    def _wait(self, sensor: str, time_ns: int, sight: Sight) -> None:
+    def _wait(self, sensor: str, time_ns: int, observation: VectorObservation) -> None:
         """Keep a direction, and start if the directions at hand fix an attitude."""
-        self._waiting[sensor] = _Waiting(time_ns, sight)
+        self._waiting[sensor] = _Waiting(time_ns, observation)
         oldest_ns = time_ns - round(self._settings.start_age * 1e9)
         self._waiting = {name: w for name, w in self._waiting.items() if w.time_ns >= oldest_ns}
         if self._rate is None or self._rate.time_ns < oldest_ns or len(self._waiting) < 2:
@@ -213,13 +215,15 @@ class AttitudeDetermination:
         self._waiting = {}
         self.starts += 1
 
-    def _moved(self, waiting: _Waiting, time_ns: int) -> Sight:
+    def _moved(self, waiting: _Waiting, time_ns: int) -> VectorObservation:
         """Return a direction at `time_ns`, its covariance enlarged by the possible turn of the body since."""
         assert self._rate is not None
         rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
         turned = rate * (time_ns - waiting.time_ns) * 1e-9
-        sight = waiting.sight
-        return Sight(sight.observed, sight.reference, sight.covariance + turned**2 * np.eye(3))
+        observation = waiting.observation
+        return VectorObservation(
+            observation.observed, observation.reference, observation.covariance + turned**2 * np.eye(3)
+        )
 
     def _new_filter(self) -> AttitudeFilter:
         settings = self._settings
@@ -246,16 +250,16 @@ class AttitudeDetermination:
         )
 
 
-def begin(sights: Sequence[Sight], improbable: float = 1e-4) -> AttitudeFix | None:
+def begin(observations: Sequence[VectorObservation], improbable: float = 1e-4) -> AttitudeFix | None:
     """Return the attitude that directions fix, None when they fix none or contradict each other.
 
     Their angles to each other must be those of their references: a chi-square of 2 n - 3 degrees of freedom.
     """
     try:
-        fix = optimum(sights)
+        fix = weighted_fit(observations)
     except (AttitudeError, np.linalg.LinAlgError):
         return None
-    return fix if 2.0 * fix.loss <= float(chdtri(2 * len(sights) - 3, improbable)) else None
+    return fix if 2.0 * fix.loss <= float(chdtri(2 * len(observations) - 3, improbable)) else None
 
 
 def field_bias(estimate: Estimate) -> tuple[FloatArray, FloatArray]:

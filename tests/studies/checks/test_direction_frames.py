@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.attitude.solvers import VectorObservation
 from knightcube.astro.attitude.wahba import AttitudeFix
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import conjugate, from_matrix, from_rotation_vector, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Status, begin
-from knightcube.gnc.attitude.single_frame import Sight, camera_sight
 from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
+from tests.studies.campaigns.direction_filter import AttitudeDetermination, Status, begin
 from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_attitude import settings_of
 from tests.support.orbit_geometry import local_frame, suite
@@ -49,8 +49,16 @@ def frame_of(camera: WideCamera, seed: int) -> Image:
     return render(MODEL, scene, np.random.default_rng(seed))
 
 
+def observation_of(
+    camera: WideCamera, direction: FloatArray, covariance: FloatArray, reference: FloatArray
+) -> VectorObservation:
+    """Return a camera's direction (3,) and covariance (3, 3) rad^2 in body axes."""
+    to_camera = camera.to_camera
+    return VectorObservation(to_camera.T @ direction, reference, to_camera.T @ covariance @ to_camera)
+
+
 @pytest.fixture(scope="module")
-def sights() -> dict[str, Sight]:
+def sights() -> dict[str, VectorObservation]:
     """Three horizons and a Sun, as the finders measured them, in body axes."""
     found = {}
     knowledge = HorizonKnowledge(position=POSITION[0], sun=sun())
@@ -59,11 +67,11 @@ def sights() -> dict[str, Sight]:
         camera = UW.cameras[number]
         nadir = find_nadir(frame_of(camera, number), MODEL.lens, knowledge, finder_settings(MODEL)).nadir
         assert nadir is not None
-        found[camera.name] = camera_sight(camera.to_camera, nadir.direction, nadir.covariance, down)
+        found[camera.name] = observation_of(camera, nadir.direction, nadir.covariance, down)
     top = UW.cameras[3]
     seen = find_sun(ArrayPixels(frame_of(top, 3)), MODEL.lens, SunSettings()).sun
     assert seen is not None
-    found["sun"] = camera_sight(top.to_camera, seen.direction, seen.covariance, sun())
+    found["sun"] = observation_of(top, seen.direction, seen.covariance, sun())
     return found
 
 
@@ -72,7 +80,7 @@ def off(fix: AttitudeFix) -> FloatArray:
     return rotation_vector(multiply(attitude(), conjugate(fix.quaternion)))
 
 
-def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, Sight]) -> None:
+def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, VectorObservation]) -> None:
     """As far off as it says: the turn about the vertical is known by a Sun 24 deg off it, 2.5 times worse."""
     fix = begin(list(sights.values()))
     assert fix is not None
@@ -81,7 +89,9 @@ def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, Sight
     assert error @ np.linalg.solve(fix.covariance, error) < 16.3  # chi-square of 3, 99.9 %
 
 
-def test_the_filter_begins_from_the_frames_and_takes_the_next_ones_in(sights: dict[str, Sight]) -> None:
+def test_the_filter_begins_from_the_frames_and_takes_the_next_ones_in(
+    sights: dict[str, VectorObservation],
+) -> None:
     estimator = AttitudeDetermination(settings_of(UW))
     estimator.rate(0, np.zeros(3))
     for name, sight in sights.items():

@@ -1,0 +1,197 @@
+"""Sun, magnetic field, eclipse and orbit of a satellite, as plain functions of time and position.
+
+Times are `datetime` instants (UTC without a time zone). Positions and velocities are in ICRS axes from the
+Earth's centre, m and m/s, unless stated otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth import geomagnetism
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements, propagated
+from knightcube.astro.earth.orientation import julian_epoch, terrestrial_time
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT, Shadow, earth_from_sun, julian_date, sunlit_share
+from knightcube.errors import UsageError
+
+
+def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
+    """Return the geomagnetic field (3,) T, ICRS axes, at a position in orbit.
+
+    The model is the World Magnetic Model 2025 of degree 12. A call takes 0.2 ms.
+
+    Args:
+        time: instant, UTC without a time zone, in the years 2025 to 2030.
+        position: (3,) m from the Earth's centre, ICRS axes.
+
+    Raises:
+        GeomagneticError: outside the years of the model.
+    """
+    return geomagnetism.field(julian_date(time), np.asarray(position, dtype=float))
+
+
+def magnetic_field_on_ground(
+    time: datetime, *, latitude: float, longitude: float, height: float = 0.0
+) -> FloatArray:
+    """Return the geomagnetic field (3,) T, north, east and down, at geodetic coordinates.
+
+    Args:
+        time: instant, UTC without a time zone, in the years 2025 to 2030.
+        latitude: geodetic latitude, rad.
+        longitude: rad, positive towards the east.
+        height: m above the WGS 84 ellipsoid.
+
+    Raises:
+        GeomagneticError: outside the years of the model, or for an invalid position.
+    """
+    year = float(julian_epoch(julian_date(time)))
+    return geomagnetism.field_on_ground_axes(year, latitude, longitude, height)
+
+
+def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
+    """Return the apparent direction (3,) of the Sun, ICRS, and its distance, m, at a Julian date UTC.
+
+    The observer is at `position` (3,) m and moves with `velocity` (3,) m/s about the Earth. The parallax of a
+    low orbit is 9", the aberration by the Earth's motion 20.5" and by that of the satellite 5".
+    """
+    earth, earth_velocity = earth_from_sun(float(terrestrial_time(date)))
+    towards = -earth - position
+    distance = float(np.linalg.norm(towards))
+    apparent = towards / distance + (earth_velocity + velocity) / SPEED_OF_LIGHT
+    return np.asarray(apparent / np.linalg.norm(apparent)), distance
+
+
+def sun_direction(
+    time: datetime, position: ArrayLike = (0.0, 0.0, 0.0), velocity: ArrayLike = (0.0, 0.0, 0.0)
+) -> FloatArray:
+    """Return the apparent direction (3,) of the Sun, a unit vector in ICRS axes.
+
+    The Sun's position is that of VSOP2000. Parallax and aberration of the observer are included.
+
+    Args:
+        time: instant, UTC without a time zone.
+        position: (3,) m of the observer from the Earth's centre, ICRS axes.
+        velocity: (3,) m/s of the observer about the Earth's centre, ICRS axes.
+    """
+    observer, motion = (np.asarray(vector, dtype=float) for vector in (position, velocity))
+    return apparent_sun(julian_date(time), observer, motion)[0]
+
+
+def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conical") -> FloatArray:
+    """Return the visible fraction (...) of the Sun's disc: 1 in sunlight, 0 in the umbra of the Earth.
+
+    The Earth is a sphere of its equatorial radius without an atmosphere.
+
+    Args:
+        time: instant, UTC without a time zone.
+        position: (..., 3) m from the Earth's centre, ICRS axes.
+        shadow: "conical" includes the penumbra; "cylindrical" gives 0 or 1.
+
+    Raises:
+        ValueError: for another kind of shadow.
+    """
+    sun = -earth_from_sun(float(terrestrial_time(julian_date(time))))[0]
+    return sunlit_share(np.asarray(position, dtype=float), sun, shadow)
+
+
+def orbit_state(
+    *,
+    semi_major_axis: float,
+    eccentricity: float = 0.0,
+    inclination: float,
+    ascending_node: float = 0.0,
+    argument_of_perigee: float = 0.0,
+    true_anomaly: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Return position (3,) m and velocity (3,) m/s, ICRS axes, of osculating Kepler elements.
+
+    Args:
+        semi_major_axis: m.
+        eccentricity: 0 (circle) to below 1.
+        inclination: rad, against the equator of ICRS.
+        ascending_node: right ascension of the ascending node, rad.
+        argument_of_perigee: rad.
+        true_anomaly: rad.
+
+    Raises:
+        UsageError: for elements that are not finite or not those of an ellipse outside the Earth.
+    """
+    angles = (inclination, ascending_node, argument_of_perigee, true_anomaly)
+    if not all(map(math.isfinite, (semi_major_axis, eccentricity, *angles))):
+        raise UsageError("the elements of an orbit must be finite")
+    if not 0.0 <= eccentricity < 1.0:
+        raise UsageError(f"eccentricity is {eccentricity}: it must be 0 to below 1")
+    if semi_major_axis * (1.0 - eccentricity) <= EARTH_RADIUS:
+        raise UsageError(
+            f"the perigee lies {semi_major_axis * (1.0 - eccentricity):.0f} m from the Earth's centre:"
+            f" it must lie above {EARTH_RADIUS:.0f} m"
+        )
+    latus_rectum = semi_major_axis * (1.0 - eccentricity**2)
+    cosine, sine = math.cos(true_anomaly), math.sin(true_anomaly)
+    in_plane = latus_rectum / (1.0 + eccentricity * cosine) * np.array([cosine, sine])
+    speed = math.sqrt(GRAVITATIONAL_PARAMETER / latus_rectum)
+    motion = speed * np.array([-sine, eccentricity + cosine])
+    ci, si = math.cos(inclination), math.sin(inclination)
+    co, so = math.cos(ascending_node), math.sin(ascending_node)
+    cw, sw = math.cos(argument_of_perigee), math.sin(argument_of_perigee)
+    axes = np.array(
+        [
+            [co * cw - so * sw * ci, -co * sw - so * cw * ci],
+            [so * cw + co * sw * ci, -so * sw + co * cw * ci],
+            [sw * si, cw * si],
+        ]
+    )
+    return axes @ in_plane, axes @ motion
+
+
+def propagate_orbit(
+    position: ArrayLike, velocity: ArrayLike, seconds: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return positions (n, 3) m and velocities (n, 3) m/s at times after (or before) a given state.
+
+    The forces are those of a spherical Earth and its oblateness J2, integrated by the classical Runge-Kutta
+    method in steps of at most 30 s. The neglected drag and gravity move a satellite in low orbit by about a
+    kilometre in two revolutions.
+
+    Args:
+        position: (3,) m, ICRS axes.
+        velocity: (3,) m/s, ICRS axes.
+        seconds: (n,) s from the given state, in increasing or decreasing order.
+    """
+    state, elapsed, states = (
+        np.concatenate([np.asarray(position), np.asarray(velocity)]).astype(float),
+        0.0,
+        [],
+    )
+    for time in np.atleast_1d(np.asarray(seconds, dtype=float)).tolist():
+        state, elapsed = propagated(state, time - elapsed), time
+        states.append(state)
+    found = np.array(states).reshape(-1, 6)
+    return found[:, :3], found[:, 3:]
+
+
+def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> tuple[FloatArray, FloatArray]:
+    """Return positions (n, 3) m and velocities (n, 3) m/s, ICRS axes, of two-line elements at `times`.
+
+    The propagator is SGP4; its error is one to three kilometres near the epoch of the elements and grows by
+    about as much per day.
+
+    Args:
+        elements: the two lines of an element set.
+        times: instants, UTC without a time zone.
+
+    Raises:
+        UsageError: for lines that are no two-line element set or describe no orbit.
+        OrbitError: if SGP4 fails at one of the times, as for an orbit that has decayed.
+    """
+    satellite = TwoLineElements(*elements)
+    states = [satellite.at(julian_date(time)) for time in times]
+    position = np.array([state.position for state in states]).reshape(-1, 3)
+    return position, np.array([state.velocity for state in states]).reshape(-1, 3)

@@ -1,0 +1,140 @@
+"""Public functions of Sun, field, eclipse and orbit against independent computations."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+import erfa
+import numpy as np
+import pytest
+from sgp4.api import Satrec
+
+from knightcube.astro.almanac import (
+    apparent_sun,
+    magnetic_field,
+    magnetic_field_on_ground,
+    orbit_state,
+    propagate_elements,
+    propagate_orbit,
+    sun_direction,
+    sunlit_fraction,
+)
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.geomagnetism import GeomagneticError
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, terrestrial_time
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, julian_date
+from knightcube.errors import UsageError
+from sim_hal.worlds import sun
+
+TIME = datetime(2026, 11, 26, 12, 0, tzinfo=UTC)
+FIRST = "1 25544U 98067A   25320.50000000  .00010000  00000-0  18000-3 0  9990"
+SECOND = "2 25544  51.6400 200.0000 0005000 100.0000 260.0000 15.50000000539990"
+
+
+def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
+    """`sim_hal.worlds.sun` is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
+    for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
+        apparent, distance = apparent_sun(date, np.zeros(3), np.zeros(3))
+        almanac = sun.position(terrestrial_time(date))
+        assert (
+            np.degrees(np.linalg.norm(np.cross(apparent, almanac / np.linalg.norm(almanac)))) < 45.0 / 3600.0
+        )
+        assert distance == pytest.approx(float(np.linalg.norm(almanac)), rel=1e-4)
+    across = np.cross(apparent, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    leant, _ = apparent_sun(date, np.zeros(3), 7.6e3 * across)
+    assert (leant - apparent) @ across == pytest.approx(7.6e3 / 299_792_458.0, rel=1e-3)
+
+
+def test_the_suns_direction_is_that_of_the_almanac() -> None:
+    almanac = sun.position(terrestrial_time(julian_date(TIME)))
+    direction = sun_direction(TIME)
+    assert np.linalg.norm(direction) == pytest.approx(1.0, abs=1e-12)
+    assert direction @ almanac == pytest.approx(np.linalg.norm(almanac), rel=1e-7)
+    # An observer at right angles to the Sun, a thousandth of the distance away, sees the parallax.
+    across = np.cross(direction, [0.0, 0.0, 1.0])
+    moved = sun_direction(TIME, 1e-3 * ASTRONOMICAL_UNIT * across / np.linalg.norm(across))
+    assert np.linalg.norm(moved - direction) == pytest.approx(1e-3, rel=0.05)
+
+
+def test_the_field_in_orbit_and_on_the_ground_are_one_field() -> None:
+    latitude, longitude, height = 0.7, -1.2, 500e3
+    ground = magnetic_field_on_ground(TIME, latitude=latitude, longitude=longitude, height=height)
+    in_itrs = erfa.gd2gc(1, longitude, latitude, height)
+    orbit = magnetic_field(TIME, in_itrs @ celestial_to_terrestrial(julian_date(TIME)))
+    assert np.linalg.norm(orbit) == pytest.approx(np.linalg.norm(ground), rel=1e-9)
+    assert 2e-5 < np.linalg.norm(orbit) < 6e-5
+    with pytest.raises(GeomagneticError, match="2025"):
+        magnetic_field(datetime(2031, 1, 1, tzinfo=UTC), (7e6, 0.0, 0.0))
+
+
+def test_the_earth_hides_the_sun_behind_it_and_not_before_it() -> None:
+    towards = sun_direction(TIME)
+    side = np.cross(towards, [0.0, 0.0, 1.0])
+    side /= np.linalg.norm(side)
+    positions = 7e6 * np.array([towards, -towards, side])
+    np.testing.assert_array_equal(sunlit_fraction(TIME, positions), [1.0, 0.0, 1.0])
+    edge = np.sqrt(1.0 - (EARTH_RADIUS / 7e6) ** 2)
+    at_edge = 7e6 * (EARTH_RADIUS / 7e6 * side - edge * towards)
+    assert 0.2 < sunlit_fraction(TIME, at_edge) < 0.8
+    assert sunlit_fraction(TIME, at_edge, "cylindrical") in (0.0, 1.0)
+    with pytest.raises(ValueError, match="conical or cylindrical"):
+        sunlit_fraction(TIME, at_edge, "round")  # type: ignore[arg-type]
+
+
+def test_kepler_elements_give_energy_momentum_and_apsides() -> None:
+    elements = {
+        "semi_major_axis": 7e6, "eccentricity": 0.02, "inclination": 1.2, "ascending_node": 0.5,
+        "argument_of_perigee": 0.8,
+    }  # fmt: skip
+    position, velocity = orbit_state(**elements, true_anomaly=0.9)
+    energy = 0.5 * velocity @ velocity - GRAVITATIONAL_PARAMETER / np.linalg.norm(position)
+    assert energy == pytest.approx(-GRAVITATIONAL_PARAMETER / 14e6, rel=1e-12)
+    momentum = np.cross(position, velocity)
+    assert momentum[2] / np.linalg.norm(momentum) == pytest.approx(np.cos(1.2), rel=1e-12)
+    assert np.arctan2(momentum[0], -momentum[1]) == pytest.approx(0.5)
+    perigee, fastest = orbit_state(**elements)
+    assert np.linalg.norm(perigee) == pytest.approx(7e6 * 0.98)
+    assert perigee @ fastest == pytest.approx(0.0, abs=1.0)
+    assert perigee[2] == pytest.approx(7e6 * 0.98 * np.sin(0.8) * np.sin(1.2))
+    assert fastest[2] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"eccentricity": 1.0}, "eccentricity"),
+        ({"semi_major_axis": 6e6}, "perigee"),
+        ({"inclination": float("nan")}, "finite"),
+    ],
+)
+def test_elements_of_no_orbit_are_refused(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        orbit_state(**{"semi_major_axis": 7e6, "inclination": 1.0, **wrong})
+
+
+def test_a_propagated_orbit_precesses_by_the_oblateness_and_returns() -> None:
+    position, velocity = orbit_state(semi_major_axis=7e6, inclination=np.radians(98.0))
+    period = 2.0 * np.pi * np.sqrt(7e6**3 / GRAVITATIONAL_PARAMETER)
+    times = np.array([0.0, 10.0 * period])
+    positions, velocities = propagate_orbit(position, velocity, times)
+    np.testing.assert_array_equal(positions[0], position)
+    before, after = (np.cross(positions[k], velocities[k]) for k in range(2))
+    node = np.arctan2(after[0], -after[1]) - np.arctan2(before[0], -before[1])
+    precession = -1.5 * J2 * (EARTH_RADIUS / 7e6) ** 2 * np.cos(np.radians(98.0)) * 20.0 * np.pi
+    assert node == pytest.approx(precession, rel=0.01)
+    back, _ = propagate_orbit(positions[1], velocities[1], [-10.0 * period])
+    assert np.linalg.norm(back[0] - position) < 100.0
+
+
+def test_two_line_elements_are_those_of_sgp4() -> None:
+    times = [datetime(2025, 11, 16, 12, 0, tzinfo=UTC) + timedelta(minutes=20 * k) for k in range(3)]
+    positions, velocities = propagate_elements((FIRST, SECOND), times)
+    satellite = Satrec.twoline2rv(FIRST, SECOND)
+    for time, position, velocity in zip(times, positions, velocities, strict=True):
+        _, r, v = satellite.sgp4(julian_date(time), 0.0)
+        assert np.linalg.norm(position) == pytest.approx(1e3 * np.linalg.norm(r), rel=1e-7)
+        assert np.linalg.norm(velocity) == pytest.approx(1e3 * np.linalg.norm(v), rel=1e-7)
+        assert position @ velocity == pytest.approx(1e6 * np.dot(r, v), abs=1e5)
+    empty, _ = propagate_elements((FIRST, SECOND), [])
+    assert empty.shape == (0, 3)
