@@ -54,7 +54,7 @@ from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.settings import LikelihoodSettings
 
 BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodies.orbit.body:ORBIT"}
 

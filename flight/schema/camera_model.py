@@ -7,7 +7,7 @@ import math
 from flight.schema.devices import Camera
 from flight.schema.orbit_devices import WideCamera
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.settings import LikelihoodSettings
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:

@@ -24,10 +24,9 @@ from knightcube.vision.objects.detect import SpaceObject, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 
 LIKELIHOOD = "likelihood"
 

@@ -45,9 +45,8 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.startracker.two_ends import solve_ends
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 
 Found = StreakResult | MotionResult
 
@@ -162,7 +161,7 @@ def _found(job: FrameJob) -> FrameFound:
 def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
     """Import the two estimators and return them; a worker does so before its first job."""
     from knightcube.vision.streaks.corners.streak_rate import estimate_rate  # noqa: PLC0415
-    from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion  # noqa: PLC0415
+    from knightcube.vision.streaks.estimate import estimate_motion  # noqa: PLC0415
 
     return estimate_motion, estimate_rate
 

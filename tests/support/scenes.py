@@ -15,6 +15,13 @@ from sim_hal.star_camera import StarCameraModel, render
 FIELD = float(np.deg2rad(20.0))
 YEAR = 2026.5
 SAMPLES = 41
+EXPOSURES = (0.2, 1.0)
+"""Exposure times (s) of random slews."""
+MOST_TURN = 0.5
+"""Largest rotation of a random slew, as a fraction of the field."""
+LEAST_USABLE = 5
+"""Smallest number of usable stars in a random slew."""
+_MOST_SKIES = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +71,42 @@ def slew(
     rate = axis * fraction * camera.field_of_view / exposure
     middle = normalise(generator.normal(size=4))
     return exposed(camera, middle, rate, exposure, generator, limit)
+
+
+@dataclass(frozen=True, slots=True)
+class RandomSlew:
+    """A random motion of a campaign; its sky is drawn when it is exposed.
+
+    Attributes:
+        seed: of the campaign; `run` numbers the motion.
+        theta: deg, angle between the axis of rotation and the boresight.
+        percent: rotation over the exposure, % of the field.
+        exposure: s.
+    """
+
+    seed: int
+    run: int
+    theta: float
+    percent: float
+    exposure: float
+
+    @classmethod
+    def drawn(cls, seed: int, run: int) -> RandomSlew:
+        """Return motion number `run`; it does not depend on how many are drawn."""
+        draw = np.random.default_rng((seed, run, 0))
+        theta = float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi)))
+        percent = float(100.0 * draw.uniform(0.0, MOST_TURN))
+        return cls(seed, run, theta, percent, float(draw.choice(EXPOSURES)))
+
+    def exposed(self, camera: StarCameraModel) -> tuple[Scene, int]:
+        """Return the frame, and how many skies were drawn until one had enough usable stars."""
+        generator = np.random.default_rng((self.seed, self.run, 1))
+        theta, fraction = np.deg2rad(self.theta), self.percent / 100.0
+        for drawn in range(1, _MOST_SKIES + 1):
+            scene = slew(generator, float(theta), fraction, self.exposure, model=camera)
+            if len(usable(scene, camera)) >= LEAST_USABLE:
+                return scene, drawn
+        raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {self}")
 
 
 def exposed(

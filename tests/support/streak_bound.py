@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
+from knightcube.vision.streaks.geometry import Motion, paths, sensitivities
 
 # Parameters of one star's information: turn (3), point spread, then position (2), electrons, background.
 _SHARED = 4

@@ -33,8 +33,8 @@ from knightcube.vision.startracker.solve import (
     weighting_of,
 )
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.course import Course
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.

@@ -29,7 +29,7 @@ from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
 """Half size of an object's patch, in point spreads."""

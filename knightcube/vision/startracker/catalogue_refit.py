@@ -26,19 +26,22 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.streaks.maximum_likelihood.chains import apart, circles, close_by
-from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
-from knightcube.vision.streaks.maximum_likelihood.iteration import ExposedCamera
-from knightcube.vision.streaks.maximum_likelihood.joint_fit import joint_fit
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions
-from knightcube.vision.streaks.maximum_likelihood.normal_equations import light_of
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.result_of_fit import with_rate, with_stars
-from knightcube.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter
-from knightcube.vision.streaks.maximum_likelihood.wholeness import Wholeness
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.estimate import Wholeness, with_rate, with_stars
+from knightcube.vision.streaks.frame import ExposedFrame, expose_frame
+from knightcube.vision.streaks.geometry import (
+    Motion,
+    Scene,
+    Shutter,
+    apart,
+    circles,
+    close_by,
+    path_lengths,
+    positions,
+)
+from knightcube.vision.streaks.joint_fit import ExposedCamera, joint_fit
+from knightcube.vision.streaks.normal_equations import light_of
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
 # Reaches: streaks closer than this to a bright one overlap its pixels.
 _NEAR = 1.4

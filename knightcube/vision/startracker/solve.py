@@ -38,10 +38,9 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
 from knightcube.vision.startracker.verification import expected_stars, track
-from knightcube.vision.streaks.maximum_likelihood.course import Course
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 
 
 class SolveStatus(Enum):

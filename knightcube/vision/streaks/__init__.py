@@ -1,6 +1,10 @@
 """Star streaks in one long exposure: from the pixels to directions and the camera's rate.
 
-`maximum_likelihood` fits one rotation and all stars to all pixels; `corners` is the thesis's method (Sease
-2013, chapter 3): corner detectors find the streaks' ends. Both admit a frame by `admission` and return a
-`streak_result`. Everything is pure and picklable, for a worker process.
+The maximum-likelihood estimator fits one rotation and all stars to all pixels. In the order of the
+computation: `frame` (background, noise, regions), `first_guess` (axis and angle of the rotation),
+`faint_stars` (matched filter along the motion), `joint_fit` (motion and stars together, with
+`normal_equations` and `streak_model`), `uncertainty` (covariance) and `estimate`, which runs them all.
+`geometry` describes the paths of the stars. `corners` is the method of Sease (2013, chapter 3): corner
+detectors find the ends of the streaks. All functions are pure; their arguments and results can be pickled for
+a worker process.
 """

@@ -24,9 +24,8 @@ from knightcube.vision.startracker.solve import (
     solve_motion,
 )
 from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 

@@ -68,7 +68,7 @@ _IMPORTED = (
     "flight.app.flight",
     "flight.app.cli.run",
     "flight.loop.executive.worker",
-    "knightcube.vision.streaks.maximum_likelihood.estimate",
+    "knightcube.vision.streaks.estimate",
     "sim_hal.faults.host",
     "sim_hal.serving.remote",
 )

@@ -16,7 +16,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.quaternion import normalise
 from sim_hal.star_camera import StarCameraModel
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.scenes import turn_of
 from tests.studies.bench.streaks import estimated
 from tests.support.scenes import FIELD, Scene, exposed
 

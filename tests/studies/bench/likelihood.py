@@ -21,12 +21,12 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_motion
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.geometry import Motion, positions
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import render
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import (
+from tests.knightcube.vision.streaks.scenes import (
     CAMERA,
     SATURATION,
     Scene,

@@ -31,9 +31,9 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, solve_motion
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.bench.streaks import estimated, scenes
 from tests.studies.campaigns import streaks as campaign

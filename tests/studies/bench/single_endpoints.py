@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.geometry import Motion, paths, sensitivities
+from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel, render
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.scenes import turn_of
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
 from tests.studies.bench.streaks import estimated
 from tests.support.scenes import FIELD, noise_floor

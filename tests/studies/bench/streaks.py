@@ -31,9 +31,9 @@ from knightcube.vision.streaks.corners import streak_rate
 from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
 from knightcube.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.bench.stage_clock import REST, WHOLE, clocked
 from tests.studies.campaigns import streaks as campaign

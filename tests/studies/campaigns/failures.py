@@ -26,63 +26,45 @@ from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.vision.camera.lens import EXACT
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.support.scenes import FIELD, Scene, slew, usable
+from tests.support.scenes import EXPOSURES, FIELD, RandomSlew, Scene, usable
 
-EXPOSURES = (0.2, 1.0)
-MOST_TURN = 0.5
-LEAST_USABLE = 5
-SIGNIFICANCE = 8.0
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
 # Turns in percent of the field, upper edges: time and errors are given for each.
 TURNS = (5, 20, 35, 50)
-_MOST_SKIES = 1000
 _FREEDOM = 3
 
 
 def cases(runs: int, seed: int) -> list[Case]:
     """Return `runs` random motions; the sky is drawn when one is run."""
-    found = []
-    for run in range(runs):
-        draw = np.random.default_rng((seed, run, 0))
-        parameters = {
-            "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
-            "percent": float(100.0 * draw.uniform(0.0, MOST_TURN)),
-            "exposure": float(draw.choice(EXPOSURES)),
-        }
-        found.append(Case(str(run), (seed, run, 1), parameters))
-    return found
-
-
-def expose(case: Case, camera: StarCameraModel) -> tuple[Scene, int]:
-    """Return a case's frame, and how many skies were drawn until one had enough usable stars."""
-    generator = np.random.default_rng(case.seed)
-    theta, fraction = np.deg2rad(case.parameters["theta"]), case.parameters["percent"] / 100.0
-    for drawn in range(1, _MOST_SKIES + 1):
-        scene = slew(generator, float(theta), fraction, case.parameters["exposure"], model=camera)
-        if len(usable(scene, camera, SIGNIFICANCE)) >= LEAST_USABLE:
-            return scene, drawn
-    raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {case.parameters}")
+    slews = (RandomSlew.drawn(seed, run) for run in range(runs))
+    return [
+        Case(
+            str(slew.run),
+            (seed, slew.run, 1),
+            {"theta": slew.theta, "percent": slew.percent, "exposure": slew.exposure},
+        )
+        for slew in slews
+    ]
 
 
 def run(case: Case) -> Result:
     """Estimate one frame's motion and judge the answer."""
     camera = StarCameraModel(field_of_view=FIELD)
-    scene, drawn = expose(case, camera)
+    scene, drawn = RandomSlew(case.seed[0], case.seed[1], **case.parameters).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         begun = time.process_time()
         found = estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
         spent = time.process_time() - begun
-    good = usable(scene, camera, SIGNIFICANCE)
+    good = usable(scene, camera)
     true_length = float(np.median(_path_lengths(scene)[good]))
     return {
         **case.parameters,

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.scenes import turn_of
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.row_exposure import row_scene
 from tests.support.scenes import FIELD

@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.scenes import turn_of
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.row_exposure import RowScene, row_scene
 from tests.support.scenes import FIELD, noise_floor

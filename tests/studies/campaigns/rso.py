@@ -23,8 +23,8 @@ from knightcube.vision.objects.detect import ObjectReport, detect
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

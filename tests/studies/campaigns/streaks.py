@@ -21,8 +21,8 @@ from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.startracker.two_ends import attitudes_of_ends
 from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

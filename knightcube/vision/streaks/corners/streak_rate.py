@@ -14,12 +14,11 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import saturation_level
-from knightcube.vision.streaks.admission import admit, in_time, validate
 from knightcube.vision.streaks.corners.rate_fit import fit_rotation
 from knightcube.vision.streaks.corners.segmentation import Regions
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.corners.streaks import Streaks, measure_streaks, segment_frame
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus, admit, in_time, validate
 
 
 def estimate_rate(

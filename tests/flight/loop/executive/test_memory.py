@@ -18,9 +18,9 @@ sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(
 _WORKING = """
 import sys
 from knightcube.vision import frame_job
-before = "knightcube.vision.streaks.maximum_likelihood.estimate" in sys.modules
+before = "knightcube.vision.streaks.estimate" in sys.modules
 frame_job.prepare()
-sys.stdout.write(f"{before} {'knightcube.vision.streaks.maximum_likelihood.estimate' in sys.modules}")
+sys.stdout.write(f"{before} {'knightcube.vision.streaks.estimate' in sys.modules}")
 """
 _WORKERS = """
 import sys

@@ -38,8 +38,7 @@ from knightcube.vision.startracker.solve import (
     solve_places,
     weighting_of,
 )
-from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.sky import ARCSECONDS, photograph
 from tests.support.attitude_errors import attitude_error

@@ -10,10 +10,9 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import FlightError
-from knightcube.vision.streaks.admission import direction_of_time
 from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus, direction_of_time
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.vision.streaks.frames import (
     Camera,

@@ -26,9 +26,9 @@ from knightcube.vision.startracker.detection import (
     measure_near,
 )
 from knightcube.vision.startracker.detection.survey import Method
-from knightcube.vision.streaks.maximum_likelihood.motion import Motion
+from knightcube.vision.streaks.geometry import Motion
 from sim_hal.star_camera import StarCameraModel, render
-from tests.knightcube.vision.streaks.maximum_likelihood.scenes import real_sky
+from tests.knightcube.vision.streaks.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 from tests.studies.bench.centroids import compare, frame_of, matched, point_bound, star_places
 from tests.support.streak_bound import star_information

@@ -1,0 +1,245 @@
+"""Regions of light are connected as an independent labelling connects them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from knightcube.astro.arrays import Image
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.frame import (
+    Binning,
+    Blobs,
+    ExposedFrame,
+    expose_frame,
+    find_blobs,
+    seen_sigma,
+    without_glare,
+    without_mosaic,
+)
+from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.geometry import Scene as FittedScene
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
+from knightcube.vision.streaks.uncertainty import LeftOver, displaced_ends, displaced_sides
+from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky
+
+_SHAPE = (60, 90)
+_LEAST = 12
+
+
+def _frame(mask: np.ndarray) -> ExposedFrame:
+    """Return a frame whose 3 x 3 sums exceed the threshold where `mask` (rows, columns) says."""
+    light = np.where(mask, 100.0, 0.0).astype(np.float32).reshape(-1)
+    light += mask.reshape(-1) * np.arange(mask.size, dtype=np.float32) % 7
+    nothing = np.zeros(mask.size, dtype=np.bool_)
+    counts = np.zeros(mask.size, dtype=np.uint16)
+    return ExposedFrame(_SHAPE, light, light, np.ones_like(light), counts, 4095.0, nothing, 1.0, 0)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
+def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
+    """Eight-connected, at every density: sparse, near percolation, and all in one piece."""
+    rng = np.random.default_rng(5)
+    mask = np.zeros(_SHAPE, dtype=np.bool_)
+    mask[1:-1, 1:-1] = rng.random((_SHAPE[0] - 2, _SHAPE[1] - 2)) < share
+    labels, _ = ndimage.label(mask, structure=np.ones((3, 3), dtype=np.int64))
+    area = np.bincount(labels.reshape(-1))[1:]
+    frame = _frame(mask)
+    found = find_blobs(frame, 4.5, 10_000)
+    assert len(found) == np.count_nonzero(area >= _LEAST)
+    for region in range(len(found)):
+        mine = found.owner == region
+        theirs = labels[found.row[mine], found.column[mine]]
+        assert np.all(theirs == theirs[0])
+        assert np.count_nonzero(mine) == area[theirs[0] - 1]
+    assert np.all(np.diff(found.flux) <= 0.0)
+
+
+def test_a_frame_without_light_has_no_regions() -> None:
+    """None at all, and nothing is raised."""
+    assert len(find_blobs(_frame(np.zeros(_SHAPE, dtype=np.bool_)), 4.5, 48)) == 0
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "sigma", "size"),
+    [(1024, 768, 1.9, 1), (1024, 768, 3.0, 3), (1025, 768, 2.6, 1), (1280, 1024, 4.3, 4)],
+)
+def test_a_star_is_in_the_same_direction_in_small_and_large_pixels(
+    columns: int, rows: int, sigma: float, size: int
+) -> None:
+    full = Pinhole(columns, rows, 3000.0)
+    binning = Binning.suited(full, sigma)
+    assert binning.size == size
+    small = np.array([[0.0, 0.0], [100.25, 60.5]])
+    seen = MotionResult(StreakStatus.FAILED, 0, 1.0, stars=small)
+    there = binning.in_pixels(seen).stars
+    assert full.unit_vectors(there) == pytest.approx(binning.pinhole.unit_vectors(small), abs=1e-12)
+
+
+def test_sums_keep_light_and_what_is_saturated() -> None:
+    pixels = np.arange(64, dtype=np.uint16).reshape(8, 8) * np.uint16(16)
+    sums, top = Binning.suited(Pinhole(8, 8, 10.0), 2.0).frame(pixels, 1000.0)
+    assert sums.shape == (4, 4)
+    assert sums[0, 0] == 16 * (0 + 1 + 8 + 9)
+    # The last sum holds 1008, the one before it at most 976.
+    assert top == 4 * 1008
+    assert (sums >= top).sum() == 1
+    assert np.all(sums % 16 == 0)
+
+
+def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> None:
+    """Without binning such frames were refused. Chi-square of 3: 16.3 is exceeded once in a thousand."""
+    camera = replace(CAMERA, psf_sigma=3.0)
+    scene = real_sky(2, 1.0, 90.0, 0.5, camera)
+    settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=3.0)
+    found = estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
+    assert found.status is StreakStatus.RATE
+    assert found.rate is not None
+    assert found.covariance is not None
+    error = found.rate - scene.rate
+    assert error @ np.linalg.solve(found.covariance, error) < 16.3
+    assert np.linalg.norm(error) < 0.005 * np.linalg.norm(scene.rate)
+    assert found.psf_sigma == pytest.approx(3.0, rel=0.05)
+    assert found.length == pytest.approx(90.0, rel=0.3)
+    # The stars used are those of the sky, in pixels of the frame.
+    apart = np.linalg.norm(found.stars[found.used][:, None] - scene.stars, axis=2).min(axis=1)
+    assert np.median(apart) < 0.5
+
+
+def test_a_summed_row_takes_as_many_times_as_long_to_the_next_whether_it_is_stated_or_not() -> None:
+    binning = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0)
+    nobody, stated = LikelihoodSettings(), LikelihoodSettings(line_time=1e-5)
+    assert binning.settings(nobody).line_time_sigma == pytest.approx(3.0 * nobody.line_time_sigma)
+    assert binning.settings(nobody).shutter_unstated
+    assert binning.settings(stated).line_time == pytest.approx(3e-5)
+    assert binning.settings(stated).line_time_sigma == 0.0
+
+
+# Chi-square of 3 that chance exceeds once in a thousand.
+_HONEST = 16.3
+
+
+def _read(scene: Scene, pixels: Image | None = None) -> tuple[ExposedFrame, Blobs]:
+    frame = expose_frame(scene.pixels if pixels is None else pixels, SATURATION, 1.0)
+    return frame, find_blobs(frame, 4.5, 48)
+
+
+def _found(scene: Scene, pixels: Image | None = None, psf_sigma: float = 1.0) -> MotionResult:
+    settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0, psf_sigma=psf_sigma)
+    pixels = scene.pixels if pixels is None else pixels
+    return estimate_motion(pixels, CAMERA.pinhole, scene.exposure, settings, scene.rate, 0.0)
+
+
+def _nees(found: MotionResult, scene: Scene) -> float:
+    assert found.rate is not None, found.reason
+    assert found.covariance is not None
+    error = found.rate - scene.rate
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+@pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(("theta", "length"), [(1.2, 60.0), (0.03, 250.0)])
+def test_the_frame_shows_its_point_spread_also_along_bent_streaks(
+    sigma: float, theta: float, length: float
+) -> None:
+    scene = real_sky(2, theta, length, 1.0, replace(CAMERA, psf_sigma=sigma))
+    seen = seen_sigma(*_read(scene))
+    assert seen is not None
+    assert seen == pytest.approx(sigma, rel=0.2, abs=0.15)
+
+
+def test_without_regions_no_point_spread_is_seen() -> None:
+    dark = np.random.default_rng(1).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
+    frame = expose_frame(dark, SATURATION, 1.0)
+    assert seen_sigma(frame, find_blobs(frame, 4.5, 48)) is None
+
+
+@pytest.mark.parametrize(("true", "described"), [(1.0, 2.0), (2.0, 1.0), (3.0, 1.0)])
+def test_a_gaussian_of_another_width_than_described_gives_a_rate_within_its_claim(
+    true: float, described: float
+) -> None:
+    """All of these were refused when only the widths were compared."""
+    scene = real_sky(12, np.radians(70.0), 80.0, 1.0, replace(CAMERA, psf_sigma=true))
+    found = _found(scene, psf_sigma=described)
+    assert _nees(found, scene) < _HONEST
+    assert found.psf_sigma == pytest.approx(true, rel=0.1)
+
+
+def _left(residual: float, noise: float, shift: str) -> tuple[LeftOver, FittedScene]:
+    """Return what ends, or sides, displaced by `residual` px leave over on blocks of pixels, and `noise`."""
+    rng = np.random.default_rng(3)
+    images = np.zeros((40, 7, 10, 9), dtype=np.float32)
+    ends, sides = slice(0, 20), slice(20, 40)
+    images[ends, 3] = rng.uniform(0.1, 0.4, (20, 10, 9))
+    images[sides, 1] = rng.uniform(-0.4, 0.4, (20, 10, 9))
+    change = 500.0 * (images[:, 3] if shift == "ends" else images[:, 1])
+    left = residual * change + rng.normal(0.0, 20.0 * noise, change.shape)
+    weight = np.full(change.shape, 20.0**-2, dtype=np.float32)
+    everyone = np.ones(1, dtype=np.bool_)
+    scene = FittedScene(
+        Motion.steady(np.zeros(3)), 1.04, np.zeros((1, 2)), np.array([500.0]), np.zeros(1), everyone
+    )
+    star, time = np.zeros(40, dtype=np.int64), np.zeros((40, 10))
+    return LeftOver(star, time, images, weight, left.astype(np.float32)), scene
+
+
+@pytest.mark.parametrize(("shift", "measured"), [("ends", displaced_ends), ("sides", displaced_sides)])
+def test_what_is_left_over_is_measured_as_a_displacement(shift: str, measured: object) -> None:
+    assert callable(measured)
+    displaced = measured(*_left(0.5, 1.0, shift))
+    assert displaced.shown == pytest.approx(0.5, rel=0.1)
+    assert displaced.chance >= displaced.shown
+    by_chance = measured(*_left(0.0, 1.0, shift))
+    assert by_chance.shown == 0.0
+    assert 0.0 < by_chance.chance < 0.15
+
+
+def test_streaks_without_ends_in_the_frame_show_no_displacement_of_theirs() -> None:
+    left, scene = _left(0.5, 1.0, "sides")
+    left.images[:, 3] = 0.0
+    assert displaced_ends(left, scene) is None
+
+
+def test_a_bright_limb_is_left_out_and_the_stars_beside_it_give_the_rate() -> None:
+    scene = real_sky(12, np.radians(70.0), 80.0, 0.2)
+    y, x = np.indices(scene.pixels.shape)
+    limb = 3000.0 / (1.0 + np.exp(np.clip((np.hypot(x - 512.0, y - 3412.0) - 2600.0) / 4.0, -50.0, 50.0)))
+    noisy = np.random.default_rng(5).poisson(limb)
+    pixels = np.clip(scene.pixels + noisy, 0, SATURATION).astype(np.uint16)
+    frame, blobs = _read(scene, pixels)
+    clear = without_glare(frame, blobs)
+    assert clear is not None
+    bad = clear.bad.reshape(clear.shape)
+    edge = int(3412.0 - 2600.0)
+    assert bad[edge - 4 : edge + 4, 500:524].all()
+    assert bad[: edge - 60].mean() < 0.02
+    assert without_glare(*_read(scene)) is None
+    assert _nees(_found(scene, pixels), scene) < _HONEST
+
+
+def test_a_colour_mosaic_is_evened_out_and_one_colour_is_left_as_it_is() -> None:
+    scene = real_sky(12, np.radians(70.0), 30.0, 1.0)
+    mosaic = np.tile(np.array([[1.0, 0.6], [0.5, 1.0]]), (512, 512))
+    dark = float(np.median(scene.pixels))
+    pixels = (dark + mosaic * (scene.pixels - dark)).clip(0.0).astype(np.uint16)
+    frame, blobs = _read(scene, pixels)
+    even = without_mosaic(frame, blobs)
+    assert even is not None
+    ratio = (frame.signal / np.where(even.signal == 0.0, 1.0, even.signal)).reshape(even.shape)[:2, :2]
+    assert ratio == pytest.approx(mosaic[:2, :2] / 0.775, rel=0.03)
+    assert without_mosaic(*_read(scene)) is None
+    assert _nees(_found(scene, pixels), scene) < _HONEST
+
+
+def test_a_frame_that_clips_below_what_the_camera_says_is_read_as_clipped() -> None:
+    scene = real_sky(12, np.radians(70.0), 30.0, 1.0)
+    pixels = np.minimum(scene.pixels, 600)
+    assert np.count_nonzero(pixels == 600) > 50
+    found = _found(scene, pixels)
+    assert _nees(found, scene) < _HONEST
+    assert found.misfit < 1.5

@@ -1,0 +1,55 @@
+"""A lens a little other than described: places through it and back, and how stars move in its picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.streaks.geometry import BentPinhole, Motion, paths, positions, sensitivities
+
+_LENS = BentPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
+_MOTION = Motion(np.array([0.03, 0.05, 0.1]), np.array([0.003, -0.002, 0.01]))
+_RNG = np.random.default_rng(1)
+_STARS, _TIME = _RNG.uniform(50.0, 970.0, (20, 2)), _RNG.uniform(-0.5, 0.5, 20)
+
+
+def test_a_corner_is_displaced_by_its_share_the_axis_by_the_shift_and_back() -> None:
+    corner = np.array([[0.0, 0.0]])
+    lens = BentPinhole(1024, 1024, 2903.0, (0.0, 0.0), 0.0, 0.01)
+    assert lens.bent(corner)[0] == pytest.approx([-5.115, -5.115])
+    assert _LENS.bent(np.array([_LENS.centre]))[0] == pytest.approx([514.5, 509.5])
+    assert _LENS.straight(_LENS.bent(_STARS)) == pytest.approx(_STARS, abs=1e-6)
+
+
+def test_a_star_is_named_by_its_pixel_in_the_lens_picture() -> None:
+    assert positions(_LENS, _MOTION, _STARS, np.zeros(20)) == pytest.approx(_STARS, abs=1e-6)
+
+
+def test_velocity_and_acceleration_are_those_of_the_places() -> None:
+    step = 1e-4
+    drawn = paths(_LENS, _MOTION, _STARS, _TIME)
+    before, after = (paths(_LENS, _MOTION, _STARS, _TIME + way * step) for way in (-1.0, 1.0))
+    assert drawn.position == pytest.approx(positions(_LENS, _MOTION, _STARS, _TIME))
+    velocity = (after.position - before.position) / (2.0 * step)
+    acceleration = (after.velocity - before.velocity) / (2.0 * step)
+    assert drawn.velocity == pytest.approx(velocity, abs=1e-3)
+    assert drawn.acceleration == pytest.approx(acceleration, abs=1e-3)
+
+
+@pytest.mark.parametrize("parameter", range(8))
+def test_sensitivities_are_those_of_the_places(parameter: int) -> None:
+    """Growth is exact to the second order of the angle: a part in a thousand here."""
+    change = np.zeros(8)
+    change[parameter] = 1e-5 if parameter < 6 else 1e-2
+
+    def moved(way: float) -> FloatArray:
+        by = way * change
+        motion = replace(_MOTION, turn=_MOTION.turn + by[:3], growth=_MOTION.growth + by[3:6])
+        return positions(_LENS, motion, _STARS + by[6:], _TIME)
+
+    expected = (moved(1.0) - moved(-1.0)) / (2.0 * change[parameter])
+    found = sensitivities(_LENS, _MOTION, _STARS, _TIME)[:, :, parameter]
+    assert found == pytest.approx(expected, abs=1e-3 * float(np.abs(expected).max()))

@@ -1,0 +1,120 @@
+"""Where streaks do not end where a motion says, it is measured by how much, and the motion mended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.vision.streaks import joint_fit
+from knightcube.vision.streaks.frame import expose_frame
+from knightcube.vision.streaks.geometry import Motion, Scene, Shutter, positions
+from knightcube.vision.streaks.joint_fit import ExposedCamera, find_edges, stretched
+from knightcube.vision.streaks.normal_equations import window_areas
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
+
+_STARS = 16
+
+
+def _seen(theta: float, length: float, turned: float) -> tuple[ExposedCamera, Scene, Motion]:
+    """Return a frame, its brightest stars under `turned` times the true motion, and that motion."""
+    sky = real_sky(21, np.radians(theta), length, 0.2)
+    frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    order = np.argsort(-sky.electrons, kind="stable")[:_STARS]
+    true = Motion.steady(sky.rate * sky.exposure)
+    motion = Motion.steady(turned * true.turn)
+    light, everyone = sky.electrons[order] / CAMERA.gain, np.ones(_STARS, dtype=np.bool_)
+    return camera, Scene(motion, 1.04, sky.stars[order], light, np.zeros(_STARS), everyone), true
+
+
+@pytest.mark.parametrize(("theta", "length"), [(90.0, 120.0), (60.0, 300.0), (20.0, 300.0)])
+def test_streaks_of_the_true_motion_end_where_it_says(theta: float, length: float) -> None:
+    camera, scene, _ = _seen(theta, length, 1.0)
+    edges = find_edges(camera, scene)
+    assert np.count_nonzero(np.isfinite(edges.beyond)) >= 8
+    assert float(np.nanmedian(np.abs(edges.beyond))) < 2.0
+    assert stretched(camera, scene) is None
+
+
+@pytest.mark.parametrize("turned", [0.96, 1.04])
+@pytest.mark.parametrize(("theta", "length"), [(90.0, 200.0), (60.0, 300.0)])
+def test_a_motion_of_the_wrong_length_is_stretched_to_the_right_one(
+    theta: float, length: float, turned: float
+) -> None:
+    camera, scene, true = _seen(theta, length, turned)
+    mended = stretched(camera, scene)
+    assert mended is not None
+    assert np.linalg.norm(mended.motion.turn - true.turn) < 0.006 * np.linalg.norm(true.turn)
+    assert stretched(camera, mended) is None
+
+
+def test_stars_of_which_one_end_was_right_are_put_back_between_their_ends() -> None:
+    """A turn 4 % too long, each star's beginning where it should be: its middle is 6 px ahead."""
+    camera, scene, true = _seen(90.0, 300.0, 1.0)
+    ahead = positions(camera.pinhole, true, scene.stars, np.full(_STARS, 0.02))
+    off = replace(scene, motion=Motion.steady(1.04 * true.turn), stars=ahead)
+    assert float(np.median(np.linalg.norm(ahead - scene.stars, axis=1))) > 5.0
+    mended = stretched(camera, off)
+    assert mended is not None
+    assert float(np.median(np.linalg.norm(mended.stars - scene.stars, axis=1))) < 1.5
+
+
+_CROWD = 40
+_TRUSTED = 12
+_ROOM = 20
+
+
+def _taken(theta: float, length: float) -> tuple[ExposedCamera, Scene]:
+    """Return a frame and its brightest stars as they are, the first of them with a say."""
+    sky = real_sky(7, np.radians(theta), length, 1.0)
+    frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    order = np.argsort(-sky.electrons, kind="stable")[:_CROWD]
+    width = float(np.sqrt(CAMERA.psf_sigma**2 + 1.0 / 12.0))
+    trusted = np.arange(len(order)) < _TRUSTED
+    motion = Motion.steady(sky.rate * sky.exposure)
+    light = sky.electrons[order] / CAMERA.gain
+    return camera, Scene(motion, width, sky.stars[order], light, np.zeros(len(order)), trusted)
+
+
+@pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (60.0, 400.0), (30.0, 400.0), (3.0, 250.0)])
+def test_the_pixels_about_streaks_are_foreseen(theta: float, length: float) -> None:
+    """Within a third: straight, oblique, bent and leaving the frame."""
+    camera, scene = _taken(theta, length)
+    windows = camera.windows(scene)
+    taken = windows.strips.index.size + windows.patches.index.size
+    foreseen = float(window_areas(camera.pinhole, scene, camera.settings.reach).sum())
+    assert 0.67 * taken < foreseen < 1.5 * taken
+
+
+def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In whatever order they come: the faintest are taken out, and the rate is as true as it claims."""
+    camera, scene = _taken(60.0, 300.0)
+    room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
+    monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)
+    done = joint_fit.joint_fit(camera, scene.select(np.arange(len(scene.light))[::-1]))
+    assert done is not None
+    assert len(done.scene.light) == _ROOM
+    apart = np.linalg.norm(done.scene.stars[:, None] - scene.stars[:_ROOM], axis=2).min(axis=0)
+    assert np.median(apart) < 1.0
+    error = (done.scene.motion.turn - scene.motion.turn)[:3]
+    assert error @ np.linalg.solve(done.solution.covariance[:3, :3], error) < 25.0
+
+
+def test_stars_with_a_say_are_fitted_whatever_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However little room there is."""
+    camera, scene = _taken(60.0, 300.0)
+    monkeypatch.setattr(joint_fit, "_MOST_PIXELS", 1.0)
+    done = joint_fit.joint_fit(camera, scene)
+    assert done is not None
+    assert len(done.scene.light) == _TRUSTED
+
+
+def test_a_fit_whose_point_spread_outgrows_the_first_is_none() -> None:
+    """Stars twice as wide as the fit set out with are not those it was given."""
+    camera, scene = _taken(60.0, 300.0)
+    assert joint_fit.joint_fit(camera, scene) is not None
+    assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None

@@ -1,0 +1,39 @@
+"""Whether stars contradict each other, by draws of what they would say under noise alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.vision.streaks.normal_equations import OwnEquations, contradiction
+
+_STARS = 400
+_KEPT = np.array([0, 1, 2, 6])
+
+
+def _drawn(noise: float, blind: bool = False) -> OwnEquations:
+    """Return what stars of very unequal light say whose scores scatter by `noise` times their own noise.
+
+    A star that is `blind` knows nothing of two directions of its own.
+    """
+    rng = np.random.default_rng(3)
+    change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))
+    change *= np.array([1e3, 1e3, 1e3, 1.0])[:, None]
+    if blind:
+        change = change[:, :, :2]
+    step = np.array([1e-3, -2e-3, 0.0, 0.1])
+    information = change @ change.swapaxes(1, 2)
+    drawn = noise * rng.normal(size=(_STARS, change.shape[2], 1))
+    return OwnEquations(_KEPT, information, information @ step + (change @ drawn)[..., 0])
+
+
+@pytest.mark.parametrize("blind", [False, True])
+@pytest.mark.parametrize("noise", [1.0, 3.0])
+def test_a_chi_square_of_a_degree_of_freedom(noise: float, blind: bool) -> None:
+    """In whatever units the parameters are, and whatever a star knows nothing of."""
+    assert contradiction(_drawn(noise, blind)) == pytest.approx(noise**2, rel=0.1)
+
+
+def test_one_star_contradicts_nobody() -> None:
+    many = _drawn(3.0)
+    assert contradiction(OwnEquations(_KEPT, many.information[:1], many.score[:1])) == 1.0

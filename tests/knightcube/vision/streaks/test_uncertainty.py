@@ -1,0 +1,176 @@
+"""What a fit claims: errors of the lens as turns, and their correction by the stars themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import from_rotation_vector, multiply
+from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
+from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.streaks.frame import expose_frame
+from knightcube.vision.streaks.geometry import Motion, Scene, Shutter, sensitivities
+from knightcube.vision.streaks.joint_fit import ExposedCamera, bared_fit
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.uncertainty import correct, seeming_turns
+from sim_hal.star_camera import StarCameraModel, render
+from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of
+from tests.support.scenes import FIELD, RandomSlew
+
+_TURN = np.array([0.02, 0.03, 0.0])
+
+
+def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
+    """Return each star's seeming turns (n, 3, m), and its information (n, 3, 3) when ends alone count."""
+    x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
+    stars = np.stack([x.ravel(), y.ravel()], axis=1)
+    ones = np.ones(len(stars))
+    scene = Scene(Motion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
+    frame = expose_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge), 1.0)
+    half = np.full(len(stars), 0.5)
+    opening = (
+        sensitivities(CAMERA.pinhole, scene.motion, stars, half)
+        - sensitivities(CAMERA.pinhole, scene.motion, stars, -half)
+    )[:, :, :3]
+    return seeming_turns(camera, scene, 0.2), opening.swapaxes(1, 2) @ opening
+
+
+def _together(seeming: FloatArray, information: FloatArray) -> FloatArray:
+    """Return what all stars together take errors for, (3, m)."""
+    return np.asarray(np.linalg.solve(information.sum(axis=0), np.sum(information @ seeming, axis=0)))
+
+
+def test_an_exact_camera_has_no_errors() -> None:
+    assert _seeming(EXACT)[0].shape == (25, 3, 0)
+
+
+def test_a_wrong_axis_seems_to_be_a_turned_camera() -> None:
+    """A shift by dx is to first order a rotation by dx / f about y, which turns the rate with it.
+
+    Of that only one of the two components of the motion asks: the flow of the second order, which the shift
+    changes as well, takes back that of the other. Of stars on a square that counts for half.
+    """
+    focal = CAMERA.pinhole.focal_length
+    found = _together(*_seeming(replace(EXACT, centre=5.0)))
+    about_y, about_x = np.array([0.0, 5.0 / focal, 0.0]), np.array([-5.0 / focal, 0.0, 0.0])
+    expected = 0.5 * np.stack([np.cross(about_y, _TURN), np.cross(about_x, _TURN)], axis=1)
+    assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
+
+
+def test_a_wrong_focal_length_seems_to_be_another_rate_and_a_wrong_line_time_too() -> None:
+    """Across the boresight a rate is a length over the focal length; rows make it longer by their delay."""
+    found = _together(*_seeming(replace(EXACT, focal_length=0.01)))
+    assert found[:, 0] == pytest.approx(0.01 * _TURN, abs=0.1 * 0.01 * float(np.linalg.norm(_TURN)))
+    late = _together(*_seeming(replace(EXACT, line_time=1e-5)))
+    rows_crossed = CAMERA.pinhole.focal_length * _TURN[0] / 0.2 * 1e-5
+    assert abs(late[:, 0] @ _TURN) / (_TURN @ _TURN) == pytest.approx(rows_crossed, rel=0.1)
+
+
+def test_an_untold_shutter_seems_to_be_more_of_the_same_turn_to_each_star() -> None:
+    """It lengthens paths and bends them no more: long ones about a near axis show their curvature well."""
+    turn = np.array([0.07, 0.05, -0.05])
+    late, _ = _seeming(replace(EXACT, line_time=1e-5), turn)
+    size = float(np.linalg.norm(turn))
+    along = late[:, :, 0] @ turn / size
+    assert np.linalg.norm(late[:, :, 0] - along[:, None] * turn / size) < 0.05 * np.linalg.norm(along)
+
+
+def test_a_shutter_that_nobody_describes_may_roll_and_one_that_is_described_may_not() -> None:
+    assert LikelihoodSettings().line_time_sigma == UNSTATED
+    assert LikelihoodSettings(line_time=0.0).line_time_sigma == 0.0
+    assert LikelihoodSettings(line_time=2e-5).line_time_sigma == 0.0
+    assert LikelihoodSettings().shutter_unstated
+    assert not LikelihoodSettings(line_time=0.0).shutter_unstated
+    assert not LikelihoodSettings(knowledge=EXACT).shutter_unstated
+    known = replace(CameraKnowledge(), line_time=3e-6)
+    assert LikelihoodSettings(line_time=2e-5, knowledge=known).line_time_sigma == 3e-6
+
+
+def test_stars_that_show_the_cameras_error_correct_it_and_others_widen_the_covariance() -> None:
+    """Distortion of 1 % is seen a hundred times beyond the noise; one of chance is left alone."""
+    seeming, information = _seeming(replace(EXACT, distortion=0.01))
+    precise = 1e4 * information
+    score = np.einsum("nij,njk->ni", precise, seeming)
+    mean = np.linalg.solve(precise.sum(axis=0), score.sum(axis=0))
+    done = correct(precise, score - np.einsum("nij,j->ni", precise, mean), seeming, 1.0, 1)
+    assert done is not None
+    assert done.step == pytest.approx(-mean, rel=0.05)
+    assert np.abs(done.score).max() < 0.05 * np.abs(score).max()
+    vague = 1e-6 * information
+    done = correct(vague, np.zeros((25, 3)), seeming, 1.0, 1)
+    assert done is not None
+    assert not done.step.any()
+    assert np.trace(done.added) == pytest.approx(float(mean @ mean), rel=0.05)
+
+
+def test_what_is_not_known_of_the_camera_widens_the_claim_and_leaves_the_rate() -> None:
+    scene = real_sky(12, np.radians(70.0), 102.0, 0.2)
+
+    def found(**more: object) -> tuple[FloatArray, FloatArray]:
+        settings = LikelihoodSettings(saturation=SATURATION, **more)  # type: ignore[arg-type]  # of settings
+        result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
+        assert result.rate is not None
+        assert result.covariance is not None
+        return result.rate, result.covariance
+
+    rate, exact = found(knowledge=EXACT)
+    same, usual = found()
+    assert same == pytest.approx(rate)
+    assert np.all(np.linalg.eigvalsh(usual - exact) > -1e-18)
+    assert np.trace(usual) > 1.5 * np.trace(exact)
+    _, doubted = found(knowledge=EXACT, psf_sigma=0.95, worst_doubt=0.1)
+    assert np.trace(doubted) > 10.0 * np.trace(exact)
+
+
+def test_short_streaks_of_another_point_spread_are_refused_with_a_reason() -> None:
+    scene = real_sky(12, np.radians(70.0), 12.0, 0.2, replace(CAMERA, psf_sigma=1.5))
+    settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
+    result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
+    assert result.rate is None
+    assert "point spread, 1.4" in result.reason
+
+
+def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
+    turn = turn_of(np.radians(60.0), 90.0, 0.3)
+    middle = np.array([0.0, 0.0, 0.0, 1.0])
+    stars = CAMERA.pinhole.unit_vectors(np.array([[300.0, 350.0], [700.0, 560.0]]))
+    times = np.array([-0.5, 0.0, 0.5])
+    attitudes = multiply(from_rotation_vector(times[:, None] * turn), middle)
+    rng = np.random.default_rng(4)
+    pixels = render(CAMERA, stars, np.array([2.0, 3.0]), 0.2 * (times + 0.5), attitudes, rng)
+    settings = LikelihoodSettings(saturation=SATURATION, knowledge=EXACT)
+    found = estimate_motion(pixels, CAMERA.pinhole, 0.2, settings, turn / 0.2, 0.0)
+    assert found.used_count == 2
+    assert found.rate is not None
+    assert found.covariance is not None
+    error = found.rate - turn / 0.2
+    assert error @ np.linalg.solve(found.covariance, error) < 16.3
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(turn / 0.2)
+
+
+def test_what_is_hidden_in_streaks_does_not_move_their_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Crowded frames of `failures`: the brightest streaks, fitted with all on their pixels, know more."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    settings = LikelihoodSettings(saturation=SATURATION, gain=camera.gain, knowledge=EXACT)
+    errors = []
+    for run in (21, 67, 96):
+        scene, _ = RandomSlew.drawn(1999, run).exposed(camera)
+        for bared in (bared_fit, lambda *_: None):
+            with monkeypatch.context() as patch:
+                patch.setattr("knightcube.vision.streaks.uncertainty.bared_fit", bared)
+                found = estimate_motion(
+                    scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0
+                )
+            assert found.rate is not None
+            assert found.covariance is not None
+            error = found.rate - scene.rate
+            size = np.linalg.norm(error) / np.linalg.norm(scene.rate)
+            errors.append([size, error @ np.linalg.solve(found.covariance, error)])
+    after, before = np.array(errors[::2]), np.array(errors[1::2])
+    assert after[:, 0].mean() < 0.5 * before[:, 0].mean()
+    assert after[:, 1].max() < chi2.isf(1e-3, 3)
