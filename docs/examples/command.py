@@ -12,8 +12,7 @@ from flight.link.commands.codec import CommandPacker, Note
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import to_text
 from ground.commands.command import exchange
-from ground.telemetry.reader import read_run
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode, read_run
 
 CONFIG = Path("config/step_demo.yaml")
 

@@ -9,7 +9,7 @@ from flight.link.telemetry.definitions import THERMAL
 from flight.link.telemetry.log import FlightLog, Recorder
 from ground.documentation import markdown
 from ground.export import export
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from sim_hal.clock import SimClock
 
 

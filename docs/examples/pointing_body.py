@@ -37,7 +37,7 @@ from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.estimate import Estimate

@@ -27,7 +27,7 @@ from ground.documentation import meaning_of
 from ground.link.commanding import change_key, obeyed
 from ground.link.commanding import command as send
 from ground.link.options import add_link_options, terminal_of
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from ground.export import FORMATS
 from ground.export import export as export_packets
 from ground.export.tracking_data import write_tracking_data
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

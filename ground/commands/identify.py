@@ -17,7 +17,7 @@ from flight.schema.carried import config_path
 from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, write_new
 from ground.identification.constants import NAMES, UNITS, Constants
-from ground.identification.fit import Fit, fit
+from ground.identification.fit import PlantFit, fit
 from ground.identification.fragment import fragment
 from ground.identification.preparation import (
     DURATION,
@@ -29,7 +29,7 @@ from ground.identification.preparation import (
 )
 from ground.identification.record import Record, read_record
 from ground.identification.scale import AbsolutePlant, absolute
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
 _ABSOLUTE_UNITS = {
@@ -49,7 +49,7 @@ class _Identified:
     folder: Path
     config: TestbedConfig
     record: Record
-    found: Fit
+    found: PlantFit
     plant: AbsolutePlant
 
     @property
@@ -205,7 +205,7 @@ def _text(made: _Identified) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _motion_line(name: str, found: Fit, before: Constants) -> str:
+def _motion_line(name: str, found: PlantFit, before: Constants) -> str:
     value, sigma = getattr(found.constants, name), found.sigma(name)
     found_text = f"{value:+12.5e} +- {sigma:.1e} {UNITS[name]}"
     return f"  {name + ':':18s}{found_text}, configured {getattr(before, name):.4g}"
@@ -221,7 +221,7 @@ def _field_line(made: _Identified) -> str:
     )
 
 
-def _noise_line(found: Fit) -> str:
+def _noise_line(found: PlantFit) -> str:
     noise, test = found.noise, found.whiteness
     verdict = (
         "innovations are white"

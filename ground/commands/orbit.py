@@ -11,7 +11,7 @@ import numpy as np
 
 from ground.export.orbit_message import write_orbit_messages
 from ground.orbits.from_run import ObjectOrbit, orbits_of
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 
 _PLACE, _SPEED = slice(0, 3), slice(3, 6)
 

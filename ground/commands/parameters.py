@@ -23,7 +23,7 @@ from flight.schema.document import read_document, read_text, to_yaml
 from ground.commands.command import exchange
 from ground.link.options import add_link_options, terminal_of
 from ground.link.terminal import report_of
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from knightcube.errors import FlightError, UsageError
 
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name in {"table", "kept"}}

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from flight.link.telemetry.archive import find_runs
 from ground import report as reporting
-from ground.report.archive import format_archive, summarise_archive
-from ground.report.comparison import compare, format_comparison
-from ground.telemetry.reader import read_run
+from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
+from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
 

@@ -17,7 +17,7 @@ from flight.link.telemetry.parameters import FIELDS as PARAMETERS
 from flight.link.telemetry.parameters import crc_of
 from ground.commands.command import exchange
 from ground.console.instant import values
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from knightcube.errors import FlightError, UsageError
 
 Object = dict[str, Any]

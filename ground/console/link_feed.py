@@ -17,7 +17,7 @@ from flight.link.telemetry.packets import PacketArray
 from ground.console.commanding import Object
 from ground.link.commanding import obeyed
 from ground.link.terminal import Terminal, report_of
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from knightcube.errors import FlightError
 
 _LISTEN_S = 0.02

@@ -10,7 +10,7 @@ from pathlib import Path
 from ground.export.csv_files import write_csv
 from ground.export.database import write_database
 from ground.export.parquet import write_parquet
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.errors import UsageError
 
 FORMATS = {"csv": "csv", "parquet": "parquet", "sqlite": "run.sqlite"}

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import csv
 from pathlib import Path
 
 from ground.export.columns import tables
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 
 
 def write_csv(run: Run, folder: Path) -> list[Path]:

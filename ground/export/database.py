@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ground.export.columns import Column, tables
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 
 _TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}
 _LARGEST = (1 << 63) - 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ground.export.columns import tables
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.errors import UsageError
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 

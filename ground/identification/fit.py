@@ -57,7 +57,7 @@ class Whiteness:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class PlantFit:
     """The constants, `covariance` (6, 6) in their order, the noise found, the innovations and their test."""
 
     constants: Constants
@@ -72,7 +72,7 @@ class Fit:
         return math.sqrt(float(self.covariance[index, index]))
 
 
-def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | None = None) -> Fit:
+def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | None = None) -> PlantFit:
     """Fit the constants to `record`; `noise` is its assumed noise.
 
     `progress` is called with the number of each round and its step in standard deviations. Raises
@@ -87,7 +87,7 @@ def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | N
         raise IdentificationError("no constants explain this flight: their prediction runs away") from error
 
 
-def _fitted(record: Record, noise: Noise, progress: Callable[[int, float], None] | None) -> Fit:
+def _fitted(record: Record, noise: Noise, progress: Callable[[int, float], None] | None) -> PlantFit:
     constants, believed, share, before = first_guess(record), noise, 1.0, np.zeros(len(NAMES))
     restarts: frozenset[int] = frozenset()
     gates = list(_GATES)
@@ -152,14 +152,14 @@ def _gone_over(
     return passed.restarts
 
 
-def _finished(record: Record, constants: Constants, noise: Noise, restarts: frozenset[int]) -> Fit:
+def _finished(record: Record, constants: Constants, noise: Noise, restarts: frozenset[int]) -> PlantFit:
     passed = innovations(record, constants, noise, restarts)
     _, information = _step(passed, constants)
     covariance = _inverse(information)
     whiteness = _whiteness(passed.whitened)
     if not whiteness.passed:
         covariance = _widened(covariance, passed)
-    made = Fit(constants, covariance, noise, passed, whiteness)
+    made = PlantFit(constants, covariance, noise, passed, whiteness)
     sigma = made.sigma("gain")
     if sigma > _LEAST_KNOWN * abs(constants.gain):
         raise IdentificationError(

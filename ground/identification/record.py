@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.errors import FlightError, UsageError
 

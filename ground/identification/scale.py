@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ground.identification.constants import NAMES
-from ground.identification.fit import Fit
+from ground.identification.fit import PlantFit
 from ground.identification.record import FieldMeasurement
 from knightcube.astro.arrays import FloatArray
 
@@ -103,7 +103,7 @@ class AbsolutePlant:
         }
 
 
-def absolute(found: Fit, beliefs: Beliefs, measured: FieldMeasurement | None) -> AbsolutePlant:
+def absolute(found: PlantFit, beliefs: Beliefs, measured: FieldMeasurement | None) -> AbsolutePlant:
     """Return the plant that fit, beliefs and the measured field make together."""
     field = _field(beliefs, measured)
     before = beliefs.inertia, beliefs.dipole, field

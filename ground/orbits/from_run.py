@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_velocity
 from knightcube.errors import UsageError

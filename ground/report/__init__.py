@@ -1,4 +1,4 @@
-"""The report of a run: the thesis's performance figures, tables, pictures. Reads packets only."""
+"""The report of a run: figures of merit of the thesis, tables and pictures, from packets only."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from ground.report.summary import summarise
 from ground.report.text import format_report
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.errors import UsageError
 
 if TYPE_CHECKING:
-    from ground.identification.fit import Fit
+    from ground.identification.fit import PlantFit
     from ground.identification.record import Record
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
     from knightcube.gnc.guidance.one_axis.vmc import StepPlan
@@ -23,9 +23,9 @@ __all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_re
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
-    """Draw the run's pictures into `folder`; returns the files.
+    """Draw the pictures of a run into `folder` and return the files.
 
-    Raises UsageError when matplotlib is not installed or the folder cannot be written.
+    Raises UsageError if matplotlib is not installed or the folder cannot be written, as all functions here.
     """
     with _drawing(folder):
         from ground.report.figures import draw_figures  # noqa: PLC0415
@@ -35,7 +35,7 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
 
 def draw_both(first: Run, second: Run, folder: Path) -> Path:
-    """Draw two runs over each other into `folder`; returns the file. Raises UsageError as `draw`."""
+    """Draw two runs into one picture in `folder` and return the file. Raises UsageError."""
     with _drawing(folder):
         from ground.report.figures import draw_comparison  # noqa: PLC0415
 
@@ -44,41 +44,33 @@ def draw_both(first: Run, second: Run, folder: Path) -> Path:
 
 
 def draw_path(plan: StepPlan, plant: SingleAxisPlant, file: Path) -> None:
-    """Draw one planned path as a PNG.
-
-    Raises UsageError when matplotlib is not installed or the file cannot be written.
-    """
+    """Draw one planned path as a PNG. Raises UsageError."""
     with _drawing(file):
-        from ground.report.path_figure import save_path  # noqa: PLC0415
+        from ground.report.figures import path_figure, save  # noqa: PLC0415
 
-        save_path(plan, plant, file)
+        save(path_figure(plan, plant), file)
 
 
 def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
-    """Draw one planned slew in orbit as a PNG.
-
-    Raises UsageError when matplotlib is not installed or the file cannot be written.
-    """
+    """Draw one planned slew in orbit as a PNG. Raises UsageError."""
     with _drawing(file):
-        from ground.report.slew_figure import save_slew  # noqa: PLC0415
+        from ground.report.figures import save  # noqa: PLC0415
+        from ground.report.orbit_figures import slew_figure  # noqa: PLC0415
 
-        save_slew(made, order, file)
+        save(slew_figure(made, order), file)
 
 
-def draw_fit(record: Record, found: Fit, file: Path) -> None:
-    """Draw an identification's measured and predicted motion as a PNG.
-
-    Raises UsageError when matplotlib is not installed or the file cannot be written.
-    """
+def draw_fit(record: Record, found: PlantFit, file: Path) -> None:
+    """Draw the measured and predicted motion of an identification as a PNG. Raises UsageError."""
     with _drawing(file):
-        from ground.identification.picture import save_fit  # noqa: PLC0415
+        from ground.report.figures import fit_figure, save  # noqa: PLC0415
 
-        save_fit(record, found, file)
+        save(fit_figure(record, found), file)
 
 
 @contextmanager
 def _drawing(place: Path) -> Iterator[None]:
-    """Turn the lack of matplotlib, or of a place to write, into one clear line."""
+    """Report a missing matplotlib, or a place that cannot be written, in one line."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -86,4 +78,4 @@ def _drawing(place: Path) -> Iterator[None]:
             raise
         raise UsageError("pictures need matplotlib: pip install '.[plots]'") from error
     except OSError as error:
-        raise UsageError(f"{place}: no pictures can be written there: {error.strerror or error}") from error
+        raise UsageError(f"{place}: the picture cannot be written: {error.strerror or error}") from error

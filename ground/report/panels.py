@@ -1,38 +1,115 @@
-"""The panels that the pictures are composed of, each drawn on axes it is given.
+"""Panels of the pictures of a run, each drawn on given axes.
 
-Colours are of the Okabe-Ito palette, distinguishable with all common kinds of colour vision.
+The colours are those of the Okabe-Ito palette, which are distinguishable with all common kinds of colour
+vision.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
 from flight.link.telemetry.definitions import MAX_NODES
-from ground.report import performance as limits
-from ground.report.scene import Scene, planned_path, streak_rates
-from ground.report.signals import seconds
+from flight.link.telemetry.packets import PacketArray
+from ground.report import steps as limits
+from ground.report.signals import (
+    PowerHistory,
+    ThreadMotion,
+    bus_power,
+    coil_power,
+    covariance_matrices,
+    estimated_attitude,
+    mean_rates,
+    seconds,
+    true_attitude,
+    with_rate,
+)
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.guidance.one_axis.path import lgl_rule
 
 BLACK, GREY = "#222222", "#8a8a8a"
-BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (
-    "#0072B2",
-    "#E69F00",
-    "#009E73",
-    "#D55E00",
-    "#CC79A7",
-    "#56B4E9",
-)
+BLUE, ORANGE, GREEN = "#0072B2", "#E69F00", "#009E73"
+VERMILLION, PURPLE, SKY = "#D55E00", "#CC79A7", "#56B4E9"
 PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
-COILS = ("x", "y", "z")
-_ABSURD = 1e9  # mrad/s: no rate, but what a damaged log may hold
+AXIS_COLOURS = {"x": BLUE, "y": ORANGE, "z": GREEN}
+DASHED = (0, (5, 2))
+_MAX_ERROR = 1e9
+"""Rate error (mrad/s) above which a value comes from a damaged log and is ignored for the scale."""
+
+
+@dataclass(frozen=True)
+class RunSignals:
+    """Signals of one run, computed once for all panels."""
+
+    run: Run
+
+    @cached_property
+    def truth(self) -> ThreadMotion | None:
+        """True motion, or None without a truth log."""
+        return true_attitude(self.run)
+
+    @cached_property
+    def estimate(self) -> ThreadMotion:
+        """Estimated motion."""
+        return estimated_attitude(self.run)
+
+    @cached_property
+    def flown(self) -> ThreadMotion:
+        """True motion, or the estimated one without a truth log."""
+        return self.truth or self.estimate
+
+    @cached_property
+    def power(self) -> PowerHistory | None:
+        """Power of the coils."""
+        return coil_power(self.run)
+
+    @cached_property
+    def end(self) -> float:
+        """Last time of the logs, s."""
+        ends = [seconds(self.run[name])[-1] for name in ("control", "truth") if len(self.run[name])]
+        return max(ends, default=0.0)
+
+    @cached_property
+    def current_limit(self) -> float:
+        """Configured limit of a coil's current, or that of the thesis if it is not known, A."""
+        run = self.run["run"]
+        return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
+
+
+def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return time (m,), s, and q2 (m,) along the path of a plan packet, then both at its nodes (n,)."""
+    nodes = int(plan["nodes"])
+    values = plan["node_q2"][:nodes].astype(float)
+    rule = lgl_rule(nodes)
+    points = np.linspace(-1.0, 1.0, 201)
+    origin, horizon = float(plan["origin_ns"]) / 1e9, float(plan["horizon"])
+    times, node_times = (origin + 0.5 * horizon * (x + 1.0) for x in (points, rule.nodes))
+    return times, rule.interpolation(points) @ values, node_times, values
+
+
+def _streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the mid-exposure times (n,), s, and the rates (n,) about the thread from streaks, rad/s.
+
+    The third and fourth array are the standard deviations, 0 if unknown, and the differences from the true
+    mean rates, NaN if unknown.
+    """
+    rated = with_rate(run["streak"])
+    start = rated["exposure_start_ns"] / 1e9
+    stop = start + rated["exposure"]
+    variance = np.nan_to_num(covariance_matrices(rated["covariance"])[:, 1, 1])
+    difference = rated["rate"][:, 1] - mean_rates(run["truth"], start, stop)[:, 1]
+    value = rated["rate"][:, 1].astype(float)
+    return 0.5 * (start + stop), value, np.sqrt(np.maximum(variance, 0.0)), difference
 
 
 def style(ax: Axes, ylabel: str, title: str = "", xlabel: str = "mission time, s") -> None:
-    """Give axes the look of all pictures."""
+    """Apply the common style of all pictures to axes."""
     ax.set_ylabel(ylabel)
     ax.set_xlabel(xlabel)
     if title:
@@ -48,7 +125,7 @@ def style(ax: Axes, ylabel: str, title: str = "", xlabel: str = "mission time, s
 
 
 def legend(ax: Axes) -> None:
-    """Put the legend above the axes, to the right of the title, where it hides nothing."""
+    """Put the legend above the axes, to the right of the title."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(
@@ -64,102 +141,103 @@ def legend(ax: Axes) -> None:
         )
 
 
-def attitude(ax: Axes, scene: Scene) -> None:
-    """Draw q2: target, estimate and truth (Sease Figure 5.9)."""
-    targets = scene.run["target"]
+def level(ax: Axes, value: float, label: str) -> None:
+    """Draw a dashed horizontal line at a target or a limit."""
+    ax.axhline(value, color=VERMILLION, linewidth=1.2, linestyle=DASHED, label=label)
+
+
+def vectors(ax: Axes, times: FloatArray, values: FloatArray) -> None:
+    """Draw the three components of vectors (n, 3) at `times` (n,)."""
+    for column, (name, colour) in zip(values.T, AXIS_COLOURS.items(), strict=True):
+        ax.plot(times, column, color=colour, linewidth=0.8, label=name)
+
+
+def attitude(ax: Axes, signals: RunSignals) -> None:
+    """Draw q2 of the target, the estimate and the truth (Sease 2013, Figure 5.9)."""
+    targets = signals.run["target"]
     if len(targets):
         times, values = seconds(targets), targets["q2"].astype(float)
         ax.step(
-            np.append(times, scene.end),
+            np.append(times, signals.end),
             np.append(values, values[-1]),
             where="post",
             color=VERMILLION,
             linewidth=1.4,
-            linestyle=(0, (5, 2)),
+            linestyle=DASHED,
             label="target",
             zorder=3,
         )
-    if len(scene.estimate.time):
-        ax.plot(scene.estimate.time, scene.estimate.q2, color=SKY, linewidth=2.6, label="estimated")
-    if scene.truth is not None:
-        ax.plot(scene.truth.time, scene.truth.q2, color=BLACK, linewidth=1.0, label="true")
+    if len(signals.estimate.time):
+        ax.plot(signals.estimate.time, signals.estimate.q2, color=SKY, linewidth=2.6, label="estimated")
+    if signals.truth is not None:
+        ax.plot(signals.truth.time, signals.truth.q2, color=BLACK, linewidth=1.0, label="true")
     style(ax, "$q_2$", "Attitude")
     legend(ax)
 
 
-def current(ax: Axes, scene: Scene) -> None:
-    """Draw the coil currents on the wire within their limit (Sease Figure 5.10)."""
-    control = scene.run["control"]
+def current(ax: Axes, signals: RunSignals) -> None:
+    """Draw the commanded coil currents and their limit (Sease 2013, Figure 5.10)."""
+    control = signals.run["control"]
     time, written = seconds(control), control["current_written"]
-    for coil, colour in enumerate((BLUE, ORANGE, GREEN)):
-        if np.any(written[:, coil]):
-            values = written[:, coil].astype(float)
-            ax.step(time, values, where="post", color=colour, linewidth=0.8, label=f"coil {COILS[coil]}")
-    for sign in (-1.0, 1.0):
-        ax.axhline(
-            sign * scene.current_limit,
-            color=VERMILLION,
-            linewidth=1.2,
-            linestyle=(0, (5, 2)),
-            label=f"limit, {scene.current_limit:g} A" if sign > 0 else None,
-        )
+    for values, (name, colour) in zip(written.T, AXIS_COLOURS.items(), strict=True):
+        if np.any(values):
+            ax.step(
+                time, values.astype(float), where="post", color=colour, linewidth=0.8, label=f"coil {name}"
+            )
+    level(ax, -signals.current_limit, "")
+    level(ax, signals.current_limit, f"limit, {signals.current_limit:g} A")
     style(ax, "current, A", "Torque coil current")
     legend(ax)
 
 
-def power(ax: Axes, scene: Scene) -> None:
-    """Draw the supply power with the thesis's 0.10 W (Sease Figure 5.11), and the average R I^2."""
-    found = scene.power
+def power(ax: Axes, signals: RunSignals) -> None:
+    """Draw the supply power, the thesis's 0.10 W (Sease 2013, Figure 5.11) and the average R I^2."""
+    found = signals.power
     if found is None:
         return
     time, ends = found.time, found.time + found.spans
     ax.fill_between(time, found.supply, step="post", color=BLUE, alpha=0.35, linewidth=0.0)
     ax.step(time, found.supply, where="post", color=BLUE, linewidth=0.7, label="$V |I|$ at the coils")
     averages = [
-        (ends, found.average_so_far(found.supply), BLACK, "average"),
-        (ends, found.average_so_far(found.heat), GREEN, "average $R I^2$"),
+        (ends, found.running_average(found.supply), BLACK, "average"),
+        (ends, found.running_average(found.heat), GREEN, "average $R I^2$"),
     ]
-    measured_at, measured = scene.bus_power
+    measured_at, measured = bus_power(signals.run)
     if len(measured):
-        so_far = np.cumsum(measured) / np.arange(1, len(measured) + 1)
-        averages.insert(1, (measured_at, so_far, PURPLE, "average at the bus"))
+        average = np.cumsum(measured) / np.arange(1, len(measured) + 1)
+        averages.insert(1, (measured_at, average, PURPLE, "average at the bus"))
     for times, average, colour, name in averages:
         ax.plot(times, average, color=colour, linewidth=1.6, label=f"{name}, {1e3 * average[-1]:.1f} mW")
-    ax.axhline(
-        limits.AVERAGE_SUPPLY_POWER_LIMIT_W,
-        color=VERMILLION,
-        linewidth=1.2,
-        linestyle=(0, (5, 2)),
-        label="thesis, 100 mW",
-    )
+    level(ax, limits.AVERAGE_SUPPLY_POWER_LIMIT_W, "thesis, 100 mW")
     ax.set_ylim(bottom=0.0)
     style(ax, "power, W", "Coil power")
     legend(ax)
 
 
-def compared(axes: Sequence[Axes], scene: Scene, name: str, colour: str) -> None:
-    """Draw q2, the rate and the average supply power so far of one run of several into three axes."""
-    flown, power = scene.flown, scene.power
+def compared(axes: Sequence[Axes], signals: RunSignals, name: str, colour: str) -> None:
+    """Draw q2, rate and running average of the supply power of one of two runs into three axes."""
+    flown, power = signals.flown, signals.power
     axes[0].plot(flown.time, flown.q2, color=colour, linewidth=1.4, label=name)
     axes[1].plot(flown.time, 1e3 * flown.rate, color=colour, linewidth=1.0, label=name)
     if power is not None:
-        average = power.average_so_far(power.supply)
+        average = power.running_average(power.supply)
         axes[2].plot(power.time + power.spans, 1e3 * average, color=colour, linewidth=1.4, label=name)
 
 
-def paths(ax: Axes, scene: Scene, start: float, stop: float, target: float, title: str) -> None:
-    """Draw the paths planned from `start` on, on their nodes, against the flown one until `stop`, s."""
-    flown = scene.flown
+def paths(ax: Axes, signals: RunSignals, start: float, stop: float, target: float, title: str) -> None:
+    """Draw the paths planned between `start` and `stop`, s, with their nodes, and the flown attitude."""
+    flown = signals.flown
     inside = (flown.time >= start) & (flown.time <= stop)
+    source = "true" if flown.source == "truth" else "estimated"
     ax.plot(
         flown.time[inside] - start,
         flown.q2[inside],
         color=BLACK,
         linewidth=3.2,
         alpha=0.3,
-        label=f"flown ({'true' if flown.source == 'truth' else 'estimated'})",
+        label=f"flown ({source})",
     )
-    plans = scene.run["plan"]
+    plans = signals.run["plan"]
     origin = plans["origin_ns"] / 1e9
     drawable = (plans["accepted"] == 1) & (plans["nodes"] >= 2) & (plans["nodes"] <= MAX_NODES)
     chosen = plans[drawable & (origin >= start - 0.5) & (origin < stop)]
@@ -168,78 +246,70 @@ def paths(ax: Axes, scene: Scene, start: float, stop: float, target: float, titl
         colour = PATH_COLOURS[i % len(PATH_COLOURS)]
         ax.plot(time - start, values, color=colour, linewidth=1.3, label=f"plan {int(plan['number'])}")
         ax.plot(node_time - start, node_values, "o", color=colour, markersize=3.5)
-    ax.axhline(target, color=VERMILLION, linewidth=1.2, linestyle=(0, (5, 2)), label="target")
+    level(ax, target, "target")
     ax.set_xlim(-0.01 * (stop - start), stop - start)
     style(ax, "$q_2$", title, "time since the command, s")
     legend(ax)
 
 
-def rate(ax: Axes, scene: Scene) -> None:
-    """Draw the rate about the thread: estimated, true, and from streaks with their standard deviations."""
-    if len(scene.estimate.time):
-        ax.plot(scene.estimate.time, 1e3 * scene.estimate.rate, color=SKY, linewidth=2.6, label="estimated")
-    if scene.truth is not None:
-        ax.plot(scene.truth.time, 1e3 * scene.truth.rate, color=BLACK, linewidth=1.0, label="true")
-    middle, value, sigma, _ = streak_rates(scene.run)
-    if len(middle):
-        ax.errorbar(
-            middle,
-            1e3 * value,
-            yerr=1e3 * sigma,
-            fmt="o",
-            markersize=3.5,
-            color=ORANGE,
-            ecolor=ORANGE,
-            elinewidth=1.0,
-            label="from streaks",
-            zorder=4,
-        )
+def rate(ax: Axes, signals: RunSignals) -> None:
+    """Draw the estimated and true rates about the thread, and those from streaks with error bars."""
+    if len(signals.estimate.time):
+        estimate = 1e3 * signals.estimate.rate
+        ax.plot(signals.estimate.time, estimate, color=SKY, linewidth=2.6, label="estimated")
+    if signals.truth is not None:
+        ax.plot(signals.truth.time, 1e3 * signals.truth.rate, color=BLACK, linewidth=1.0, label="true")
+    middle, value, sigma, _ = _streak_rates(signals.run)
+    _error_bars(ax, middle, value, sigma, "from streaks")
     style(ax, "rate, mrad/s", "Rate about the thread")
     legend(ax)
 
 
-def rate_error(ax: Axes, scene: Scene) -> None:
+def rate_error(ax: Axes, signals: RunSignals) -> None:
     """Draw the errors of the estimated rate and of the streak rates against the truth."""
-    truth, control = scene.truth, scene.run["control"]
+    truth, control = signals.truth, signals.run["control"]
     if truth is None:
         return
     control = control[np.isfinite(control["rate"]) & np.isfinite(control["rate_sigma"])]
     time, bound = seconds(control), 3e3 * control["rate_sigma"].astype(float)
     error = 1e3 * (control["rate"] - np.interp(time, truth.time, truth.rate))
-    ax.fill_between(
-        time, -bound, bound, color=SKY, alpha=0.35, linewidth=0.0, label=r"$\pm 3\sigma$ of the estimate"
-    )
-    ax.plot(time, error, color=BLUE, linewidth=0.6, label="estimated less true")
-    middle, _, sigma, difference = streak_rates(scene.run)
+    band = r"$\pm 3\sigma$ of the estimate"
+    ax.fill_between(time, -bound, bound, color=SKY, alpha=0.35, linewidth=0.0, label=band)
+    ax.plot(time, error, color=BLUE, linewidth=0.6, label="estimated minus true")
+    middle, _, sigma, difference = _streak_rates(signals.run)
     known = np.isfinite(difference)
-    if known.any():
-        ax.errorbar(
-            middle[known],
-            1e3 * difference[known],
-            yerr=1e3 * sigma[known],
-            fmt="o",
-            markersize=3.5,
-            color=ORANGE,
-            ecolor=ORANGE,
-            elinewidth=0.8,
-            label=r"streaks less true, $\pm\sigma$",
-        )
+    _error_bars(ax, middle[known], difference[known], sigma[known], r"streaks minus true, $\pm\sigma$")
     everything = np.concatenate([np.abs(error), bound, np.abs(1e3 * difference[known])])
-    everything = everything[everything < _ABSURD]
-    if len(everything):  # a start-up transient must not flatten the rest
+    everything = everything[everything < _MAX_ERROR]
+    if len(everything):  # a start-up transient must not determine the scale
         span = 1.5 * float(np.percentile(everything, 99.0)) or 1.0
         ax.set_ylim(-span, span)
     style(ax, "error, mrad/s", "Error of the rate")
     legend(ax)
 
 
-def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
-    """Draw the share of values larger than x, of each named set of times in s; a line at `bound` s.
+def _error_bars(ax: Axes, time: FloatArray, rate: FloatArray, sigma: FloatArray, label: str) -> None:
+    if len(time):
+        ax.errorbar(
+            time,
+            1e3 * rate,
+            1e3 * sigma,
+            fmt="o",
+            markersize=3.5,
+            color=ORANGE,
+            elinewidth=1.0,
+            label=label,
+            zorder=4,
+        )
 
-    On axes of decades: one late cycle of thousands is as plain as the median. Times of zero, as the lateness
-    in lock-step, have no place on them and are stated in the legend.
+
+def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
+    """Draw the share of values above x for each named set of times, s, and a line at `bound` s.
+
+    Both axes are logarithmic, so that one late cycle in thousands is as visible as the median. Times of zero,
+    such as the lateness in lock-step, cannot be drawn on them and are stated in the legend.
     """
-    least = []
+    shortest = []
     for (name, times), colour in zip(values.items(), PATH_COLOURS, strict=False):
         ordered = np.sort(times[np.isfinite(times)])
         share = 1.0 - np.arange(len(ordered)) / max(1, len(ordered))
@@ -251,14 +321,14 @@ def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float
         x, y = ordered[shown], share[shown]
         ax.step(x, y, where="pre", color=colour, linewidth=1.6, label=f"{name}: {ends}")
         ax.plot(x[-1:], y[-1:], "o", color=colour, markersize=5)
-        least.append(x[0])
+        shortest.append(x[0])
     if bound is not None:
         label = f"period, {duration(bound)}"
-        ax.axvline(bound, color=VERMILLION, linewidth=1.2, linestyle=(0, (5, 2)), label=label)
+        ax.axvline(bound, color=VERMILLION, linewidth=1.2, linestyle=DASHED, label=label)
     style(ax, "share above", title, "time")
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter(lambda share, _: f"{100.0 * share:g} %")
-    if least or bound is not None:
+    if shortest or bound is not None:
         ax.set_xscale("log")
         ax.margins(x=0.05)
         ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
@@ -267,6 +337,6 @@ def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float
 
 
 def duration(time: float) -> str:
-    """Return a time in s as text of three digits with its unit."""
+    """Return a time in s as text with three digits and a unit."""
     scale, unit = next(((s, u) for s, u in ((1.0, "s"), (1e3, "ms")) if abs(time) * s >= 0.9995), (1e6, "µs"))
     return f"{time * scale:.3g} {unit}"

@@ -1,22 +1,34 @@
-"""The signals of a run that the report judges and draws: from the truth where it is known, else as flown."""
+"""Signals of a run and the errors of its estimates.
+
+The signals come from the truth of the simulation if the run has it, otherwise from the flight log.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.packets import PacketArray
-from ground.telemetry.reader import Run
+from flight.link.telemetry.packets import PacketArray, to_text
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
 from knightcube.gnc.coil_power import steady_heat, supply_power
+
+Object = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Attitude:
-    """The turn about the thread: time (n,) in s, q2 (n,), rate (n,) in rad/s.
+class ThreadMotion:
+    """Rotation about the testbed's thread.
 
-    `source` is "truth" or "estimate".
+    Attributes:
+        time: mission times (n,), s.
+        q2: second quaternion component (n,), the sine of half the angle.
+        rate: rates (n,), rad/s.
+        source: "truth" or "estimate".
     """
 
     time: FloatArray
@@ -26,15 +38,15 @@ class Attitude:
 
 
 @dataclass(frozen=True)
-class CoilPower:
-    """The power of all coils together over the intervals of a run (`knightcube.gnc.coil_power`).
+class PowerHistory:
+    """Power of all coils together, as means over the intervals of a run (`knightcube.gnc.coil_power`).
 
     Attributes:
-        time: (n,) s, the beginning of each interval; the last one ends at `end`.
-        end: s.
-        supply: (n,) W, mean of V |I| over each interval: what the coils take from their supply.
-        heat: (n,) W, mean of R I^2 over each interval: the heat of steady currents, the planner's cost.
-        source: "truth", or "written" for the currents on the wire.
+        time: beginning (n,) of each interval, s.
+        end: end of the last interval, s.
+        supply: mean of V |I| (n,), W, which the coils draw from their supply.
+        heat: mean of R I^2 (n,), W, the heat of steady currents and the cost function of the planner.
+        source: "truth" for the simulated coils, "written" for the commanded currents.
     """
 
     time: FloatArray
@@ -48,89 +60,223 @@ class CoilPower:
         """Lengths (n,) of the intervals, s."""
         return np.diff(np.append(self.time, self.end))
 
-    @property
-    def duration(self) -> float:
-        """The time covered, s."""
-        return float(np.sum(self.spans))
-
     def energy(self, power: FloatArray) -> float:
-        """Return the integral of `supply` or `heat`, J."""
+        """Return the integral of `supply` or `heat` (n,), J."""
         return float(power @ self.spans)
 
-    def average(self, power: FloatArray) -> float:
-        """Return the mean of `supply` or `heat` over the run, W."""
-        return self.energy(power) / self.duration
+    def average(self, power: FloatArray, begin: float = -np.inf, end: float = np.inf) -> float:
+        """Return the mean of `supply` or `heat` over the intervals from `begin` to `end` s, W.
 
-    def average_so_far(self, power: FloatArray) -> FloatArray:
+        Returns NaN if no interval lies between them.
+        """
+        inside = (self.time >= begin) & (self.time < end)
+        spans = self.spans[inside]
+        return float(power[inside] @ spans / spans.sum()) if inside.any() else float("nan")
+
+    def running_average(self, power: FloatArray) -> FloatArray:
         """Return the mean of `supply` or `heat` from the start to the end of each interval (n,), W."""
         return np.asarray(np.cumsum(power * self.spans) / np.cumsum(self.spans))
 
 
 def seconds(packets: PacketArray) -> FloatArray:
-    """Return the mission times (n,) of packets, in s."""
+    """Return the mission times (n,) of packets, s."""
     return np.asarray(packets["time_ns"] / 1e9)
 
 
 def true_rows(truth: PacketArray, packets: PacketArray) -> IntArray:
-    """Return for each packet (n,) the row of the truth at the same time, -1 where there is none."""
+    """Return for each packet (n,) the index of the truth at the same time, or -1 if there is none."""
     if not len(truth):
         return np.full(len(packets), -1)
     place = np.minimum(np.searchsorted(truth["time_ns"], packets["time_ns"]), len(truth) - 1)
     return np.where(truth["time_ns"][place] == packets["time_ns"], place, -1)
 
 
-def true_attitude(run: Run) -> Attitude | None:
-    """Return what the simulated body did, None where no truth is known."""
+def true_attitude(run: Run) -> ThreadMotion | None:
+    """Return the motion of the simulated body, or None without a truth log."""
     truth = run["truth"]
     if not len(truth):
         return None
     quaternion = truth["quaternion"].astype(float)
-    # q and -q are one attitude: q2 = sin(theta/2) of the turn in (-pi, pi) has the scalar part positive.
+    # q and -q are the same attitude: an angle in (-pi, pi) has a positive scalar part.
     q2 = quaternion[:, 1] * np.where(quaternion[:, 3] < 0.0, -1.0, 1.0)
-    return Attitude(seconds(truth), q2, truth["rate"][:, 1].astype(float), "truth")
+    return ThreadMotion(seconds(truth), q2, truth["rate"][:, 1].astype(float), "truth")
 
 
-def estimated_attitude(run: Run) -> Attitude:
-    """Return what the estimator believed, cycles without an estimate left out."""
+def estimated_attitude(run: Run) -> ThreadMotion:
+    """Return the estimated motion. Cycles without an estimate are omitted."""
     control = run["control"]
-    known = np.isfinite(control["q2"]) & np.isfinite(control["rate"])
-    control = control[known]
-    return Attitude(seconds(control), control["q2"].astype(float), control["rate"].astype(float), "estimate")
+    control = control[np.isfinite(control["q2"]) & np.isfinite(control["rate"])]
+    q2, rate = (control[name].astype(float) for name in ("q2", "rate"))
+    return ThreadMotion(seconds(control), q2, rate, "estimate")
 
 
-def coil_power(run: Run) -> CoilPower | None:
-    """Return the coils' power, None when neither the truth nor the coils' resistance is known."""
-    return _true_power(run["truth"]) or _written_power(run["control"], run["run"])
+def coil_power(run: Run) -> PowerHistory | None:
+    """Return the coil power, or None if neither the truth nor the coil resistance is known.
+
+    Without the truth, each written current is assumed to flow until the next control cycle.
+    """
+    truth, control, identity = run["truth"], run["control"], run["run"]
+    time = seconds(truth)
+    if len(time) >= 2 and np.all(np.diff(time) > 0.0):
+        spans = np.diff(time)
+        supply, heat = np.diff(truth["supply_energy"]) / spans, np.diff(truth["energy"]) / spans
+        return PowerHistory(time[:-1], float(time[-1]), supply, heat, "truth")
+    time = seconds(control)
+    if len(time) < 2 or not len(identity):
+        return None
+    current = control["current_written"][:-1].astype(float)
+    resistance = np.nan_to_num(identity["coil_resistance"][0].astype(float))
+    supply = supply_power(current, float(identity["supply_voltage"][0])).sum(axis=1)
+    heat = steady_heat(current, resistance).sum(axis=1)
+    return PowerHistory(time[:-1], float(time[-1]), supply, heat, "written")
 
 
 def bus_power(run: Run) -> tuple[FloatArray, FloatArray]:
-    """Return the times (n,), s, and the power (n,), W, that a monitor in the coils' supply measured.
+    """Return the times (n,), s, and the power (n,), W, measured by the monitor in the coils' supply.
 
-    The power is the voltage of the bus, before the losses of the bridges, times the current of all coils.
-    Both arrays are empty without a monitor.
+    The power is the bus voltage, before the losses of the bridges, times the current of all coils. Both
+    arrays are empty without a monitor.
     """
     packets = run["housekeeping"]
     packets = packets[np.isfinite(packets["coil_power"])]
     return seconds(packets), packets["coil_power"].astype(float)
 
 
-def _true_power(truth: PacketArray) -> CoilPower | None:
+def covariance_matrices(packed: FloatArray) -> FloatArray:
+    """Return matrices (n, 3, 3) from rows (n, 6) in the order xx yy zz xy xz yz."""
+    order = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+    return np.asarray(packed, dtype=float)[:, order]
+
+
+def with_rate(streak: PacketArray) -> PacketArray:
+    """Return the streak packets that contain a rate."""
+    return streak[np.all(np.isfinite(streak["rate"]), axis=1)]
+
+
+def mean_rates(truth: PacketArray, start: FloatArray, stop: FloatArray) -> FloatArray:
+    """Return the mean true body rates (n, 3), rad/s, between the times `start` and `stop` (n,), s.
+
+    Rows that the truth does not cover are NaN.
+    """
     time = seconds(truth)
-    if len(time) < 2 or not np.all(np.diff(time) > 0.0):
-        return None
-    spans = np.diff(time)
-    supply = np.diff(truth["supply_energy"]) / spans
-    heat = np.diff(truth["energy"]) / spans
-    return CoilPower(time[:-1], float(time[-1]), supply, heat, "truth")
+    means = np.full((len(start), 3), np.nan)
+    if len(time) < 2:
+        return means
+    rate = truth["rate"].astype(float)
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    covered = (start >= time[0]) & (stop <= time[-1]) & (stop > start)
+    for axis in range(3):
+        angle = np.interp(stop, time, turned[:, axis]) - np.interp(start, time, turned[:, axis])
+        means[covered, axis] = angle[covered] / (stop - start)[covered]
+    return means
 
 
-def _written_power(control: PacketArray, run: PacketArray) -> CoilPower | None:
-    """Take each written current to stand until the next cycle writes its own."""
-    time = seconds(control)
-    if len(time) < 2 or not len(run):
+def streaks(run: Run) -> Object:
+    """Return the number of frames and rates from streaks, and the errors of the rates.
+
+    `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P. It is 1 if
+    the covariances are correct.
+    """
+    packets = run["streak"]
+    rated = with_rate(packets)
+    start = rated["exposure_start_ns"] / 1e9
+    error = rated["rate"] - mean_rates(run["truth"], start, start + rated["exposure"])
+    known = np.all(np.isfinite(error), axis=1)
+    return {
+        "frames": len(packets),
+        "rates": len(rated),
+        "accepted": int(np.sum(packets["accepted"] == 1)),
+        "status": _counts(packets["status"]),
+        **_error_figures(error[known], rated["covariance"][known]),
+    }
+
+
+def star_attitudes(run: Run) -> Object:
+    """Return the number of frames and attitudes of the star tracker, and the errors of the attitudes.
+
+    `rms_error` is about the body axes in rad; `normalised` is defined as for the streaks.
+    """
+    packets, truth = run["stars"], run["truth"]
+    solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]
+    time, middle = seconds(truth), solved["middle_ns"] / 1e9
+    covered = (middle >= time[0]) & (middle <= time[-1]) if len(time) > 1 else np.zeros(len(solved), bool)
+    error = np.zeros((0, 3))
+    if covered.any():
+        # Over the short steps of the truth, linear interpolation equals the great circle.
+        columns = [np.interp(middle[covered], time, column) for column in truth["quaternion"].T]
+        true = normalise(np.stack(columns, axis=-1))
+        error = to_rotation_vector(multiply(solved["quaternion"][covered], conjugate(true)))
+    return {
+        "frames": len(packets),
+        "solved": len(solved),
+        "tracked": int(np.sum(solved["tracked"] == 1)),
+        "accepted": int(np.sum(packets["accepted"] == 1)),
+        "status": _counts(packets["status"]),
+        "matched": float(np.median(solved["matched"])) if len(solved) else None,
+        **_error_figures(error, solved["covariance"][covered]),
+    }
+
+
+def failed_frames(run: Run) -> list[Object]:
+    """Return number, time and reasons of each frame that gave neither a rate nor an attitude."""
+    stars = run["stars"]
+    solved = set(stars["sequence"][np.all(np.isfinite(stars["quaternion"]), axis=1)].tolist())
+    reasons = {int(row["sequence"]): to_text(row["status"]) for row in stars}
+    rated = np.all(np.isfinite(run["streak"]["rate"]), axis=1)
+    return [
+        {
+            "sequence": int(row["sequence"]),
+            "exposed_s": float(row["exposure_start_ns"]) / 1e9,
+            "streaks": to_text(row["status"]),
+            "stars": reasons.get(int(row["sequence"])),
+        }
+        for row in run["streak"][~rated]
+        if int(row["sequence"]) not in solved
+    ]
+
+
+def estimate_errors(run: Run) -> Object | None:
+    """Return the rms errors of the estimated angle and rate about the thread, or None without a truth.
+
+    `*_normalised` is the rms of the error divided by the estimated standard deviation. It is 1 if the
+    standard deviations are correct.
+    """
+    control, truth = run["control"], run["truth"]
+    control = control[np.isfinite(control["angle"]) & np.isfinite(control["rate"])]
+    if not len(control) or len(truth) < 2:
         return None
-    resistance = np.nan_to_num(run["coil_resistance"][0].astype(float))
-    current = control["current_written"][:-1].astype(float)
-    supply = supply_power(current, float(run["supply_voltage"][0])).sum(axis=1)
-    heat = steady_heat(current, resistance).sum(axis=1)
-    return CoilPower(time[:-1], float(time[-1]), supply, heat, "written")
+    quaternion, time = truth["quaternion"], seconds(truth)
+    turn = np.unwrap(2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3]))
+    angle = control["angle"] - np.interp(seconds(control), time, turn)
+    angle = np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi
+    rate = control["rate"] - np.interp(seconds(control), time, truth["rate"][:, 1])
+    found: Object = {"angle_rms_rad": _rms(angle), "rate_rms_rad_s": _rms(rate)}
+    for name, error in (("angle", angle), ("rate", rate)):
+        sigma = control[f"{name}_sigma"]
+        usable = np.isfinite(sigma) & (sigma > 0.0)
+        found[f"{name}_normalised"] = _rms(error[usable] / sigma[usable]) if usable.any() else None
+    return found
+
+
+def _counts(texts: PacketArray) -> dict[str, int]:
+    return dict(Counter(to_text(text) for text in texts))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _error_figures(error: FloatArray, packed: FloatArray) -> Object:
+    """Return count and rms of errors e (n, 3), and the mean of e' P^-1 e / 3 over positive definite P."""
+    found: Object = {"compared": len(error), "rms_error": None, "normalised": None}
+    if len(error):
+        found["rms_error"] = np.sqrt(np.mean(error**2, axis=0)).tolist()
+    covariance = covariance_matrices(packed)
+    usable = np.all(np.isfinite(covariance), axis=(1, 2))
+    error, covariance = error[usable], covariance[usable]
+    definite = np.linalg.eigvalsh(covariance)[:, 0] > 0.0 if len(error) else np.zeros(0, bool)
+    if definite.any():
+        scaled = np.linalg.solve(covariance[definite], error[definite][:, :, None])[:, :, 0]
+        found["normalised"] = float(np.mean(np.sum(error[definite] * scaled, axis=1)) / 3.0)
+    return found

@@ -1,101 +1,87 @@
-"""A run in one object, ready for JSON: what `flight report --json` prints and the text report is made from.
+"""The report of a run as one object, printed by `report --json` and written as text by `ground.report.text`.
 
-`None` stands for a value that is unknown, does not apply or was never reached; `notes` say which.
+`None` means that a value is unknown, not applicable or was never reached; `notes` give the reasons.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.packets import to_text
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import PacketArray, to_text
+from flight.loop.fdir.facts import FACTS, StreamState
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
-from ground.report import performance as limits
-from ground.report.detumbling import detumbling
-from ground.report.knowledge import knowledge
-from ground.report.objects import objects
-from ground.report.operations import (
-    cycles,
-    events,
-    health,
-    jobs,
-    logs,
-    modes,
-    planner,
-    rate_groups,
-    step_ends,
+from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements
+from ground.report.signals import (
+    PowerHistory,
+    ThreadMotion,
+    bus_power,
+    coil_power,
+    estimate_errors,
+    estimated_attitude,
+    failed_frames,
+    seconds,
+    star_attitudes,
+    streaks,
+    true_attitude,
 )
-from ground.report.performance import Command, Response, commands, interrupted, placed, response
-from ground.report.pointing import pointing
-from ground.report.requirements import judge, required
-from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
-from ground.report.signals import Attitude, bus_power, coil_power, estimated_attitude, seconds, true_attitude
-from ground.telemetry.reader import Run
+from ground.report.steps import against_thesis, judged_steps, step_row
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 
 
-@np.errstate(all="ignore")  # a packet may hold any number: results that are not finite become None
+@np.errstate(all="ignore")  # a packet may contain any number: results that are not finite become None
 def summarise(run: Run) -> Object:
-    """Return all values of the report; only None, bool, int, float, str, list and dict."""
+    """Return all values of the report, made of None, bool, int, float, str, list and dict only."""
     attitude = true_attitude(run) or estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
     in_orbit = len(run["spin"]) > 0
-    steps = [] if in_orbit else _steps(run, attitude, identity["duration_planned_s"], notes)
-    power = _power(run, notes)
-    braked, known = detumbling(run), knowledge(run)
+    steps = [] if in_orbit else judged_steps(run, attitude, identity["duration_planned_s"], notes)
+    power = coil_power(run)
+    powers = _power(run, power, notes)
+    detumbled, known = detumbling(run), knowledge(run)
     config = _orbit_config(run, notes) if in_orbit else None
-    pointed = None if config is None else pointing(run, config.pointing.axis, coil_power(run))
+    pointed = None if config is None else pointing(run, config.pointing.axis, power)
     summary: Object = {
         "run": identity,
         "attitude_source": attitude.source,
-        "steps": [_step_row(*step) for step in steps],
-        "detumbling": braked,
+        "steps": [step_row(*step) for step in steps],
+        "detumbling": detumbled,
         "knowledge": known,
         "pointing": pointed,
-        "requirements": [] if config is None else required(config, braked, known, pointed),
-        "thesis": [] if in_orbit else _against_thesis([(c, r) for c, r in steps if r is not None], power),
-        "power": power,
-        "rate_groups": rate_groups(run["rate_group"]),
-        "cycles": cycles(run["cycle_timing"], run["control"]),
-        "jobs": jobs(run["job_timing"]),
-        "planner": planner(run["plan"]),
+        "requirements": [] if config is None else requirements(config, detumbled, known, pointed),
+        "thesis": [] if in_orbit else against_thesis(steps, powers),
+        "power": powers,
+        "rate_groups": _rate_groups(run["rate_group"]),
+        "cycles": _cycles(run["cycle_timing"], run["control"]),
+        "jobs": _jobs(run["job_timing"]),
+        "planner": _planner(run["plan"]),
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
         "stars": star_attitudes(run),
         "failed_frames": failed_frames(run),
         "objects": objects(run),
-        "modes": modes(run["mode"]),
-        "health": health(run["health"]),
-        "events": events(run["event"]),
-        "logs": logs(run),
+        "modes": _modes(run["mode"]),
+        "health": _health(run["health"]),
+        "events": _events(run["event"]),
+        "logs": _logs(run),
         "notes": notes,
     }
     plain: Object = _plain(summary)
     return plain
 
 
-def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
-    """Return the configuration that was flown, None where its copy beside the log cannot be read."""
-    path = run.folder / "config.yaml"
-    try:
-        if path.exists():
-            return as_orbit(reader.load(path))
-        why = "no copy of the configuration beside the log"
-    except ConfigError as error:
-        why = str(error)
-    notes.append(f"pointing and requirements not judged: {why}")
-    return None
-
-
 def _plain(value: Any) -> Any:
-    """Return `value` with numpy's types made Python's, and NaN and infinity made None."""
+    """Return `value` with Python types instead of numpy types, and None instead of NaN and infinity."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -105,8 +91,21 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _identity(run: Run, attitude: Attitude, notes: list[str]) -> Object:
-    """Return what was flown, and for how long."""
+def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
+    """Return the configuration of the flight, or None if its copy beside the log cannot be read."""
+    path = run.folder / "config.yaml"
+    try:
+        if path.exists():
+            return as_orbit(reader.load(path))
+        why = f"{path} does not exist"
+    except ConfigError as error:
+        why = str(error)
+    notes.append(f"pointing and requirements not judged: {why}")
+    return None
+
+
+def _identity(run: Run, attitude: ThreadMotion, notes: list[str]) -> Object:
+    """Return configuration, software, seed and duration of the run."""
     ends = [seconds(run[name])[-1] for name in ("control", "truth", "event") if len(run[name])]
     identity: Object = {"folder": str(run.folder), "duration_s": max(ends, default=0.0), "cut_short": False}
     if attitude.source == "estimate":
@@ -135,136 +134,154 @@ def _identity(run: Run, attitude: Attitude, notes: list[str]) -> Object:
     }
 
 
-def _steps(
-    run: Run, attitude: Attitude, planned_end: float, notes: list[str]
-) -> list[tuple[Command, Response | None]]:
-    """Return each commanded step with its response, None where it was interrupted or not observed."""
-    targets = run["target"]
-    if not len(targets):
-        notes.append("no target packets: no steps to judge")
-        return []
-    if len(attitude.time) < 2:
-        notes.append("no attitude: no steps can be judged")
-        return []
-    times = seconds(targets)
-    seen_until = float(attitude.time[-1])
-    release = float(np.interp(times[0], attitude.time, attitude.q2))
-    end = _end_of_last_step(times, planned_end, seen_until)
-    listed = commands(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)
-    listed = placed(listed, attitude.time, attitude.q2, step_ends(run["mode"]))
-    sample = 3.0 * float(np.median(np.diff(attitude.time)))
-    steps: list[tuple[Command, Response | None]] = []
-    for command in listed:
-        seen = attitude.time[0] - sample <= command.time
-        complete = seen and command.time + command.duration <= seen_until + sample
-        found = response(attitude.time, attitude.q2, command) if complete else None
-        if found is not None and interrupted(command, found):
-            found = None
-            notes.append(f"step {command.index}: interrupted after {command.duration:.1f} s, not judged")
-        else:
-            notes += _remarks(command, found)
-        steps.append((command, found))
-    return steps
-
-
-def _remarks(command: Command, found: Response | None) -> list[str]:
-    """Return what the missing numbers of a step mean."""
-    if found is None:
-        return [f"step {command.index}: not complete, not judged"]
-    if math.isnan(found.settling_s):
-        return [f"step {command.index}: the target stays where it was, only the steady state is judged"]
-    short = math.isnan(found.steady_state_deg)
-    remarks = [f"step {command.index}: too short for a steady state to be judged"] if short else []
-    never = {"rise_s": "reached 90 %", "settling_s": "settled"}
-    return remarks + [
-        f"step {command.index}: never {what}"
-        for name, what in never.items()
-        if math.isinf(getattr(found, name))
-    ]
-
-
-def _end_of_last_step(times: FloatArray, planned_end: float, seen_until: float) -> float:
-    """Return when the last target's time is up: the run's planned end, else as long as the longest before."""
-    if math.isfinite(planned_end):
-        return max(planned_end, float(times[-1]))
-    return float(times[-1] + np.max(np.diff(times))) if len(times) > 1 else max(seen_until, float(times[-1]))
-
-
-def _rise_is_judged(command: Command) -> bool:
-    """Return whether the thesis bounds this rise: a step between targets, not a slew from elsewhere."""
-    return command.index > 0 and command.from_target
-
-
-def _step_row(command: Command, found: Response | None) -> Object:
-    none = Response(math.nan, math.nan, math.nan, math.nan)
-    answer = found or none
-    return {
-        "index": command.index,
-        "again": command.again,
-        "start_s": command.time,
-        "duration_s": command.duration,
-        "complete": found is not None,
-        "from_q2": command.start,
-        "from_target": command.from_target,
-        "target_q2": command.target,
-        "steady_state_deg": answer.steady_state_deg,
-        "overshoot_percent": answer.overshoot_percent,
-        "rise_s": answer.rise_s,
-        "rise_judged": _rise_is_judged(command),
-        "settling_s": answer.settling_s,
-    }
-
-
-def _power(run: Run, notes: list[str]) -> Object:
-    """Return the coils' power from their supply, R I^2 of their mean currents, and the largest currents."""
-    written = np.abs(run["control"]["current_written"])
-    actual = np.abs(run["truth"]["current"])
-    _, measured = bus_power(run)
+def _power(run: Run, power: PowerHistory | None, notes: list[str]) -> Object:
+    """Return the power that the coils draw, R I^2 of their mean currents, and the largest currents."""
+    written, actual = np.abs(run["control"]["current_written"]), np.abs(run["truth"]["current"])
+    measured = bus_power(run)[1]
+    sums = ("supply_average_w", "supply_peak_w", "supply_j", "heat_average_w", "heat_j")
     found: Object = {
         "bus_average_w": float(measured.mean()) if len(measured) else math.nan,
         "peak_current_a": float(written.max()) if written.size else math.nan,
         "peak_current_actual_a": float(actual.max()) if actual.size else math.nan,
+        "source": None,
+        **dict.fromkeys(sums, math.nan),
     }
-    power = coil_power(run)
-    if power is None or power.duration <= 0.0:
-        notes.append("power not known: neither truth nor coil resistance in the log")
-        return {
-            **found,
-            "source": None,
-            "supply_average_w": math.nan,
-            "supply_peak_w": math.nan,
-            "supply_j": math.nan,
-            "heat_average_w": math.nan,
-            "heat_j": math.nan,
+    if power is None or power.spans.sum() <= 0.0:
+        notes.append("power not known: the log has neither truth nor coil resistance")
+        return found
+    supply = power.average(power.supply), float(power.supply.max()), power.energy(power.supply)
+    heat = power.average(power.heat), power.energy(power.heat)
+    return {**found, "source": power.source, **dict(zip(sums, supply + heat, strict=True))}
+
+
+def _rate_groups(packets: PacketArray) -> list[Object]:
+    """Return the final counters of each rate group, fastest first."""
+    last = {to_text(row["name"]): row for row in packets}
+    groups: list[Object] = [
+        {
+            "name": name,
+            "period_s": float(row["period"]),
+            **{counter: int(row[counter]) for counter in ("cycles", "slips", "overruns")},
+            "mean_s": float(row["mean"]),
+            "max_s": float(row["max"]),
         }
+        for name, row in last.items()
+    ]
+    return sorted(groups, key=lambda group: float(group["period_s"]))
+
+
+def _cycles(timing: PacketArray, control: PacketArray) -> Object:
+    """Return the punctuality of the control cycles. Slots without a control packet count as `skipped`."""
+    slots = control["cycle"].astype(np.int64)
     return {
-        **found,
-        "source": power.source,
-        "supply_average_w": power.average(power.supply),
-        "supply_peak_w": float(power.supply.max()),
-        "supply_j": power.energy(power.supply),
-        "heat_average_w": power.average(power.heat),
-        "heat_j": power.energy(power.heat),
+        "count": len(control),
+        "skipped": int(slots[-1] - slots[0]) + 1 - len(slots) if len(slots) else 0,
+        "lateness_s": _percentiles(timing["lateness"].astype(float)),
+        "execution_s": _percentiles(timing["execution"].astype(float)),
     }
 
 
-def _against_thesis(steps: list[tuple[Command, Response]], power: Object) -> list[Object]:
-    """Return the worst of each figure beside the thesis's bound."""
-    judged = [r.rise_s for c, r in steps if _rise_is_judged(c)]
-    responses = [r for _, r in steps]
+def _percentiles(values: FloatArray) -> Object | None:
+    """Return median, 99th percentile and maximum, or None for an empty array."""
+    if not len(values):
+        return None
+    p50, p99 = np.percentile(values, [50.0, 99.0])
+    return {"p50": float(p50), "p99": float(p99), "max": float(values.max())}
+
+
+def _jobs(packets: PacketArray) -> list[Object]:
+    """Return number, outcomes and execution times of the jobs of each worker."""
+    names = np.array([to_text(name) for name in packets["name"]], dtype=object)
+    found = []
+    for name in sorted(set(names)):
+        own = packets[names == name]
+        outcomes = Counter(to_text(outcome) for outcome in own["outcome"])
+        times = _percentiles(own["execution"].astype(float))
+        found.append({"name": name, "count": len(own), "outcomes": dict(outcomes), "execution_s": times})
+    return found
+
+
+def _planner(packets: PacketArray) -> Object:
+    """Return the numbers of accepted, stretched and refused plans, and the reasons of the refusals."""
+    accepted = packets["accepted"] == 1
+    status = np.array([to_text(value) for value in packets["status"]], dtype=object)
+    flown = packets[accepted]
+    return {
+        "plans": len(packets),
+        "accepted": int(accepted.sum()),
+        "refused": int((~accepted).sum()),
+        "stretched": int(np.sum(status[accepted] == "stretched")),
+        "refusals": dict(Counter(status[~accepted])),
+        "longest_horizon_s": float(flown["horizon"].max()) if len(flown) else None,
+        "peak_current_a": float(flown["peak_current"].max()) if len(flown) else None,
+    }
+
+
+def _modes(packets: PacketArray) -> list[Object]:
+    """Return the modes in order, each with its time, trigger and reason."""
     return [
-        judge(
-            "steady-state error",
-            [r.steady_state_deg for r in responses],
-            limits.STEADY_STATE_LIMIT_DEG,
-            "deg",
-        ),
-        judge("overshoot", [r.overshoot_percent for r in responses], limits.OVERSHOOT_LIMIT_PERCENT, "%"),
-        judge("rise time", judged, limits.RISE_LIMIT_S, "s"),
-        judge("settling time", [r.settling_s for r in responses], limits.SETTLING_LIMIT_S, "s"),
-        *(
-            judge(f"average supply power at the {place}", [average], limits.AVERAGE_SUPPLY_POWER_LIMIT_W, "W")
-            for place, average in (("coils", power["supply_average_w"]), ("bus", power["bus_average_w"]))
-        ),
-        judge("largest current", [power["peak_current_a"]], limits.CURRENT_LIMIT_A, "A"),
+        {
+            "mode": Mode(int(row["mode"])).label,
+            "at_s": float(time),
+            "trigger": to_text(row["trigger"]),
+            "reason": to_text(row["reason"]),
+        }
+        for row, time in zip(packets, seconds(packets), strict=True)
+    ]
+
+
+def _health(packets: PacketArray) -> Object | None:
+    """Return the share of time with each stream good, the facts and the resources; None without packets."""
+    if not len(packets):
+        return None
+    streams = {
+        name: float(np.mean(packets[name] == StreamState.GOOD))
+        for name in ("imu", "field", "coils", "power", "camera")
+        if (packets[name] != StreamState.NOT_FITTED).any()
+    }
+    held = int(np.bitwise_or.reduce(packets["facts"].astype(np.uint64)))
+
+    def known(name: str) -> FloatArray:
+        values: FloatArray = packets[name][np.isfinite(packets[name])]
+        return values if len(values) else np.array([math.nan])
+
+    return {
+        "streams_good": streams,
+        "facts": [fact.name for bit, fact in enumerate(FACTS) if held >> bit & 1],
+        "watchdog_fed": int(packets["fed"][-1]),
+        "clock_steps": int(packets["clock_steps"][-1]),
+        "cpu_share": float(known("cpu_share").max()),
+        "proportional_bytes": float(known("proportional").max()),
+        "memory_slope_bytes_per_hour": float(known("memory_slope")[-1]) * 3600.0,
+        "disk_free_bytes": float(known("disk_free")[-1]),
+        "temperature_c": float(known("temperature").max()),
+    }
+
+
+def _events(packets: PacketArray) -> list[Object]:
+    """Return the events by name in order of first appearance. `count` includes the throttled events."""
+    found: dict[str, Object] = {}
+    for row, time in zip(packets, seconds(packets), strict=True):
+        name, text = to_text(row["name"]), to_text(row["text"])
+        first = {"name": name, "count": 0, "severity": int(row["severity"]), "first_s": float(time)}
+        found.setdefault(name, {**first, "text": text})["count"] += 1 + int(row["suppressed"])
+    return list(found.values())
+
+
+def _logs(run: Run) -> list[Object]:
+    """Return the integrity of each log that has data."""
+    return [
+        {
+            "log": stem,
+            "bytes": log.total_bytes,
+            "packets": sum(log.counts.values()),
+            "counts": log.counts,
+            "skipped_bytes": log.skipped_bytes,
+            "truncated_bytes": log.truncated_bytes,
+            "missing_packets": sum(log.missing.values()),
+            "other_versions": log.other_versions,
+            "dropped_segments": run.dropped_segments(stem),
+        }
+        for stem, log in run.logs.items()
+        if log.total_bytes
     ]

@@ -1,4 +1,4 @@
-"""The report as text, from the object that `ground.report.summary.summarise` makes."""
+"""The report as text, from the object that `ground.report.summary.summarise` returns."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from flight.link.telemetry.definitions import SEVERITIES
-from ground.report.performance import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
+from ground.report.steps import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
 
 Object = dict[str, Any]
 
 ARCSECONDS = 648_000.0 / math.pi
-_LISTED = 20
+DEGREES = 180.0 / math.pi
+_MAX_LISTED = 20
+"""Number of failed frames that the text lists."""
 
 
 def format_report(summary: Object) -> str:
@@ -23,11 +25,15 @@ def format_report(summary: Object) -> str:
         _detumbling(summary["detumbling"]),
         _knowledge(summary["knowledge"]),
         _pointing(summary["pointing"]),
-        _bounds("Against the requirements of the configuration", "required", summary["requirements"]),
-        _bounds("Worst against the thesis (Sease 2013, Table 5.3 and ch. 5)", "bound", summary["thesis"]),
+        _limits("Requirements of the configuration", "required", summary["requirements"]),
+        _limits(
+            "Worst values and limits of the thesis (Sease 2013, Table 5.3 and ch. 5)",
+            "limit",
+            summary["thesis"],
+        ),
         _power(summary["power"], bool(summary["thesis"])),
         _loop(summary),
-        _planner(summary),
+        _planner(summary["planner"]),
         _sensing(summary),
         _objects(summary["objects"]),
         _modes(summary["modes"]),
@@ -40,7 +46,7 @@ def format_report(summary: Object) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return aligned lines, two spaces in: the first column to the left, the others to the right."""
+    """Return aligned lines, indented by two spaces. The first column is left-aligned, the others right."""
     cells = [list(head), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return [
@@ -51,23 +57,23 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Return a number with a fixed count of decimals, "-" for None."""
+    """Return a number with a fixed count of decimals, or "-" for None."""
     return "-" if value is None else f"{value * scale:.{digits}f}"
 
 
-def _signed(q2: float | None) -> str:
-    return "-" if q2 is None else f"{q2:+.3f}"
+def provenance(run: Object) -> str:
+    """Return configuration, devices, pace, seed and software of a run; empty if they are not known."""
+    if "software" not in run:
+        return ""
+    devices = f"simulated devices, seed {run['seed']}" if run["simulated"] else "real devices"
+    pace = "real time" if run["realtime"] else "lock-step"
+    return f"{run['config_name']} on {devices}, {pace}, software {run['software']}"
 
 
 def _headline(summary: Object) -> list[str]:
     run = summary["run"]
-    lines = [f"Run {run['folder']}: {number(run['duration_s'], 1)} s"]
-    if "software" in run:
-        devices = "simulated hardware" if run["simulated"] else "hardware"
-        pace = "real time" if run["realtime"] else "lock-step"
-        seed = f", seed {run['seed']}" if run["simulated"] else ""
-        lines.append(f"{run['config_name']} on {devices}, {pace}{seed}, software {run['software']}")
-    return lines
+    origin = provenance(run)
+    return [f"Run {run['folder']}: {number(run['duration_s'], 1)} s", *([origin] if origin else [])]
 
 
 def _steps(summary: Object) -> list[str]:
@@ -75,11 +81,11 @@ def _steps(summary: Object) -> list[str]:
         return []
     rows = []
     for step in summary["steps"]:
+        start, target = ("-" if q2 is None else f"{q2:+.3f}" for q2 in (step["from_q2"], step["target_q2"]))
         rise = number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
         rows.append(
             [
-                f"{step['index']}{' again' if step['again'] else ''}  "
-                f"{_signed(step['from_q2'])} -> {_signed(step['target_q2'])}",
+                f"{step['index']}{' again' if step['again'] else ''}  {start} -> {target}",
                 number(step["start_s"], 1),
                 number(step["steady_state_deg"]),
                 number(step["overshoot_percent"], 1),
@@ -87,119 +93,118 @@ def _steps(summary: Object) -> list[str]:
                 number(step["settling_s"]),
             ]
         )
-    head = ["step, q2", "at s", "steady state deg", "overshoot %", "rise s", "settling s"]
-    lines = [f"Attitude steps, judged on the {summary['attitude_source']}", *table(head, rows)]
+    head = ["step, q2", "start s", "steady state deg", "overshoot %", "rise s", "settling s"]
+    source = {"truth": "true", "estimate": "estimated"}[summary["attitude_source"]]
+    lines = [f"Attitude steps, judged on the {source} attitude", *table(head, rows)]
     if any(not step["rise_judged"] for step in summary["steps"]):
-        lines.append("  * from the release, or from a body on its way: its rise is not judged")
+        lines.append("  * the step began at the release or during another slew; its rise time is not judged")
     return [
         *lines,
-        "  rise: from 10 to 90 % of the step; overshoot: beyond the target, in % of the step;",
-        f"  settling: the last entry into +-{100 * SETTLING_BAND:g} % of the step about the target;",
-        f"  steady state: the largest error in the last {STEADY_STATE_S:g} s of a target that stands for "
+        "  rise: time from 10 to 90 % of the step; overshoot: excursion beyond the target, in % of the step;",
+        f"  settling: last entry into +-{100 * SETTLING_BAND:g} % of the step around the target;",
+        f"  steady state: largest error in the last {STEADY_STATE_S:g} s, for targets held for "
         f"{2 * STEADY_STATE_S:g} s or more;",
-        f"  a step that ended within {SETTLING_LIMIT_S:g} s, not settled, is interrupted and not judged",
+        f"  a step that ended within {SETTLING_LIMIT_S:g} s without settling is interrupted and not judged",
     ]
 
 
 def _detumbling(found: Object | None) -> list[str]:
     if found is None:
         return []
-    degrees = 180.0 / math.pi
     rows = [
         [
             number(period["begin_s"], 1),
             number(period["duration_s"], 1),
-            *(number(period[f"{name}_rate_rad_s"], 2, degrees) for name in ("first", "largest", "last")),
+            *(number(period[f"{name}_rate_rad_s"], 2, DEGREES) for name in ("first", "largest", "last")),
             "yes" if period["slowed"] else "no",
         ]
         for period in found["periods"]
     ]
-    head = ["braked from s", "for s", "first deg/s", "largest deg/s", "last deg/s", "slow in the end"]
+    head = ["start s", "duration s", "first deg/s", "maximum deg/s", "last deg/s", "detumbled"]
     known, error = found["rate_known_share"], found["rate_error_rms_rad_s"]
     return [
-        f"Detumbling, rates of the {'truth' if found['rate_source'] == 'truth' else 'gyro'}",
+        f"Detumbling, rates from the {'truth' if found['rate_source'] == 'truth' else 'gyro'}",
         *table(head, rows),
-        f"  rate by the magnetometer alone: known {number(known, 1, 100.0)} % of the time, error "
-        f"{number(error, 3, degrees)} deg/s rms an axis, found again {found['restarts']} times",
+        f"  rate from the magnetometer alone: available {number(known, 1, 100.0)} % of the time, "
+        f"{number(error, 3, DEGREES)} deg/s rms error per axis, {found['restarts']} restarts",
     ]
 
 
 def _knowledge(found: Object | None) -> list[str]:
     if found is None:
         return []
-    degrees = 180.0 / math.pi
     share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
     dipole = found["dipole_error_share"]
     return [
         "Attitude knowledge",
-        f"  {share}; fine first at {number(found['fine_after_s'], 1)} s",
-        f"  error while fine {number(found['fine_error_rms_rad'], 4, degrees)} deg rms of three axes "
-        f"(with stars {number(found['with_stars_error_rms_rad'], 4, degrees)}), "
-        f"at most {number(found['fine_error_worst_rad'], 4, degrees)}; "
-        f"{number(found['worst_sigmas'], 1)} sigma of an axis at most, "
-        f"NEES of an axis {number(found['nees_per_axis'], 2)}",
-        f"  residual dipole known to {number(dipole['sunlight'], 0, 100.0)} % in the last ten minutes of "
-        f"sunlight, {number(dipole['shadow'], 0, 100.0)} % in those of shadow",
-        f"  refused {found['refused']} measurements and {found['fixes_refused']} fixes, "
-        f"{found['restarts']} new starts",
+        f"  {share}; first fine at {number(found['fine_after_s'], 1)} s",
+        f"  error while fine {number(found['fine_error_rms_rad'], 4, DEGREES)} deg rms over three axes "
+        f"({number(found['with_stars_error_rms_rad'], 4, DEGREES)} with stars), "
+        f"maximum {number(found['fine_error_worst_rad'], 4, DEGREES)} deg; "
+        f"maximum {number(found['worst_sigmas'], 1)} sigma per axis, "
+        f"NEES per axis {number(found['nees_per_axis'])}",
+        "  error of the residual dipole in the last ten minutes: "
+        f"{number(dipole['sunlight'], 0, 100.0)} % in sunlight, "
+        f"{number(dipole['shadow'], 0, 100.0)} % in shadow",
+        f"  {found['refused']} measurements and {found['fixes_refused']} fixes refused, "
+        f"{found['restarts']} restarts",
     ]
 
 
 def _pointing(found: Object | None) -> list[str]:
     if found is None:
         return []
-    degrees = 180.0 / math.pi
     errors = ("axis_rms_rad", "axis_worst_rad", "all_axes_rms_rad")
     rows = [
         [
-            aim["target"],
-            number(aim["begin_s"], 1),
-            number(aim["duration_s"], 1),
-            *(number(aim[name], 2, degrees) for name in errors),
-            number(aim["supply_w"], 2, 1e3),
-            number(aim["heat_w"], 2, 1e3),
+            target["target"],
+            number(target["begin_s"], 1),
+            number(target["duration_s"], 1),
+            *(number(target[name], 2, DEGREES) for name in errors),
+            number(target["supply_w"], 2, 1e3),
+            number(target["heat_w"], 2, 1e3),
         ]
-        for aim in found["targets"]
+        for target in found["targets"]
     ]
-    head = [
-        "pointing to",
-        "from s",
-        "for s",
-        "axis deg rms",
-        "at most",
-        "all axes deg rms",
-        "V |I| mW",
-        "R I^2 mW",
-    ]
+    head = ["target", "start s", "duration s", "axis deg rms", "maximum", "all axes deg rms"]
     return [
         f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
-        *table(head, rows),
-        f"  errors from {number(found['settled_after_s'], 0)} s after the begin on, or the first slew's end",
+        *table([*head, "V |I| mW", "R I^2 mW"], rows),
+        f"  errors count from {number(found['settled_after_s'], 0)} s after the start, or from the end "
+        "of the first slew if that is later",
     ]
 
 
 def _objects(found: list[Object]) -> list[str]:
     if not found:
         return []
-    degrees = 180.0 / math.pi
     rows = [
         [
             str(row["number"]),
             number(row["first_s"], 1),
             number(row["last_s"], 1),
             f"{row['seen']} of {row['frames']}",
-            number(row["rate_least_rad_s"], 3, degrees),
-            number(row["rate_most_rad_s"], 3, degrees),
+            number(row["rate_least_rad_s"], 3, DEGREES),
+            number(row["rate_most_rad_s"], 3, DEGREES),
             number(row["magnitude"], 1),
             number(row["sighting_sigma_rad"], 2, ARCSECONDS),
         ]
         for row in found
     ]
-    head = ["object", "from s", "to s", "seen in", "deg/s least", "most", "V", "sigma of a sighting, arcsec"]
+    head = [
+        "object",
+        "start s",
+        "end s",
+        "detected in",
+        "minimum deg/s",
+        "maximum deg/s",
+        "V",
+        "sigma arcsec",
+    ]
     return ["Objects among the stars", *table(head, rows)]
 
 
-def _bounds(title: str, bound: str, judged: list[Object]) -> list[str]:
+def _limits(title: str, limit: str, judged: list[Object]) -> list[str]:
     if not judged:
         return []
     rows = [
@@ -211,49 +216,50 @@ def _bounds(title: str, bound: str, judged: list[Object]) -> list[str]:
         ]
         for row in judged
     ]
-    return [title, *table(["", "here", bound, ""], rows)]
+    return [title, *table(["", "this run", limit, ""], rows)]
 
 
-def _power(power: Object, compared: bool) -> list[str]:
-    """Return the lines of the power, `compared` with the thesis's."""
+def _power(power: Object, thesis: bool) -> list[str]:
+    """Return the lines of the coil power, with the consumption stated in the thesis if `thesis`."""
     if power["source"] is None:
         return []
     currents = (
-        (power["peak_current_a"], "written"),
+        (power["peak_current_a"], "commanded"),
         (power["peak_current_actual_a"], "in the coils (truth)"),
     )
-    largest = [f"{number(value, 4)} A {where}" for value, where in currents if value is not None]
-    thesis = "on average on the order of 100 mW, at most about 0.5 W"
     rows = [
         (
             "supply power V |I| at the coils",
-            f"on average {number(power['supply_average_w'], 1, 1e3)} mW, "
-            f"at most {number(power['supply_peak_w'], 3)} W, {number(power['supply_j'], 2)} J in all",
+            f"average {number(power['supply_average_w'], 1, 1e3)} mW, "
+            f"maximum {number(power['supply_peak_w'], 3)} W, total {number(power['supply_j'], 2)} J",
         ),
-        ("supply power measured at the bus", f"on average {number(power['bus_average_w'], 1, 1e3)} mW"),
-        *([("consumption stated in the thesis", thesis)] if compared else []),
+        ("supply power measured at the bus", f"average {number(power['bus_average_w'], 1, 1e3)} mW"),
+        *(
+            [("consumption stated in the thesis", "average about 100 mW, maximum about 0.5 W")]
+            if thesis
+            else []
+        ),
         (
             "R I^2, heat of steady currents",
-            f"on average {number(power['heat_average_w'], 3, 1e3)} mW, {number(power['heat_j'], 3)} J in all",
+            f"average {number(power['heat_average_w'], 3, 1e3)} mW, total {number(power['heat_j'], 3)} J",
         ),
-        ("largest current", ", ".join(largest)),
+        (
+            "largest current",
+            ", ".join(f"{number(value, 4)} A {where}" for value, where in currents if value is not None),
+        ),
     ]
-    return [
-        f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
-        *(f"  {name:34}{text}" for name, text in rows),
-    ]
+    source = "currents in the coils (truth)" if power["source"] == "truth" else "commanded currents"
+    return [f"Coil power, from the {source}", *(f"  {name:34}{text}" for name, text in rows)]
 
 
 def _loop(summary: Object) -> list[str]:
-    lines = []
+    lines, cycles = [], summary["cycles"]
     if summary["rate_groups"]:
         rows = [
             [
                 group["name"],
                 number(group["period_s"], 3),
-                str(group["cycles"]),
-                str(group["slips"]),
-                str(group["overruns"]),
+                *(str(group[name]) for name in ("cycles", "slips", "overruns")),
                 number(group["mean_s"], 3, 1e3),
                 number(group["max_s"], 3, 1e3),
             ]
@@ -262,8 +268,8 @@ def _loop(summary: Object) -> list[str]:
         head = ["rate group", "period s", "cycles", "slips", "overruns", "mean ms", "max ms"]
         lines += ["Rate groups", *table(head, rows)]
     timed = {
-        "lateness of a control cycle": summary["cycles"]["lateness_s"],
-        "execution of a control cycle": summary["cycles"]["execution_s"],
+        "lateness of a control cycle": cycles["lateness_s"],
+        "execution of a control cycle": cycles["execution_s"],
         **{
             f"{job['name']}: {job['count']} jobs ({_tally(job['outcomes'])})": job["execution_s"]
             for job in summary["jobs"]
@@ -276,19 +282,17 @@ def _loop(summary: Object) -> list[str]:
     ]
     if rows:
         lines += ["Times", *table(["", "median ms", "99 % ms", "max ms"], rows)]
-    cycles = summary["cycles"]
-    return [*lines, f"Control cycles in the log: {cycles['count']}, slots without one: {cycles['skipped']}"]
+    return [*lines, f"Control cycles in the log: {cycles['count']}, skipped slots: {cycles['skipped']}"]
 
 
-def _planner(summary: Object) -> list[str]:
-    plans = summary["planner"]
+def _planner(plans: Object) -> list[str]:
     if not plans["plans"]:
         return []
     refusals = f" ({_tally(plans['refusals'])})" if plans["refusals"] else ""
     return [
         "Planner",
-        f"  plans {plans['plans']}, flown {plans['accepted']} of which stretched {plans['stretched']}, "
-        f"refused {plans['refused']}{refusals}",
+        f"  {plans['plans']} plans, {plans['accepted']} accepted ({plans['stretched']} of them stretched), "
+        f"{plans['refused']} refused{refusals}",
         f"  longest horizon {number(plans['longest_horizon_s'], 1)} s, "
         f"largest planned current {number(plans['peak_current_a'], 4)} A",
     ]
@@ -296,62 +300,54 @@ def _planner(summary: Object) -> list[str]:
 
 def _sensing(summary: Object) -> list[str]:
     lines = []
-    estimate = summary["estimate"]
+    estimate, streaks, stars = summary["estimate"], summary["streaks"], summary["stars"]
     if estimate is not None:
         lines.append(
             f"Estimate: rms error {number(estimate['angle_rms_rad'], 3, 1e3)} mrad, "
-            f"{number(estimate['rate_rms_rad_s'], 3, 1e3)} mrad/s; "
-            f"over its own sigma {number(estimate['angle_normalised'])}, "
-            f"{number(estimate['rate_normalised'])}"
+            f"{number(estimate['rate_rms_rad_s'], 3, 1e3)} mrad/s; divided by the estimated sigma "
+            f"{number(estimate['angle_normalised'])}, {number(estimate['rate_normalised'])}"
         )
-    streaks = summary["streaks"]
     if streaks["frames"]:
         lines.append(
             f"Streaks: {streaks['frames']} frames ({_tally(streaks['status'])}), "
-            f"{streaks['rates']} rates, {streaks['accepted']} into the estimate"
+            f"{streaks['rates']} rates, {streaks['accepted']} used by the estimator"
         )
-    if streaks["rms_error"] is not None:
-        errors = ", ".join(number(error, 3, 1e3) for error in streaks["rms_error"])
+        lines += _errors(streaks, "x, y, z", "mrad/s", 3, 1e3, "rates")
+    if stars["frames"]:
         lines.append(
-            f"  rms error x, y, z {errors} mrad/s of {streaks['compared']} rates; "
-            f"mean e' P^-1 e / 3 = {number(streaks['normalised'])}"
+            f"Stars:   {stars['frames']} frames ({_tally(stars['status'])}), {stars['tracked']} tracked, "
+            f"median of {number(stars['matched'], 0)} matches, {stars['accepted']} used by the estimator"
         )
-    return lines + _stars(summary["stars"]) + _failed_frames(summary["failed_frames"])
-
-
-def _failed_frames(frames: list[Object]) -> list[str]:
+        lines += _errors(stars, "about x, y, z", "arcsec", 2, ARCSECONDS, "attitudes")
+    frames = summary["failed_frames"]
     if not frames:
-        return []
+        return lines
     rows = [
         [str(frame["sequence"]), number(frame["exposed_s"], 3), frame["streaks"], frame["stars"] or "-"]
-        for frame in frames[:_LISTED]
+        for frame in frames[:_MAX_LISTED]
     ]
-    more = [f"  and {len(frames) - _LISTED} more: --json lists all"] if len(frames) > _LISTED else []
+    more = len(frames) - _MAX_LISTED
     head = ["frame", "exposed at s", "streaks", "stars"]
-    return [f"Frames without rate or attitude: {len(frames)}", *table(head, rows), *more]
+    lines += [f"Frames without rate or attitude: {len(frames)}", *table(head, rows)]
+    return lines + ([f"  and {more} more; --json lists all"] if more > 0 else [])
 
 
-def _stars(stars: Object) -> list[str]:
-    if not stars["frames"]:
+def _errors(found: Object, axes: str, unit: str, digits: int, scale: float, what: str) -> list[str]:
+    """Return the line of the rms errors against the truth, or nothing if they are not known."""
+    if found["rms_error"] is None:
         return []
-    lines = [
-        f"Stars:   {stars['frames']} frames ({_tally(stars['status'])}), {stars['tracked']} tracked, "
-        f"{number(stars['matched'], 0)} stars matched in the median, {stars['accepted']} into the estimate"
+    errors = ", ".join(number(error, digits, scale) for error in found["rms_error"])
+    return [
+        f"  rms error {axes} {errors} {unit} over {found['compared']} {what}; "
+        f"mean e' P^-1 e / 3 = {number(found['normalised'])}"
     ]
-    if stars["rms_error"] is not None:
-        errors = ", ".join(number(error, 2, ARCSECONDS) for error in stars["rms_error"])
-        lines.append(
-            f"  rms error about x, y, z {errors} arcsec of {stars['compared']} attitudes; "
-            f"mean e' P^-1 e / 3 = {number(stars['normalised'])}"
-        )
-    return lines
 
 
 def _modes(modes: list[Object]) -> list[str]:
     if not modes:
         return []
     rows = [[mode["mode"], number(mode["at_s"], 3), mode["trigger"], mode["reason"] or "-"] for mode in modes]
-    return ["Modes", *table(["", "at s", "by", "because"], rows)]
+    return ["Modes", *table(["", "start s", "trigger", "reason"], rows)]
 
 
 def _health(health: Object | None) -> list[str]:
@@ -360,12 +356,12 @@ def _health(health: Object | None) -> list[str]:
     good = ", ".join(f"{name} {number(share, 1, 1e2)} %" for name, share in health["streams_good"].items())
     lines = [
         f"Health: streams good {good}",
-        f"  facts that counted: {', '.join(health['facts']) or 'none'}; "
+        f"  facts raised: {', '.join(health['facts']) or 'none'}; "
         f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
     ]
     if health["proportional_bytes"] is not None:
         lines.append(
-            f"  at most {number(health['cpu_share'])} of a core, "
+            f"  maximum {number(health['cpu_share'])} of a core, "
             f"{number(health['proportional_bytes'], 0, 2.0**-20)} MiB, "
             f"{number(health['temperature_c'], 1)} deg C; memory slope "
             f"{number(health['memory_slope_bytes_per_hour'], 2, 2.0**-20)} MiB/h; "
@@ -377,22 +373,31 @@ def _health(health: Object | None) -> list[str]:
 def _events(events: list[Object]) -> list[str]:
     if not events:
         return []
+    names = dict(SEVERITIES)
     rows = [
-        [event["name"], _severity(event["severity"]), str(event["count"]), number(event["first_s"], 3)]
+        [
+            event["name"],
+            names.get(event["severity"], str(event["severity"])),
+            str(event["count"]),
+            number(event["first_s"], 3),
+        ]
         for event in events
     ]
     return ["Events", *table(["", "severity", "count", "first at s"], rows)]
 
 
-def _severity(code: int) -> str:
-    return dict(SEVERITIES).get(code, str(code))
-
-
 def _logs(logs: list[Object]) -> list[str]:
-    keys = ["packets", "bytes", "skipped_bytes", "truncated_bytes", "missing_packets", "other_versions"]
-    keys.append("dropped_segments")
-    head = ["log", "packets", "bytes", "skipped", "cut off", "missing", "other version", "dropped segments"]
-    return ["Log integrity", *table(head, [[log["log"], *(str(log[key]) for key in keys)] for log in logs])]
+    columns = {
+        "packets": "packets",
+        "bytes": "bytes",
+        "skipped_bytes": "skipped bytes",
+        "truncated_bytes": "truncated bytes",
+        "missing_packets": "missing packets",
+        "other_versions": "other versions",
+        "dropped_segments": "dropped segments",
+    }
+    rows = [[log["log"], *(str(log[key]) for key in columns)] for log in logs]
+    return ["Log integrity", *table(["log", *columns.values()], rows)]
 
 
 def _tally(counts: dict[str, int]) -> str:

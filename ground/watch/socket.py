@@ -12,7 +12,7 @@ from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT
 from flight.link.telemetry.packets import PacketArray, TelemetryError
 from ground.commands.command import exchange
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from knightcube.errors import FlightError, UsageError
 
 _TIMEOUT_S = 2.0

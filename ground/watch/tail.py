@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import PacketArray
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from knightcube.errors import UsageError
 
 _STEM = "flight"

@@ -18,7 +18,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LAYOUTS, to_text
 from ground.commands.command import exchange
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from tests.deploy.scripts import DEPLOY, script
 
 safe_state = script("safe_state")

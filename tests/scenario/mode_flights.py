@@ -11,7 +11,7 @@ from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from flight.schema.testbed import TestbedConfig
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Release, Simulation
 from tests.support.flights import demo_config, demo_world

@@ -12,7 +12,7 @@ from flight.schema.carried import config_path
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from ground.report.signals import true_attitude
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.settings import Simulation
 from tests.support.flights import event_names, fly
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema.reader import replace
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.faults import config_for
 from tests.support.flights import demo_world, event_names, fly

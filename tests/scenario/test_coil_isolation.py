@@ -12,7 +12,7 @@ from flight.link.telemetry.packets import to_text
 from flight.loop.fdir.resources import ResourceSample
 from flight.schema.reader import replace
 from flight.schema.sections import Modes
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry

@@ -12,8 +12,7 @@ import pytest
 from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from ground.telemetry.reader import Run
-from ground.telemetry.scanner import decode
+from ground.telemetry import Run, decode
 from tests.scenario.mode_flights import commanded, modes_of
 from tests.support.flights import Rigged, demo_config, event_names, fly
 

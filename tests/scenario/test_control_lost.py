@@ -17,7 +17,7 @@ import pytest
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured

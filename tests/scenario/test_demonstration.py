@@ -14,7 +14,7 @@ import pytest
 
 from flight.schema import reader as configuration
 from ground import report
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from tests.studies.campaigns.controllers import clairvoyant_power
 from tests.support.flights import CONFIG, demo_config, demo_world, fly
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 

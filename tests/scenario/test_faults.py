@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.schema.reader import replace
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry

@@ -13,7 +13,7 @@ import pytest
 from flight.link.modes import Mode
 from flight.loop.fdir.facts import FACTS, IMU_POOR, TASK_FAILING, StreamState
 from flight.loop.fdir.resources import ResourceSample
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.mode_flights import commanded, modes_of
 from tests.support.flights import Rigged, demo_config, event_names, fly

@@ -16,7 +16,7 @@ from flight.loop.executive.executive import RateGroup
 from flight.loop.fdir.facts import FACTS
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from tests.scenario.test_objects import flight_with_objects, two_objects
 from tests.scenario.test_orbit import orbit_config, world
 from tests.support.flights import Rigged, demo_config, event_names, fly

@@ -11,11 +11,12 @@ import pytest
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
 from ground.export.tracking_data import write_tracking_data
-from ground.report.objects import objects
-from ground.report.objects_figure import objects_figure
+from ground.report.orbit import objects
+from ground.report.orbit_figures import objects_figure
+from ground.report.panels import RunSignals
 from ground.report.summary import summarise
 from ground.report.text import format_report
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
@@ -107,7 +108,7 @@ def test_the_report_lists_and_draws_them(tracked: Run) -> None:
         assert np.degrees(row["rate_most_rad_s"]) == pytest.approx(line.rate_deg, rel=0.05)
         assert 3 < row["seen"] <= row["frames"]
     assert "Objects among the stars" in format_report(summarise(tracked))
-    assert objects_figure(tracked) is not None
+    assert objects_figure(RunSignals(tracked)) is not None
 
 
 def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from sim_hal.faults.schedule import check
@@ -118,7 +118,7 @@ def test_the_report_shows_the_detumbling_and_no_steps(flown: Run) -> None:
     assert first["slowed"]
     assert first["first_rate_rad_s"] == pytest.approx(SPEED, rel=0.05)
     text = format_report(summary)
-    assert "Detumbling, rates of the truth" in text
+    assert "Detumbling, rates from the truth" in text
     assert "thesis" not in text
 
 

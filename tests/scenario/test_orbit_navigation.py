@@ -10,8 +10,8 @@ import pytest
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.report import format_report, summarise
-from ground.report.knowledge import FINE, AttitudeErrors, attitude_errors
-from ground.telemetry.reader import Run
+from ground.report.orbit import FINE, AttitudeErrors, attitude_errors
+from ground.telemetry import Run
 from knightcube.astro import quaternion
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody

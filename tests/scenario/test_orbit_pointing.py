@@ -10,7 +10,7 @@ from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.orbit import TargetStep
 from flight.schema.sections import Commands, CommandStep
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between
 from tests.scenario.mode_flights import modes_of
 from tests.scenario.test_orbit_navigation import navigating, skyward

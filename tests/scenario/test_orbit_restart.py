@@ -9,7 +9,7 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.settings import Simulation
 from tests.scenario.test_orbit_navigation import GYRO_BIAS, navigating, skyward
 from tests.support.flights import Rigged, event_names, fly

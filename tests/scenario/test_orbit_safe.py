@@ -8,7 +8,7 @@ import pytest
 from flight.link.modes import Mode
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from tests.scenario.mode_flights import currents, entered, modes_of
 from tests.scenario.test_orbit import orbit_config, speed, world
 from tests.support.flights import event_names, fly

@@ -11,7 +11,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
 from knightcube.gnc.control.three_axes import pointing_law
 from sim_hal.settings import FaultEntry, Simulation

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from ground.report.knowledge import COARSE, attitude_errors
-from ground.telemetry.reader import Run
+from ground.report.orbit import COARSE, attitude_errors
+from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
 from tests.scenario.test_orbit import orbit_config, world
 from tests.support.flights import fly

@@ -10,7 +10,7 @@ import pytest
 from flight.link.commands.codec import CommandPacker, DumpParameters, LoadParameters
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from tests.scenario.mode_flights import commanded
 from tests.scenario.test_commands import said
 from tests.support.flights import event_names

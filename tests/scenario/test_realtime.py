@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flight.link.telemetry.packets import to_text
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from tests.support.flights import CONFIG, event_names
 
 ROOT = CONFIG.parents[1]

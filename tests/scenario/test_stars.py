@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from sim_hal.emulators.serial_line import SOUND, LineFaults

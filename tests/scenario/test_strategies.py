@@ -10,7 +10,7 @@ import pytest
 
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.one_axis.plant import angle_of
 from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config

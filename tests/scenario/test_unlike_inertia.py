@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_other_body, without_cameras
 

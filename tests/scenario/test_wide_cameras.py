@@ -7,8 +7,8 @@ import pytest
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
-from ground.report.knowledge import COARSE, attitude_errors
-from ground.telemetry.reader import Run
+from ground.report.orbit import COARSE, attitude_errors
+from ground.telemetry import Run
 from tests.scenario.test_orbit import orbit_config, world
 from tests.support.flights import CONFIG, event_names, fly
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from ground.report.figures import DPI
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.images import grey_stretch

@@ -22,7 +22,7 @@ from flight.schema.testbed import as_testbed
 from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from knightcube.astro import catalogue
 from knightcube.astro.quaternion import about_axis_y, from_rotation_vector, multiply
 from knightcube.gnc.guidance.one_axis.vmc import plan

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link.telemetry.packets import to_text
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from tests.hal.guardian.live_flight import CoilTruth
 from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
 from tests.support.process_watch import MIB, Look

@@ -16,7 +16,7 @@ from flight.loop.flight_status import RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from hal.interfaces.wires import SECOND_NS, Rig
 from sim_hal import lockstep
 from sim_hal.lockstep import LockStep

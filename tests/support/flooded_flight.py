@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from tests.hal.guardian.live_flight import ROOT
 from tests.support.lateness import QUANTILES
 

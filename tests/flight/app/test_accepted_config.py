@@ -24,7 +24,7 @@ from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError, UnreadConfigError
 from flight.schema.testbed import as_testbed
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from sim_hal.faults.host import corrupted
 from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock

@@ -16,7 +16,7 @@ from flight.app.service import StartRetry, StoppedError, pauses, retried_start
 from flight.link.telemetry.packets import to_text
 from flight.loop.state.store import StateStore
 from flight.schema.errors import ConfigError, UnreadConfigError
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import write_config

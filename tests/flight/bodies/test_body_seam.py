@@ -13,7 +13,7 @@ from flight.loop.tasks.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from tests.support.flights import CONFIG, demo_config, fly

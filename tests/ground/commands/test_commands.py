@@ -16,7 +16,7 @@ import pytest
 from flight.app.cli import main
 from flight.app.cli.run import progress_on
 from flight.loop.flight_status import FlightProgress
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,7 +11,7 @@ from flight.link.telemetry.packets import LAYOUTS
 from ground.console.cursor import Cursor
 from ground.console.history import History
 from ground.console.instant import Instant, values
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
 LATER = 10**15

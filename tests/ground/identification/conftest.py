@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ground.identification.fit import Fit, fit
+from ground.identification.fit import PlantFit, fit
 from ground.identification.preparation import noise_of
 from ground.identification.record import Record
 from tests.ground.identification.worlds import World, believed, drawn, fly_bare
 
-Identified = tuple[World, Record, Fit]
+Identified = tuple[World, Record, PlantFit]
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,7 @@ from scipy.stats import chi2
 from ground.identification.fit import fit
 from ground.identification.preparation import excitation_config, noise_of
 from ground.identification.record import IdentificationError, Record, read_record
-from ground.telemetry.reader import Run
-from ground.telemetry.scanner import ScanResult
+from ground.telemetry import Run, ScanResult
 from knightcube.errors import UsageError
 from tests.ground.identification.worlds import World, believed, fly_stack, motion_error
 from tests.support import flights

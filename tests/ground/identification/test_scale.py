@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from flight.schema.reader import parse
 from flight.schema.testbed import as_testbed
 from ground.identification.constants import Constants
-from ground.identification.fit import Fit
+from ground.identification.fit import PlantFit
 from ground.identification.fragment import fragment, plant_section
 from ground.identification.preparation import beliefs_of, config_text, excitation_config
 from ground.identification.record import FieldMeasurement
@@ -23,7 +23,7 @@ from tests.support import flights
 BELIEFS = beliefs_of(believed())
 
 
-def scaled(found: Fit, beliefs: Beliefs, field: float | None) -> AbsolutePlant:
+def scaled(found: PlantFit, beliefs: Beliefs, field: float | None) -> AbsolutePlant:
     measured = None if field is None else FieldMeasurement(field, 0.0, 100)
     return absolute(found, beliefs, measured)
 

@@ -1,4 +1,4 @@
-"""Two runs side by side: every figure of both with its difference, and what was configured otherwise."""
+"""Reports over several runs: two runs side by side, and the table of an archive."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from flight.app.cli import main
 from ground.report import summarise
-from ground.report.comparison import compare, format_comparison
-from ground.telemetry.reader import read_run
+from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
+from ground.telemetry import read_run
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -67,7 +68,7 @@ def test_events_are_counted_in_both(pair: tuple[Path, Path]) -> None:
 def test_as_text_the_runs_stand_beside_each_other(pair: tuple[Path, Path]) -> None:
     done = command("report", *pair)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"A  {pair[0]}: 90.0 s of made-up, lock-step, seed 7")
+    assert done.stdout.startswith(f"A  {pair[0]}: 90.0 s of made-up on simulated devices, seed 7, lock-step")
     lines = [line.split() for line in done.stdout.splitlines()]
     assert ["guidance.horizon", "10.0", "13.0"] in lines
     assert ["duration", "s", "90", "60", "-30", "(-33", "%)"] in lines
@@ -80,7 +81,7 @@ def test_a_run_beside_itself_differs_in_nothing(pair: tuple[Path, Path]) -> None
     compared = compare(summary, summary)
     assert compared["configuration"] == []
     assert {row["difference"] for row in compared["figures"]} <= {0, None}
-    assert "Configured alike" in format_comparison(compared)
+    assert "The configurations are the same" in format_comparison(compared)
 
 
 def test_a_configuration_that_cannot_be_read_is_no_obstacle(pair: tuple[Path, Path], tmp_path: Path) -> None:
@@ -107,3 +108,38 @@ def test_both_are_drawn_over_each_other_where_a_folder_is_given(
 def test_what_is_no_run_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
     done = command("report", pair[0], tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+
+
+SHORT = Recipe(duration=4.0, planned=4.0, hold=2.0, rate_hz=10.0)
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """Return an archive of a whole run, one with a torn tail, one without a log, and something else."""
+    make_run(tmp_path / "run-000001", SHORT)
+    torn = make_run(tmp_path / "run-000002", SHORT) / "flight-0001.ccsds"
+    torn.write_bytes(torn.read_bytes()[:-30])
+    (tmp_path / "run-000003").mkdir()
+    (tmp_path / "state-a.json").write_text("{}")
+    return tmp_path
+
+
+def test_each_boot_has_its_row_and_damage_shows(archive: Path) -> None:
+    whole, torn, empty = summarise_archive(archive)["runs"]
+    assert whole["duration_s"] == 4.0
+    assert (whole["bad_bytes"], whole["missing_packets"]) == (0, 0)
+    assert torn["bad_bytes"] > 0
+    assert torn["packets"] == whole["packets"] - 1
+    assert (empty["packets"], empty["end"]) == (0, "no flight log")
+    text = format_archive(summarise_archive(archive))
+    assert text.startswith(f"Archive {archive}: 3 runs")
+    assert [line.split()[0] for line in text.splitlines()[2:]] == ["run-000001", "run-000002", "run-000003"]
+
+
+def test_the_command_reports_an_archive_as_text_and_as_json(
+    archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(archive)]) == 0
+    assert "run-000002" in capsys.readouterr().out
+    assert main(["report", str(archive), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["runs"]) == 3

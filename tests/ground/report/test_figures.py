@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.report import draw
-from ground.telemetry.reader import read_run
+from flight.bodies.testbed.thread import plant_of
+from flight.schema import reader as configuration
+from flight.schema.testbed import as_testbed
+from ground.report import draw, draw_path
+from ground.telemetry import read_run
 from knightcube.errors import UsageError
+from knightcube.gnc.guidance.one_axis.vmc import plan
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
@@ -19,7 +23,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ground.report import panels
-from ground.report.scene import Scene, planned_path
+from ground.report.figures import path_figure
+from ground.report.panels import RunSignals, planned_path
 
 EVERY = ["attitude", "current", "power", "paths", "cycle_times", "rate", "overview"]
 ROOT = Path(__file__).resolve().parents[3]
@@ -54,22 +59,22 @@ def test_every_picture_that_the_run_has_something_for_is_drawn(
 
 def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=120.0, rate_hz=10.0)))
-    scene, figure = Scene(run), Figure()
+    signals, figure = RunSignals(run), Figure()
     top, bottom = figure.subplots(2)
-    panels.attitude(top, scene)
+    panels.attitude(top, signals)
     lines = {str(line.get_label()): line for line in top.get_lines()}
     assert set(lines) == {"target", "estimated", "true"}
     np.testing.assert_array_equal(lines["estimated"].get_ydata(), run["control"]["q2"])
     np.testing.assert_allclose(lines["true"].get_ydata(), run["control"]["q2"], atol=1e-12)
-    panels.current(bottom, scene)
+    panels.current(bottom, signals)
     drawn = np.asarray(bottom.get_lines()[0].get_ydata())
     assert drawn.max() == CURRENT
 
 
 def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tmp_path: Path) -> None:
     """0.1 A in a tenth of the time: 34 mW at 3.4 V, 50 mW measured at the bus, 23 mW of R I^2."""
-    scene, ax = Scene(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots()
-    panels.power(ax, scene)
+    signals, ax = RunSignals(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots()
+    panels.power(ax, signals)
     drawn = {str(line.get_label()): np.asarray(line.get_ydata(), float) for line in ax.get_lines()}
     assert drawn["$V |I|$ at the coils"].max() == pytest.approx(0.34)
     assert drawn["average, 34.0 mW"][-1] == pytest.approx(0.034)
@@ -79,8 +84,8 @@ def test_the_thesis_line_stands_beside_the_supply_power_and_r_i_squared_apart(tm
 
 
 def test_two_runs_are_compared_by_their_supply_power(tmp_path: Path) -> None:
-    scene, axes = Scene(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots(3)
-    panels.compared(axes, scene, "A", "black")
+    signals, axes = RunSignals(read_run(make_run(tmp_path, Recipe(rate_hz=5.0)))), Figure().subplots(3)
+    panels.compared(axes, signals, "A", "black")
     assert np.asarray(axes[2].get_lines()[0].get_ydata(), float)[-1] == pytest.approx(34.0)
 
 
@@ -123,7 +128,7 @@ def test_values_that_only_a_damaged_log_has_do_not_keep_a_panel_from_being_drawn
     run.truth.packets["truth"] = damaged
     axes = Figure().subplots()
     with np.errstate(invalid="ignore"):
-        panels.rate_error(axes, Scene(run))
+        panels.rate_error(axes, RunSignals(run))
     assert np.isfinite(axes.get_ylim()).all()
 
 
@@ -138,7 +143,7 @@ def test_a_planned_path_passes_through_its_nodes_and_is_the_polynomial_between(t
 
 
 def test_the_report_on_board_imports_no_matplotlib() -> None:
-    code = "import sys, ground.report, ground.telemetry.reader; print('matplotlib' in sys.modules)"
+    code = "import sys, ground.report, ground.telemetry; print('matplotlib' in sys.modules)"
     printed = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -157,5 +162,26 @@ def test_without_matplotlib_the_cure_is_reported(tmp_path: Path, monkeypatch: py
 def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=1.0, rate_hz=10.0)))
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="no pictures can be written there"):
+    with pytest.raises(UsageError, match="the picture cannot be written"):
         draw(run, tmp_path / "file")
+
+
+def test_a_path_is_drawn_from_its_start_to_its_target_within_the_limit(tmp_path: Path) -> None:
+    plant = plant_of(as_testbed(configuration.load(ROOT / "config" / "step_demo.yaml")))
+    made = plan(plant, -0.3, 0.0, -0.2, 0.0, 10.0)
+    attitude, rate, current = path_figure(made, plant).axes
+    q2 = np.asarray(attitude.get_lines()[0].get_ydata())
+    assert (q2[0], q2[-1]) == pytest.approx((-0.3, -0.2), abs=1e-9)
+    line = rate.get_lines()[0]
+    values, spans = np.asarray(line.get_ydata()) / 1e3, np.diff(np.asarray(line.get_xdata()))
+    assert 0.5 * (values[1:] + values[:-1]) @ spans == pytest.approx(
+        2.0 * (np.arcsin(-0.2) - np.arcsin(-0.3)), abs=1e-4
+    )
+    drawn = np.abs(np.asarray(current.get_lines()[0].get_ydata()))
+    assert drawn.max() == pytest.approx(made.peak_current, rel=0.02)
+    assert drawn.max() <= 1.001 * plant.current_limit
+    file = tmp_path / "path.png"
+    draw_path(made, plant, file)
+    assert imread(file).std() > 0.01
+    with pytest.raises(UsageError, match="the picture cannot be written"):
+        draw_path(made, plant, tmp_path)

@@ -13,10 +13,8 @@ from flight.link.telemetry.definitions import STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from ground.report import format_report, summarise
-from ground.report.sensing import covariance_matrices, mean_rates
-from ground.report.signals import coil_power
-from ground.telemetry.reader import Run, read_run
-from ground.telemetry.scanner import scan
+from ground.report.signals import coil_power, covariance_matrices, mean_rates
+from ground.telemetry import Run, read_run, scan
 from tests.ground.report.synthetic import (
     CURRENT,
     DAMPING,
@@ -109,7 +107,7 @@ def test_a_run_cut_short_is_judged_on_its_complete_steps_and_says_so(tmp_path: P
     ] == 4 * [None]
     assert summary["run"]["cut_short"]
     assert "cut short: 250.0 s of 700.0 s" in summary["notes"]
-    assert "step 2: not complete, not judged" in summary["notes"]
+    assert "step 2: the log does not cover the whole step, not judged" in summary["notes"]
     assert {row["verdict"] for row in summary["thesis"]} == {"pass"}
 
 
@@ -125,14 +123,14 @@ def test_a_run_without_targets_has_no_steps_and_unknown_verdicts(tmp_path: Path)
     verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
     assert verdicts["rise time"] == verdicts["overshoot"] == "unknown"
     assert verdicts["average supply power at the coils"] == "pass"
-    assert "no target packets: no steps to judge" in summary["notes"]
+    assert "no target packets: no attitude step can be judged" in summary["notes"]
 
 
 def test_a_step_of_no_size_is_distinguished_from_one_never_made(tmp_path: Path) -> None:
     summary = summarise(short(tmp_path, duration=300.0, planned=300.0, targets=(-0.3, -0.3, -0.2)))
     assert summary["steps"][1]["complete"]
     assert summary["steps"][1]["rise_s"] is None
-    assert "step 1: the target stays where it was, only the steady state is judged" in summary["notes"]
+    assert "step 1: the target equals the previous one, only the steady state is judged" in summary["notes"]
     verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
     assert verdicts["rise time"] == "pass"
 
@@ -205,7 +203,7 @@ def test_a_run_without_its_identity_is_still_reported(tmp_path: Path) -> None:
     assert coil_power(run) is None
     summary = summarise(run)
     assert "no run packet: the configuration of this run is not known" in summary["notes"]
-    assert "power not known: neither truth nor coil resistance in the log" in summary["notes"]
+    assert "power not known: the log has neither truth nor coil resistance" in summary["notes"]
     assert [step["complete"] for step in summary["steps"]] == [True, True, False]
     assert format_report(summary)
 
@@ -290,12 +288,10 @@ def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     for row in ("steady-state error", "overshoot", "rise time", "settling time", supply):
         (line,) = [line for line in text.splitlines() if line.strip().startswith(row)]
         assert line.endswith("pass")
-    assert "  supply power V |I| at the coils   on average 34.0 mW, at most 0.340 W, 23.80 J in all\n" in text
-    assert "  supply power measured at the bus  on average 50.0 mW\n" in text
-    assert (
-        "  consumption stated in the thesis  on average on the order of 100 mW, at most about 0.5 W\n" in text
-    )
-    assert "  R I^2, heat of steady currents    on average 23.000 mW, 16.100 J in all\n" in text
+    assert "  supply power V |I| at the coils   average 34.0 mW, maximum 0.340 W, total 23.80 J\n" in text
+    assert "  supply power measured at the bus  average 50.0 mW\n" in text
+    assert "  consumption stated in the thesis  average about 100 mW, maximum about 0.5 W\n" in text
+    assert "  R I^2, heat of steady currents    average 23.000 mW, total 16.100 J\n" in text
     assert "planner: 3 jobs (done 3)" in text
     assert max(len(line) for line in text.splitlines()) <= 120
 

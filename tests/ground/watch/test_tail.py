@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flight.link.telemetry.archive import find_segments
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from ground.watch.tail import LogTail
 from knightcube.errors import UsageError
 from tests.ground.report.synthetic import Recipe, make_run

@@ -19,7 +19,7 @@ from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PAC
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import watch
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from ground.watch.plain import PlainLines, state_line
 from ground.watch.tail import LogTail
 from ground.watch.view import View

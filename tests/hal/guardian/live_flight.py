@@ -21,8 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.link.telemetry.archive import find_segments
-from ground.telemetry.reader import Run, read_run
-from ground.telemetry.scanner import scan
+from ground.telemetry import Run, read_run, scan
 from tests.support.flights import CONFIG
 
 ROOT = CONFIG.parents[1]

@@ -9,7 +9,7 @@ import pytest
 
 from flight.link.events import EVENTS, Reaction, Severity
 from flight.schema import reader as configuration
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry

@@ -22,7 +22,7 @@ from tests.studies.campaigns import fault_judgement
 from tests.support.flights import demo_config, demo_world
 
 if TYPE_CHECKING:
-    from ground.telemetry.reader import Run
+    from ground.telemetry import Run
 
 MS = 1_000_000
 CYCLE_NS = 25 * MS

@@ -11,7 +11,7 @@ import pytest
 from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
 from flight.schema.errors import ConfigError
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SECOND_NS, Rig

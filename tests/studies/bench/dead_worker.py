@@ -20,7 +20,7 @@ import numpy as np
 
 from flight.link import events
 from flight.loop.executive.worker_processes import BUDGET
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from hal.interfaces.wires import SECOND_NS
 from tests.hal.guardian import live_flight
 from tests.studies.bench.executive import Load, fifo_allowed, fly

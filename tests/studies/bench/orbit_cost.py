@@ -18,7 +18,7 @@ import numpy as np
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from tests.studies.bench.demonstration import command_s
 
 WANTED_CYCLE_MS = 0.5

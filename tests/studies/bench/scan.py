@@ -6,7 +6,7 @@ import sys
 
 from flight.link.telemetry.definitions import CONTROL, IMU, TRUTH
 from flight.link.telemetry.packets import Packer
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.pace import ordinary_seconds
 

@@ -24,7 +24,7 @@ from flight.loop.state.content import Learned
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
 from flight.schema.sections import Config
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.settings import Simulation

@@ -17,9 +17,9 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
-from ground.report.knowledge import COARSE, FINE, attitude_errors
+from ground.report.orbit import COARSE, FINE, attitude_errors
 from ground.report.signals import seconds
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.settings import Simulation
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.flights import CONFIG, fly

@@ -21,7 +21,7 @@ from flight.link import events
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE

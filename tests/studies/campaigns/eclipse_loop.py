@@ -16,9 +16,9 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
-from ground.report.knowledge import attitude_errors, dipole_errors
+from ground.report.orbit import attitude_errors, dipole_errors
 from ground.report.signals import seconds
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict

@@ -11,7 +11,7 @@ import numpy as np
 
 from flight.link.events import EVENTS, EventKind, Reaction, Severity
 from flight.link.telemetry.packets import to_text
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from sim_hal.faults.bench import FaultKind
 from sim_hal.settings import FaultEntry

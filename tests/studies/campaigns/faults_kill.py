@@ -21,7 +21,7 @@ import numpy as np
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
-from ground.telemetry.reader import Run, read_run
+from ground.telemetry import Run, read_run
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives

@@ -9,9 +9,9 @@ import numpy as np
 from flight.link.events import EVENTS, EventKind, Severity
 from flight.link.modes import POINTING, Mode
 from flight.link.telemetry.packets import to_text
-from ground.report.knowledge import FINE, LOST, attitude_errors
+from ground.report.orbit import FINE, LOST, attitude_errors
 from ground.report.signals import seconds
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.faults.bench import FaultKind

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link import events
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from hal.buses import linux_process
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives

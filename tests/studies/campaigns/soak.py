@@ -22,7 +22,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.faults import faults

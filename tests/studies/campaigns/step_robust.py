@@ -24,8 +24,8 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
-from ground.report.performance import STEADY_STATE_S
-from ground.telemetry.reader import Run
+from ground.report.steps import STEADY_STATE_S
+from ground.telemetry import Run
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

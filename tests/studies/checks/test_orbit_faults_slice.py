@@ -10,7 +10,7 @@ import pytest
 
 from flight.link.events import EVENTS, Severity
 from flight.schema import reader as configuration
-from ground.telemetry.reader import Run
+from ground.telemetry import Run
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry

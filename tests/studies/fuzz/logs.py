@@ -20,8 +20,7 @@ from unittest import mock
 
 from flight.link.telemetry.packets import LAYOUTS
 from ground import report as reporting
-from ground.telemetry.reader import Run, read_run
-from ground.telemetry.scanner import ScanResult, scan
+from ground.telemetry import Run, ScanResult, read_run, scan
 from knightcube.errors import UsageError
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.fuzz.harness import Finding

@@ -20,7 +20,7 @@ from space_packet_parser.xtce.definitions import XtcePacketDefinition
 
 from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, to_text
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from ground.xtce import document, spread
 
 _BY_APID = {layout.packet.apid: layout for layout in LAYOUTS.values()}

@@ -29,7 +29,7 @@ from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text, walk
 from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from flight.schema.reader import load
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from ground.xtce import spread
 from ground.yamcs import write
 from tests.studies.interop.sockets import beyond_loopback

@@ -13,7 +13,7 @@ import pytest
 
 from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.log import FlightLog
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from hal.buses.clock import SystemClock
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets

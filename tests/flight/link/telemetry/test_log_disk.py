@@ -13,7 +13,7 @@ import pytest
 
 from flight.link.telemetry.archive import SegmentFile, open_segment
 from flight.link.telemetry.log import FlightLog
-from ground.telemetry.scanner import scan
+from ground.telemetry import scan
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.flight.link.telemetry.small_disk import SmallDisk, SmallDiskFile, content

@@ -28,7 +28,7 @@ from flight.link.telemetry.packets import (
     crc16,
     to_text,
 )
-from ground.telemetry.scanner import decode
+from ground.telemetry import decode
 from tests.flight.link.telemetry.samples import contents, plain_contents, timing_packets
 
 every_packet = pytest.mark.parametrize("packet", PACKETS, ids=lambda packet: packet.name)

@@ -10,8 +10,7 @@ import pytest
 from flight.link.telemetry.archive import find_segments
 from flight.link.telemetry.packets import LAYOUTS, crc16
 from ground.report import format_report, summarise
-from ground.telemetry.reader import read_run
-from ground.telemetry.scanner import ScanResult, scan
+from ground.telemetry import ScanResult, read_run, scan
 from tests.ground.report.synthetic import Recipe, make_run
 
 TAIL = 4096

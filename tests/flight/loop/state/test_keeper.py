@@ -24,7 +24,7 @@ from flight.loop.state.keeper import Notices, StateKeeper, open_state, state_fol
 from flight.loop.state.store import COPIES, StateStore
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
-from ground.telemetry.reader import read_run
+from ground.telemetry import read_run
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from ground.report.performance import Command, commands, interrupted, placed, response
+from ground.report.steps import StepCommand, commanded_steps, flown_steps, is_interrupted, response
 from knightcube.astro.arrays import FloatArray
 from tests.ground.report.synthetic import second_order
 
-STEP = Command(index=1, time=100.0, start=-0.3, target=-0.2, duration=100.0)
+STEP = StepCommand(index=1, time=100.0, start=-0.3, target=-0.2, duration=100.0)
 TIME: FloatArray = np.arange(90.0, 210.0, 0.025)
 
 
-def step_of(command: Command, progress: FloatArray) -> FloatArray:
+def step_of(command: StepCommand, progress: FloatArray) -> FloatArray:
     return command.start + (command.target - command.start) * progress
 
 
@@ -52,7 +52,7 @@ def test_a_first_order_rise_is_the_logarithm_of_nine() -> None:
 
 
 def test_a_falling_step_is_judged_like_a_rising_one() -> None:
-    down = Command(0, 100.0, 0.2, -0.3, 100.0)
+    down = StepCommand(0, 100.0, 0.2, -0.3, 100.0)
     since = np.maximum(TIME - 100.0, 0.0)
     rising, falling = (response(TIME, step_of(c, second_order(since, 0.4, 0.5)), c) for c in (STEP, down))
     assert falling.overshoot_percent == pytest.approx(rising.overshoot_percent, rel=1e-9)
@@ -91,7 +91,7 @@ def test_one_excursion_late_in_the_step_is_the_settling_time() -> None:
 
 
 def test_a_step_of_no_size_has_only_a_steady_state() -> None:
-    none = Command(2, 100.0, -0.2, -0.2, 100.0)
+    none = StepCommand(2, 100.0, -0.2, -0.2, 100.0)
     found = response(TIME, np.full_like(TIME, -0.21), none)
     assert math.isnan(found.rise_s)
     assert math.isnan(found.settling_s)
@@ -102,19 +102,19 @@ def test_a_step_of_no_size_has_only_a_steady_state() -> None:
 
 
 def test_steps_run_from_target_to_target_and_the_first_from_the_release() -> None:
-    listed = commands([3, 4], np.array([0.0, 100.0]), np.array([-0.3, -0.2]), 0.2, 180.0)
-    assert listed == [Command(3, 0.0, 0.2, -0.3, 100.0), Command(4, 100.0, -0.3, -0.2, 80.0)]
+    listed = commanded_steps([3, 4], np.array([0.0, 100.0]), np.array([-0.3, -0.2]), 0.2, 180.0)
+    assert listed == [StepCommand(3, 0.0, 0.2, -0.3, 100.0), StepCommand(4, 100.0, -0.3, -0.2, 80.0)]
 
 
 def test_a_step_begins_where_the_body_was_unless_the_body_held_the_target_before() -> None:
     """The second command comes while the body is half way to the first; a mode ends the third."""
-    listed = commands([0, 1, 1], np.array([0.0, 2.0, 60.0]), np.array([0.2, 0.4, -0.2]), 0.0, 100.0)
+    listed = commanded_steps([0, 1, 1], np.array([0.0, 2.0, 60.0]), np.array([0.2, 0.4, -0.2]), 0.0, 100.0)
     time = np.arange(0.0, 100.0, 0.1)
     q2 = np.where(time < 2.0, 0.05 * time, 0.4)
-    met = placed(listed, time, q2, np.array([70.0]))
+    met = flown_steps(listed, time, q2, np.array([70.0]))
     assert [step.start for step in met] == pytest.approx([0.0, 0.4, 0.4], abs=1e-9)
     assert [step.duration for step in met] == [2.0, 58.0, 10.0]
     assert [step.again for step in met] == [False, False, True]
     assert [step.from_target for step in met] == [False, False, True], "0.2 was never held, 0.4 was"
-    assert interrupted(met[0], response(time, q2, met[0]))
-    assert not interrupted(replace(met[0], duration=60.0), response(time, q2, met[0])), "it had its time"
+    assert is_interrupted(met[0], response(time, q2, met[0]))
+    assert not is_interrupted(replace(met[0], duration=60.0), response(time, q2, met[0])), "it had its time"

@@ -1,9 +1,10 @@
-"""The report of a flight in orbit: pointing errors of each target, and the verdicts of its requirements."""
+"""The figures of a flight in orbit: pointing errors, verdicts of the requirements, the residual dipole."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from flight.link.telemetry.definitions import ORBIT_TRUTH, SPIN
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from ground.report import draw, summarise
-from ground.telemetry.reader import read_run
+from ground.report.orbit import JUDGED, dipole_errors
+from ground.telemetry import Run, read_run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from tests.manual_clock import ManualClock
 from tests.support.flights import CONFIG
@@ -96,7 +98,7 @@ def test_each_target_is_judged_by_the_true_attitude_once_settled(folder: Path) -
 def test_requirements_are_judged_and_what_cannot_be_known_is_unknown(folder: Path, tmp_path: Path) -> None:
     verdicts = {row["quantity"]: row["verdict"] for row in summarise(read_run(folder))["requirements"]}
     assert verdicts == {
-        "slow after": "unknown",
+        "detumbling time": "unknown",
         "pointing to sun, rms": "miss",
         "pointing to nadir, rms": "miss",
     }
@@ -119,3 +121,30 @@ def test_the_pictures_of_an_orbit_are_drawn(folder: Path, tmp_path: Path) -> Non
     pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
     names = {path.stem for path in draw(read_run(folder), tmp_path)}
     assert {"pointing", "track"} <= names
+
+
+SHADOW, END = 2 * JUDGED, 3 * JUDGED
+"""s, from which the satellite is in shadow, and the end of the flight."""
+TRUE = np.array([6e-4, 0.0, 8e-4])
+
+
+def dipole_flight(known: bool = True) -> Run:
+    """Return a flight whose estimate is off by half, later by a tenth, in shadow by a fifth of the dipole."""
+    times = np.arange(END)
+    share = np.where(times < SHADOW - JUDGED, 0.5, np.where(times < SHADOW, 0.1, 0.2))
+    packets = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3)])
+    truth = np.zeros(END, dtype=[("time_ns", "i8"), ("residual_dipole", "f8", 3), ("sunlit", "f8")])
+    packets["time_ns"] = truth["time_ns"] = times * 1_000_000_000
+    packets["residual_dipole"] = TRUE * (1.0 + share[:, None]) if known else math.nan
+    truth["residual_dipole"], truth["sunlit"] = TRUE, times < SHADOW
+    return cast(Run, {"navigation": packets, "orbit_truth": truth})
+
+
+def test_the_last_ten_minutes_of_each_light_are_judged() -> None:
+    found = dipole_errors(dipole_flight())
+    assert found["sunlight"] == pytest.approx(0.1)
+    assert found["shadow"] == pytest.approx(0.2)
+
+
+def test_without_an_estimate_nothing_is_said() -> None:
+    assert all(math.isnan(share) for share in dipole_errors(dipole_flight(known=False)).values())

@@ -1,0 +1,293 @@
+"""Figures of a flight in orbit: detumbling, attitude knowledge, pointing, tracked objects, requirements."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.link import events
+from flight.link.modes import POINTING, Mode
+from flight.link.telemetry.packets import PacketArray, to_text
+from flight.schema.orbit import OrbitConfig
+from ground.report.signals import PowerHistory, seconds, true_rows
+from ground.report.steps import judge
+from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
+
+Object = dict[str, Any]
+LOST, COARSE, FINE = 0, 1, 2
+"""Levels of attitude knowledge in the navigation packet."""
+WITH_STARS_S = 10.0
+"""Time after an accepted star attitude during which the estimate counts as based on stars (s)."""
+SUNLIT = 0.99
+"""Visible fraction of the solar disc above which the satellite is in sunlight."""
+JUDGED = 600
+"""Navigation packets, one per second, over which the residual dipole is judged."""
+MIN_DIPOLE = 1e-9
+"""Lower limit (A m^2) of the residual dipole by which its error is divided."""
+SETTLED_AFTER_S = 600.0
+"""Time after the start of pointing at a target before its pointing error is judged (s)."""
+
+
+def detumbling_periods(run: Run, end: float) -> list[tuple[float, float, bool]]:
+    """Return start and end, s, of each period in mode detumble, and whether the body was slow at its end."""
+    times = np.append(seconds(run["mode"]), end)
+    modes = [Mode(int(mode)) for mode in run["mode"]["mode"]]
+    return [
+        (float(times[k]), float(times[k + 1]), modes[k + 1 : k + 2] in ([Mode.ACQUIRE], [Mode.HOLD]))
+        for k, mode in enumerate(modes)
+        if mode is Mode.DETUMBLE
+    ]
+
+
+def body_speeds(run: Run) -> tuple[FloatArray, FloatArray, str]:
+    """Return times (n,), s, speeds (n,), rad/s, and their source: "truth", or "imu" without a truth log."""
+    name = "truth" if len(run["truth"]) else "imu"
+    packets = run[name]
+    return seconds(packets), np.linalg.norm(packets["rate"].astype(float), axis=1), name
+
+
+def magnetometer_rates(run: Run) -> PacketArray:
+    """Return the spin packets that contain a rate estimated from the magnetometer."""
+    known: PacketArray = run["spin"][run["spin"]["known"] == 1]
+    return known
+
+
+def detumbling(run: Run) -> Object | None:
+    """Return the periods of detumbling and the error of the magnetometer-only rate.
+
+    Returns None for a body without spin packets. The error is NaN without a truth log.
+    """
+    if not len(run["spin"]):
+        return None
+    time, speed, source = body_speeds(run)
+    end = float(time[-1]) if len(time) else float(seconds(run["spin"])[-1])
+    periods = []
+    for begin, stop, slowed in detumbling_periods(run, end):
+        inside = speed[(time >= begin) & (time <= stop)]
+        periods.append(
+            {
+                "begin_s": begin,
+                "duration_s": stop - begin,
+                "slowed": slowed,
+                "first_rate_rad_s": float(inside[0]) if len(inside) else math.nan,
+                "largest_rate_rad_s": float(inside.max()) if len(inside) else math.nan,
+                "last_rate_rad_s": float(inside[-1]) if len(inside) else math.nan,
+            }
+        )
+    spin, truth, rms = magnetometer_rates(run), run["truth"], math.nan
+    if len(truth) and len(spin):
+        at, times, rate = seconds(spin), seconds(truth), truth["rate"].astype(float)
+        true = np.column_stack([np.interp(at, times, column) for column in rate.T])
+        rms = float(np.sqrt(np.mean((spin["rate"].astype(float) - true) ** 2)))
+    return {
+        "rate_source": source,
+        "periods": periods,
+        "rate_error_rms_rad_s": rms,
+        "rate_known_share": float(np.mean(run["spin"]["known"])),
+        "restarts": int(run["spin"]["restarts"][-1]),
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeErrors:
+    """Attitude errors about the body axes.
+
+    Attributes:
+        times: mission times (n,), s.
+        error: rotations (n, 3), rad, from the reference to the other attitude.
+        sigma: standard deviations (n, 3), rad, of the attitude estimate.
+        source: "truth" or "estimate".
+    """
+
+    times: FloatArray
+    error: FloatArray
+    sigma: FloatArray
+    source: str = "truth"
+
+
+def attitude_errors(run: Run) -> AttitudeErrors:
+    """Return the errors of the attitude estimates against the truth; empty without a truth log."""
+    packets, truth = run["attitude"], run["truth"]
+    known = packets[np.isfinite(packets["quaternion"][:, 0])]
+    if not len(known) or not len(truth):
+        return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+    place = true_rows(truth, known)
+    known, place = known[place >= 0], place[place >= 0]
+    true = truth["quaternion"][place].astype(float)
+    error = to_rotation_vector(multiply(true, conjugate(known["quaternion"].astype(float))))
+    return AttitudeErrors(seconds(known), error, known["angle_sigma"].astype(float))
+
+
+def knowledge(run: Run) -> Object | None:
+    """Return the time share of each level of attitude knowledge, and the errors while it was fine.
+
+    An error counts as one with stars within `WITH_STARS_S` s of an accepted star attitude. Returns None
+    without navigation packets.
+    """
+    packets = run["navigation"]
+    if not len(packets):
+        return None
+    level = packets["knowledge"].astype(int)
+    errors = attitude_errors(run)
+    at = np.searchsorted(seconds(packets), errors.times, side="right") - 1
+    fine = level[np.maximum(at, 0)] == FINE
+    error, sigma = errors.error[fine], errors.sigma[fine]
+    size = np.linalg.norm(errors.error, axis=1)
+    stars = run["stars"]
+    accepted = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
+    age = errors.times - accepted[np.searchsorted(accepted, errors.times, side="right") - 1]
+    last = packets[-1]
+    return {
+        "share": {name: float(np.mean(level == k)) for k, name in enumerate(("lost", "coarse", "fine"))},
+        "fine_after_s": float(seconds(packets)[level == FINE][0]) if (level == FINE).any() else math.nan,
+        "fine_error_rms_rad": _rms(size[fine]),
+        "with_stars_error_rms_rad": _rms(size[fine & (age < WITH_STARS_S)]),
+        "fine_error_worst_rad": float(size[fine].max()) if len(error) else math.nan,
+        "worst_sigmas": float((np.abs(error) / sigma).max()) if len(error) else math.nan,
+        "nees_per_axis": float(np.mean((error / sigma) ** 2)) if len(error) else math.nan,
+        "refused": int(last["refused"]),
+        "fixes_refused": int(last["fixes_refused"]),
+        "restarts": int(last["restarts"]),
+        "dipole_error_share": dipole_errors(run),
+    }
+
+
+def dipole_errors(run: Run) -> dict[str, float]:
+    """Return the rms error of the residual dipole divided by its size, in sunlight and in shadow.
+
+    The last ten minutes in each are judged. The values are NaN without an estimate or a truth log.
+    """
+    packets, truth = run["navigation"], run["orbit_truth"]
+    packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
+    found = {"sunlight": math.nan, "shadow": math.nan}
+    if not len(packets) or not len(truth):
+        return found
+    at = np.clip(np.searchsorted(seconds(truth), seconds(packets)), 0, len(truth) - 1)
+    true, lit = truth["residual_dipole"][at].astype(float), truth["sunlit"][at]
+    error = packets["residual_dipole"].astype(float) - true
+    for name, inside in (("sunlight", lit > SUNLIT), ("shadow", lit < 1.0 - SUNLIT)):
+        last = np.flatnonzero(inside)[-JUDGED:]
+        if len(last):
+            size = max(float(np.linalg.norm(true[last])), MIN_DIPOLE)
+            found[name] = float(np.linalg.norm(error[last])) / size
+    return found
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def pointing_errors(run: Run) -> AttitudeErrors:
+    """Return the rotations from the target attitude to the flown one in the pointing modes.
+
+    The flown attitude is the true one if the run has a truth log, otherwise the estimate.
+    """
+    packets = run["attitude"]
+    in_mode = np.isin(packets["mode"], [int(mode) for mode in POINTING])
+    packets = packets[in_mode & np.isfinite(packets["target"][:, 0])]
+    flown, source = packets["quaternion"].astype(float), "estimate"
+    if len(run["truth"]) and len(packets):
+        place = true_rows(run["truth"], packets)
+        packets = packets[place >= 0]
+        flown, source = run["truth"]["quaternion"][place[place >= 0]].astype(float), "truth"
+    known = np.isfinite(flown[:, 0])
+    error = to_rotation_vector(multiply(flown[known], conjugate(packets["target"][known].astype(float))))
+    sigma = packets["angle_sigma"][known].astype(float)
+    return AttitudeErrors(seconds(packets)[known], np.reshape(error, (-1, 3)), sigma, source)
+
+
+def pointing(run: Run, axis: npt.ArrayLike, power: PowerHistory | None) -> Object | None:
+    """Return the figures of each target, or None for a run without pointing.
+
+    A target is judged `SETTLED_AFTER_S` s after its first pointing cycle, or from the end of its first slew
+    if that is later. `axis` (3,) is the pointing axis in the body frame.
+    """
+    found = pointing_errors(run)
+    if not len(found.times):
+        return None
+    happened, unit = run["event"], np.asarray(axis, dtype=float)
+    slew_ends = seconds(happened[happened["code"] == events.SLEW_ENDED.code])
+    announced = happened[happened["code"] == events.TARGET.code]
+    starts = [*map(float, seconds(announced))] or [-math.inf]
+    names = [to_text(row["text"]) for row in announced] or ["-"]
+    rows = []
+    for name, start, stop in zip(names, starts, [*starts[1:], math.inf], strict=True):
+        inside = (found.times >= start) & (found.times < stop)
+        if not inside.any():
+            continue
+        begin, end = float(found.times[inside][0]), float(found.times[inside][-1])
+        slewed = min(slew_ends[(slew_ends >= start) & (slew_ends < stop)], default=-math.inf)
+        error = found.error[inside & (found.times >= max(begin + SETTLED_AFTER_S, slewed))]
+        axis_error = np.linalg.norm(error - np.outer(error @ unit, unit), axis=1)
+        rows.append(
+            {
+                "target": name,
+                "begin_s": begin,
+                "duration_s": end - begin,
+                "axis_rms_rad": _rms(axis_error),
+                "axis_worst_rad": float(axis_error.max()) if len(error) else math.nan,
+                "all_axes_rms_rad": _rms(np.linalg.norm(error, axis=1)),
+                "supply_w": math.nan if power is None else power.average(power.supply, begin, end),
+                "heat_w": math.nan if power is None else power.average(power.heat, begin, end),
+            }
+        )
+    return {"source": found.source, "settled_after_s": SETTLED_AFTER_S, "targets": rows}
+
+
+def object_tracks(run: Run) -> list[PacketArray]:
+    """Return the packets of each tracked object, by its number."""
+    packets = run["track"]
+    return [packets[packets["number"] == number] for number in np.unique(packets["number"])]
+
+
+def objects(run: Run) -> list[Object]:
+    """Return the figures of each tracked object, in the order of detection."""
+    rows = []
+    for packets in object_tracks(run):
+        detected = packets["seen"] > 0
+        speed = np.linalg.norm(packets["rate"].astype(float), axis=1)
+        sigma = float(np.median(packets["measured_sigma"][detected])) if detected.any() else None
+        rows.append(
+            {
+                "number": int(packets["number"][0]),
+                "first_s": float(packets["middle_ns"][0]) * 1e-9,
+                "last_s": float(packets["middle_ns"][-1]) * 1e-9,
+                "frames": len(packets),
+                "seen": int(detected.sum()),
+                "rate_least_rad_s": float(speed.min()),
+                "rate_most_rad_s": float(speed.max()),
+                "magnitude": float(np.median(packets["magnitude"])),
+                "sighting_sigma_rad": sigma,
+            }
+        )
+    return rows
+
+
+def requirements(
+    config: OrbitConfig, detumbled: Object | None, known: Object | None, pointed: Object | None
+) -> list[Object]:
+    """Return each figure that the section `requirements` of the configuration limits, with its verdict.
+
+    `detumbled`, `known` and `pointed` are the report's figures of detumbling, knowledge and pointing.
+    """
+    limits = config.requirements
+    periods = detumbled["periods"][:1] if detumbled else []
+    slow = [one["duration_s"] if one["slowed"] else math.inf for one in periods]
+    rows = [("detumbling time", slow, limits.slow_within, "s")]
+    if known is not None:
+        slowed_at = [one["begin_s"] + one["duration_s"] for one in periods if one["slowed"]]
+        fine_at = known["fine_after_s"]
+        fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
+        error = [math.degrees(known["with_stars_error_rms_rad"])]
+        rows.append(("time from detumbling to fine attitude", fine, limits.fine_within, "s"))
+        rows.append(("attitude error with stars, rms", error, limits.knowledge_deg, "deg"))
+    for target in pointed["targets"] if pointed else []:
+        error = [math.degrees(target["axis_rms_rad"])]
+        rows.append((f"pointing to {target['target']}, rms", error, limits.pointing_deg, "deg"))
+    return [judge(name, values, limit, unit) for name, values, limit, unit in rows if limit is not None]

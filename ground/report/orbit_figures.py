@@ -1,0 +1,377 @@
+"""Pictures of a flight in orbit: detumbling, attitude knowledge, pointing, ground track, objects, a slew."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from flight.link import events
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import PacketArray, to_text
+from ground.report import panels
+from ground.report.orbit import (
+    AttitudeErrors,
+    attitude_errors,
+    body_speeds,
+    detumbling_periods,
+    magnetometer_rates,
+    object_tracks,
+    pointing_errors,
+)
+from ground.report.panels import RunSignals
+from ground.report.signals import seconds, true_rows
+from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.guidance.three_axes.slew_model import shown
+from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
+from knightcube.gnc.guidance.three_axes.slew_task import Cone
+
+SPIN_MARGIN = 0.2
+"""Fraction of the time of detumbling that is shown before and after it."""
+POWER_MEAN_S = 30.0
+"""Time over which the power is averaged, because the coils pause every second or two (s)."""
+SHADOW = 0.5
+"""Visible fraction of the solar disc below which the satellite is drawn in shadow."""
+TRACK_INTERVAL_S = 10.0
+"""Time between drawn points of the ground track (s)."""
+TRACK_MARK_S = 600.0
+"""Time between marked points of the ground track (s)."""
+_CONES = {"Sun": panels.ORANGE, "Earth": panels.GREEN, "Moon": panels.GREY}
+_OBJECT_COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)
+
+
+def spin_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of detumbling: rate, field and dipole; None for a run without spin packets."""
+    spin = signals.run["spin"]
+    if not len(spin):
+        return None
+    figure = Figure(figsize=(10.9, 9.4), layout="constrained")
+    rate, field, dipole = figure.subplots(3, 1, sharex=True)
+    _detumbling_rate(rate, signals.run)
+    panels.vectors(field, seconds(spin), 1e6 * spin["field"].astype(float))
+    panels.vectors(dipole, seconds(spin), 1e3 * spin["dipole"].astype(float))
+    panels.style(rate, "rate, deg/s", "Detumbling", "")
+    panels.style(field, "field, µT", "Magnetic field in the body frame", "")
+    panels.style(dipole, "dipole, mA m²", "Commanded dipole")
+    for ax in (rate, field, dipole):
+        panels.legend(ax)
+    return figure
+
+
+def _detumbling_rate(ax: Axes, run: Run) -> None:
+    """Draw the speed, and that from the magnetometer with its uncertainty; detumbling is shaded."""
+    time, speed, source = body_speeds(run)
+    spin = magnetometer_rates(run)
+    if len(spin):
+        at, found = seconds(spin), np.degrees(np.linalg.norm(spin["rate"].astype(float), axis=1))
+        sigma = np.degrees(spin["rate_sigma"].astype(float))
+        lower, upper, colour = np.maximum(found - sigma, 1e-3), found + sigma, panels.ORANGE
+        ax.fill_between(at, lower, upper, color=colour, alpha=0.3, linewidth=0, label="1 sigma")
+        ax.semilogy(at, found, ".", color=panels.ORANGE, markersize=5, label="from the magnetometer alone")
+    label = "gyro" if source == "imu" else source
+    ax.semilogy(time, np.degrees(speed), color=panels.BLUE, linewidth=1.2, label=label, zorder=3)
+    periods = detumbling_periods(run, float(time[-1]) if len(time) else 0.0)
+    for k, (begin, stop, _) in enumerate(periods):
+        label = "" if k else "detumbling"
+        ax.axvspan(begin, stop, color=panels.GREY, alpha=0.12, linewidth=0, label=label)
+    if periods:
+        margin = SPIN_MARGIN * (periods[-1][1] - periods[0][0])
+        first, last = max(periods[0][0] - margin, 0.0), periods[-1][1] + margin
+        ax.set_xlim(first, last)
+        shown_rows = (time >= first) & (time <= last)
+        speed = speed[shown_rows]
+    ax.set_ylim(bottom=max(1e-3, 0.5 * float(np.degrees(speed[speed > 0.0].min()))) if speed.any() else 1e-3)
+
+
+def knowledge_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of the attitude errors with their uncertainty, and the level of knowledge.
+
+    Returns None for a run without navigation packets or without a truth log.
+    """
+    found, packets = attitude_errors(signals.run), signals.run["navigation"]
+    if not (len(found.times) and len(packets)):
+        return None
+    figure = Figure(figsize=(10.9, 9.4), layout="constrained")
+    *errors, level = figure.subplots(4, 1, sharex=True)
+    for axis, (ax, (name, colour)) in enumerate(zip(errors, panels.AXIS_COLOURS.items(), strict=True)):
+        error, bound = np.degrees(found.error[:, axis]), 3.0 * np.degrees(found.sigma[:, axis])
+        grey = panels.GREY
+        ax.fill_between(found.times, -bound, bound, color=grey, alpha=0.25, linewidth=0, label="3 sigma")
+        ax.plot(found.times, error, color=colour, linewidth=0.9, label="error")
+        ax.set_yscale("symlog", linthresh=0.01)
+        panels.style(ax, f"{name}, deg", "Attitude error against the truth" if axis == 0 else "", "")
+        panels.legend(ax)
+    values = packets["knowledge"].astype(int)
+    level.step(seconds(packets), values, where="post", color=panels.BLUE, linewidth=1.2)
+    level.set_yticks(range(3), ("lost", "coarse", "fine"))
+    panels.style(level, "knowledge", "Level of attitude knowledge")
+    return figure
+
+
+def pointing_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of a flight in orbit, or None for a run without pointing.
+
+    The panels show the pointing error, rate, dipole, power and magnetic field, and modes with targets.
+    """
+    run = signals.run
+    found = pointing_errors(run)
+    if not len(found.times):
+        return None
+    figure = Figure(figsize=(10.9, 14.0), layout="constrained")
+    rows = figure.subplots(6, 1, sharex=True, height_ratios=(1.7, 1.0, 1.0, 1.0, 1.0, 0.8))
+    error, rate, dipole, power, field, mode = rows
+    _pointing_error(error, found)
+    name = "truth" if len(run["truth"]) else "attitude"
+    speed = np.degrees(np.linalg.norm(run[name]["rate"].astype(float), axis=1))
+    rate.semilogy(seconds(run[name]), np.maximum(speed, 1e-4), color=panels.BLUE, linewidth=0.9)
+    panels.style(rate, "rate, deg/s", "Body rate", "")
+    # The pauses of the coils for the magnetometer would fill the picture.
+    acting = run["attitude"][run["attitude"]["dipole"].any(axis=1)]
+    panels.vectors(dipole, seconds(acting), 1e3 * acting["dipole"].astype(float))
+    dipole.set_yscale("symlog", linthresh=1.0)
+    panels.style(dipole, "dipole, mA m²", "Commanded dipole, pauses omitted", "")
+    _mean_power(power, signals)
+    _field(field, run)
+    _modes(mode, run, signals.end)
+    for ax in rows:
+        _shade(ax, run["orbit_truth"])
+        panels.legend(ax)
+    return figure
+
+
+def _pointing_error(ax: Axes, found: AttitudeErrors) -> None:
+    panels.vectors(ax, found.times, np.degrees(found.error))
+    sigma = 3.0 * np.degrees(found.sigma.max(axis=1))
+    for sign, label in ((1.0, "3 sigma of the attitude"), (-1.0, None)):
+        ax.plot(found.times, sign * sigma, "--", color=panels.GREY, linewidth=0.8, label=label)
+    ax.set_yscale("symlog", linthresh=0.1)
+    known = "true" if found.source == "truth" else "estimated"
+    panels.style(ax, "error, deg", f"Pointing error about the body axes, {known} attitude", "")
+
+
+def _mean_power(ax: Axes, signals: RunSignals) -> None:
+    found = signals.power
+    if found is not None:
+        edges = np.arange(found.time[0], found.end + POWER_MEAN_S, POWER_MEAN_S)
+        place = np.digitize(found.time, edges) - 1
+        spans = np.bincount(place, found.spans, len(edges) - 1)
+        for name, power, colour in (
+            ("supply, V |I|", found.supply, panels.VERMILLION),
+            ("R I²", found.heat, panels.GREEN),
+        ):
+            spent = np.bincount(place, power * found.spans, len(edges) - 1)
+            mean = 1e3 * spent / np.where(spans > 0.0, spans, np.nan)
+            ax.stairs(np.maximum(mean, 1e-3), edges, color=colour, linewidth=1.0, label=name)
+        ax.set_yscale("log")
+    panels.style(ax, "power, mW", f"Coil power, mean over {POWER_MEAN_S:g} s", "")
+
+
+def _field(ax: Axes, run: Run) -> None:
+    """Draw the Earth's magnetic field in the body frame: the true one, or the measured one without it."""
+    packets = run["orbit_truth"]
+    place = true_rows(run["truth"], packets)
+    if (place >= 0).any():
+        packets, place = packets[place >= 0], place[place >= 0]
+        into_body = attitude_matrix(run["truth"]["quaternion"][place].astype(float))
+        values, times = np.einsum("nij,nj->ni", into_body, packets["field"].astype(float)), seconds(packets)
+    else:
+        values, times = run["imu"]["field"].astype(float), seconds(run["imu"])
+    panels.vectors(ax, times, 1e6 * values)
+    panels.style(ax, "field, µT", "Magnetic field in the body frame", "")
+
+
+def _modes(ax: Axes, run: Run, end: float) -> None:
+    """Draw the modes as steps, and the targets by name at their times."""
+    packets = run["mode"]
+    if len(packets):
+        times, modes = seconds(packets), packets["mode"].astype(int)
+        used = sorted({int(mode) for mode in modes})
+        levels = [used.index(int(mode)) for mode in modes]
+        ax.step(np.append(times, end), [*levels, levels[-1]], where="post", color=panels.BLUE, linewidth=1.4)
+        ax.set_yticks(range(len(used)), [Mode(mode).label for mode in used])
+        ax.set_ylim(-0.5, len(used) - 0.2)
+    happened = run["event"]
+    for row in happened[happened["code"] == events.TARGET.code]:
+        at, colour = float(row["time_ns"]) * 1e-9, panels.PURPLE
+        ax.axvline(at, color=colour, linewidth=0.9)
+        place = (at, 1.0), (3, -2), ("data", "axes fraction"), "offset points"
+        ax.annotate(to_text(row["text"]), *place, va="top", fontsize=8, color=colour)
+    panels.style(ax, "mode", "Modes and commanded targets")
+
+
+def _shade(ax: Axes, packets: PacketArray) -> None:
+    """Shade the time in the Earth's shadow."""
+    if not len(packets):
+        return
+    times = seconds(packets)
+    dark = np.concatenate([[0], (packets["sunlit"] < SHADOW).astype(int), [0]])
+    changes = np.flatnonzero(np.diff(dark))
+    for begin, end in zip(changes[::2], changes[1::2], strict=True):
+        last = float(times[min(end, len(times) - 1)])
+        ax.axvspan(float(times[begin]), last, color=panels.GREY, alpha=0.15, linewidth=0)
+
+
+def track_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of the ground track in light and shadow; None if the true position is not known."""
+    packets = signals.run["orbit_truth"]
+    if not len(packets):
+        return None
+    _, kept = np.unique((seconds(packets) / TRACK_INTERVAL_S).astype(int), return_index=True)
+    packets = packets[kept]
+    times, into_earth = seconds(packets), celestial_to_terrestrial(packets["utc"].astype(float))
+    position = np.einsum("nij,nj->ni", into_earth, packets["position"].astype(float))
+    longitude, latitude, height = geodetic(position)
+    east, north = np.degrees(longitude), np.degrees(latitude)
+    figure = Figure(figsize=(10.9, 5.8), layout="constrained")
+    ax = figure.subplots()
+    dark = packets["sunlit"] < SHADOW
+    for inside, colour, label in ((~dark, panels.ORANGE, "sunlit"), (dark, panels.BLUE, "in shadow")):
+        ax.plot(east[inside], north[inside], ".", color=colour, markersize=4, label=label)
+    marked = np.searchsorted(times, np.arange(times[0], times[-1], TRACK_MARK_S))
+    ax.plot(east[marked], north[marked], "o", color=panels.BLACK, markersize=4)
+    for k in marked:
+        label, place = f"{times[k] / 60.0:.0f} min", (east[k], north[k])
+        ax.annotate(label, place, (5, 4), textcoords="offset points", fontsize=8)
+    ax.set_xlim(-180, 180)
+    ax.set_ylim(-90, 90)
+    ax.set_xticks(range(-180, 181, 30))
+    ax.set_yticks(range(-90, 91, 30))
+    ax.set_aspect("equal")
+    title = f"Ground track, {np.min(height) * 1e-3:.0f} to {np.max(height) * 1e-3:.0f} km above the ellipsoid"
+    panels.style(ax, "latitude, deg", title, "longitude, deg")
+    panels.legend(ax)
+    return figure
+
+
+def objects_figure(signals: RunSignals) -> Figure | None:
+    """Return the picture of the tracked objects' paths, rates and brightness; None for a run without them."""
+    tracks = object_tracks(signals.run)
+    if not tracks:
+        return None
+    figure = Figure(figsize=(11.0, 7.6), layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.1, 1.0))
+    path, rate, brightness = (figure.add_subplot(grid[place]) for place in ((slice(None), 0), (0, 1), (1, 1)))
+    for k, packets in enumerate(tracks):
+        colour, label = _OBJECT_COLOURS[k % len(_OBJECT_COLOURS)], f"object {int(packets['number'][0])}"
+        times, direction = packets["middle_ns"] * 1e-9, packets["direction"].astype(float)
+        right = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+        right = np.degrees(right - 2.0 * np.pi * np.floor(right[0] / (2.0 * np.pi)))
+        up = np.degrees(np.arcsin(np.clip(direction[:, 2], -1.0, 1.0)))
+        path.plot(right, up, color=colour, label=label)
+        path.plot(right[:1], up[:1], "o", color=colour)
+        speed = np.degrees(np.linalg.norm(packets["rate"].astype(float), axis=1))
+        rate.plot(times, speed, color=colour, label=label)
+        brightness.plot(times, packets["magnitude"], color=colour, label=label)
+        missed = packets["seen"] <= 0
+        if missed.any():
+            path.plot(right[missed], up[missed], "x", color=colour, markersize=4, label="not detected")
+    path.set_aspect("equal", adjustable="datalim")
+    path.invert_xaxis()
+    brightness.invert_yaxis()
+    panels.style(
+        path, "declination, deg", "Paths among the stars, starting at the dot", "right ascension, deg"
+    )
+    panels.style(rate, "deg/s", "Angular rate")
+    panels.style(brightness, "V", "Magnitude, mean of the last detections")
+    path.legend(loc="best", fontsize=9)
+    return figure
+
+
+def slew_figure(made: OrderedSlew, order: SlewOrder) -> Figure:
+    """Return the picture of a planned slew: boresights on the sky, dipole, torque and energy."""
+    figure = Figure(figsize=(10.9, 12.6), layout="constrained")
+    grid = figure.add_gridspec(4, 1, height_ratios=(2.3, 1.0, 1.0, 1.0))
+    sky = figure.add_subplot(grid[0], projection="mollweide")
+    dipole = figure.add_subplot(grid[1])
+    torque, energy = (figure.add_subplot(grid[k], sharex=dipole) for k in (2, 3))
+    times = np.linspace(0.0, made.plan.horizon, 601)
+    _slew_sky(sky, made, order, times)
+    dipoles, limit = 1e3 * made.plan.path.dipoles(times), 1e3 * float(made.task.craft.limit.min())
+    panels.vectors(dipole, times, dipoles)
+    # The line of a limit far above the curves would flatten them.
+    if np.abs(dipoles).max() > 0.3 * limit:
+        panels.level(dipole, -limit, "")
+        panels.level(dipole, limit, "limit")
+    panels.style(dipole, "dipole, mA m²", f"Dipole; the limit is {limit:.3g} mA m²", "")
+    _slew_torque(torque, made, times)
+    power = made.plan.path.dipoles(times) ** 2 @ made.task.craft.weights
+    heat = np.concatenate([[0.0], np.cumsum(0.5 * np.diff(times) * (power[1:] + power[:-1]))])
+    energy.fill_between(times, heat, color=panels.BLUE, alpha=0.35, linewidth=0)
+    energy.set_ylim(bottom=0.0)
+    panels.style(energy, "energy, J", "Accumulated heat of the coils", "time since the start of the slew, s")
+    for ax in (dipole, torque, energy):
+        panels.legend(ax)
+    return figure
+
+
+def _slew_sky(ax: Axes, made: OrderedSlew, order: SlewOrder, times: FloatArray) -> None:
+    """Draw the paths of the pointing axis and of the star camera's boresight, and the keep-out cones."""
+    plan = made.plan
+    turned = attitude_matrix(plan.path.references(times).quaternion)
+    handles: list[Line2D | Patch] = [*_cones(ax, made.task.cones, times[[0, -1]])]
+    axes = [("pointing axis", order.axes.pointing, panels.BLUE), ("star camera", order.camera, panels.PURPLE)]
+    for name, axis, colour in axes[: 1 if np.allclose(order.axes.pointing, order.camera) else 2]:
+        path = axis @ turned
+        east, north = np.arctan2(path[:, 1], path[:, 0]), np.arcsin(np.clip(path[:, 2], -1.0, 1.0))
+        # A gap where the path crosses the edge of the map
+        jumps = np.flatnonzero(np.abs(np.diff(east)) > np.pi) + 1
+        ax.plot(*(np.insert(values, jumps, np.nan) for values in (east, north)), color=colour, linewidth=1.8)
+        ax.plot(east[0], north[0], "o", color=colour, markersize=8, markerfacecolor="white")
+        ax.plot(east[-1], north[-1], "o", color=colour, markersize=8)
+        handles.append(Line2D([], [], color=colour, linewidth=1.8, label=name))
+    for fill, name in (("white", "start"), (panels.BLACK, "end")):
+        mark = Line2D([], [], color=panels.BLACK, marker="o", markerfacecolor=fill, ls="", label=name)
+        handles.append(mark)
+    stretched = f", stretched from {plan.horizon_asked:g} s" if plan.status is SlewStatus.STRETCHED else ""
+    title = f"Planned slew: {plan.energy:.4g} J in {plan.horizon:.4g} s{stretched}"
+    title += "; the sky in right ascension and declination"
+    ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=panels.BLACK, pad=22.0)
+    ax.grid(True, color="#e4e4e4", linewidth=0.8)
+    ax.tick_params(labelsize=8, labelcolor=panels.GREY)
+    place = (0.5, -0.02)
+    ax.legend(handles=handles, loc="upper center", bbox_to_anchor=place, ncols=4, fontsize=9, frameon=False)
+
+
+def _cones(ax: Axes, cones: tuple[Cone, ...], ends: FloatArray) -> Iterator[Patch]:
+    """Draw the cones, shaded at the first of two times and dashed at the second, and yield their legends."""
+    longitude, latitude = np.meshgrid(np.radians(np.arange(-180, 181)), np.radians(np.arange(-90, 91)))
+    level = np.cos(latitude)
+    grid = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=2)
+    for cone in cones:
+        colour, label = _CONES[cone.name], f"{cone.name} cone, {np.degrees(cone.angle):.0f} deg"
+        first, last = (grid @ towards - np.cos(cone.angle) for towards in cone.direction(ends))
+        ax.contourf(longitude, latitude, first, [0.0, 9.0], colors=[colour], alpha=0.3)
+        ax.contour(longitude, latitude, last, [0.0], colors=[colour], linestyles="dashed", linewidths=1.2)
+        yield Patch(facecolor=colour, alpha=0.4, label=label)
+
+
+def _slew_torque(ax: Axes, made: OrderedSlew, times: FloatArray) -> None:
+    """Draw the torque that the motion requires, across the magnetic field and along it."""
+    task, path = made.task, made.plan.path
+    reference, craft, around = path.references(times), task.craft, task.along(times)
+    q = reference.quaternion
+    down, strength = around.gradient()
+    field, down = shown(q, around.field), shown(q, down)
+    disturbance = strength[:, None] * np.cross(down, down @ craft.inertia) + craft.torque
+    gyroscopic = np.cross(reference.rate, reference.rate @ craft.inertia)
+    torque = (
+        reference.acceleration @ craft.inertia + gyroscopic - disturbance - np.cross(craft.residual, field)
+    )
+    size = np.linalg.norm(field, axis=1)
+    along = np.sum(torque * field, axis=1) / size
+    across = np.linalg.norm(torque - along[:, None] * field / size[:, None], axis=1)
+    ax.plot(times, 1e6 * across, color=panels.BLUE, linewidth=1.3, label="across the field")
+    label = "along the field, not available"
+    ax.plot(times, 1e6 * along, color=panels.VERMILLION, linewidth=1.3, label=label)
+    largest = 1e6 * size * float(craft.limit.min())
+    if 1e6 * across.max() > 0.3 * largest.min():
+        label = "limit of one coil across the field"
+        ax.plot(times, largest, color=panels.GREY, linestyle=panels.DASHED, label=label)
+    panels.style(ax, "torque, µN m", "Torque of the coils", "")

@@ -1,0 +1,286 @@
+"""Figures of merit of each attitude step of the testbed (Sease 2013, Table 5.3).
+
+Time zero is the command of the step. The step runs from the previous target if the body held it, otherwise
+from the attitude of the body, to its own target. Rise time is from 10 to 90 % of the step. Overshoot is the
+excursion beyond the target, in % of the step. Settling time is the last entry into +-5 % of the step around
+the target. Steady-state error is the largest error over the last 30 s, in degrees of theta = 2 asin q2, for
+targets held for a minute or more. Crossings are interpolated between samples. A step that ends within 30 s
+without settling is interrupted and is not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flight.link.modes import STEERING
+from flight.link.telemetry.packets import PacketArray, to_text
+from ground.report.signals import ThreadMotion, seconds
+from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
+
+Object = dict[str, Any]
+
+SETTLING_BAND = 0.05
+STEADY_STATE_S = 30.0
+MIN_STEP = 1e-6
+"""Smallest change of q2 that counts as a step."""
+
+STEADY_STATE_LIMIT_DEG = 4.5
+OVERSHOOT_LIMIT_PERCENT = 20.0
+RISE_LIMIT_S = 8.0
+SETTLING_LIMIT_S = 30.0
+AVERAGE_SUPPLY_POWER_LIMIT_W = 0.10
+"""Average power consumption in the thesis (ch. 5, Hardware Results), compared with V |I| at the coils (W)."""
+CURRENT_LIMIT_A = 0.148
+
+
+@dataclass(frozen=True, slots=True)
+class StepCommand:
+    """One commanded attitude step.
+
+    Attributes:
+        index: number of the step in the configuration.
+        time: time of the command, s.
+        start: q2 at the beginning of the step.
+        target: commanded q2.
+        duration: time until the step ends, s.
+        from_target: whether the step begins at a target that the body held.
+        again: whether a step with the same index came before.
+    """
+
+    index: int
+    time: float
+    start: float
+    target: float
+    duration: float
+    from_target: bool = True
+    again: bool = False
+
+    @property
+    def rise_is_judged(self) -> bool:
+        """Whether the thesis limits the rise time, which it does for steps between targets only."""
+        return self.index > 0 and self.from_target
+
+
+@dataclass(frozen=True, slots=True)
+class StepResponse:
+    """Figures of one step. NaN means not applicable; infinity means not reached before the step ended."""
+
+    steady_state_deg: float = math.nan
+    overshoot_percent: float = math.nan
+    rise_s: float = math.nan
+    settling_s: float = math.nan
+
+
+def commanded_steps(
+    indices: Sequence[int], times: FloatArray, targets: FloatArray, release_q2: float, end: float
+) -> list[StepCommand]:
+    """Return the steps between targets.
+
+    Args:
+        indices: numbers of the n steps.
+        times: times of the commands (n,), s, ascending.
+        targets: commanded q2 (n,).
+        release_q2: q2 at the first command.
+        end: end of the last step, s.
+    """
+    starts = np.concatenate([[release_q2], targets[:-1]])
+    ends = np.append(times[1:], end)
+    return [
+        StepCommand(int(i), float(t), float(start), float(target), float(stop - t))
+        for i, t, start, target, stop in zip(indices, times, starts, targets, ends, strict=True)
+    ]
+
+
+def flown_steps(
+    commanded: Sequence[StepCommand], time: FloatArray, q2: FloatArray, stops: FloatArray
+) -> list[StepCommand]:
+    """Return the steps as flown: from the attitude of the body, until a mode change ended the step.
+
+    Args:
+        commanded: steps between targets.
+        time: times of the samples (n,), s.
+        q2: attitude (n,).
+        stops: ascending times, s, at which a mode ended the step in progress.
+    """
+    flown: list[StepCommand] = []
+    for command in commanded:
+        was = float(np.interp(command.time, time, q2))
+        held = abs(was - command.start) <= SETTLING_BAND * abs(command.target - command.start)
+        later = stops[stops > command.time]
+        duration = min(command.duration, float(later[0]) - command.time if len(later) else math.inf)
+        flown.append(
+            replace(
+                command,
+                start=command.start if held else was,
+                duration=duration,
+                from_target=held and bool(flown),
+                again=any(before.index == command.index for before in flown),
+            )
+        )
+    return flown
+
+
+def is_interrupted(command: StepCommand, found: StepResponse) -> bool:
+    """Return whether a step ended before it could be judged."""
+    return command.duration < SETTLING_LIMIT_S and math.isinf(found.settling_s)
+
+
+def response(time: FloatArray, q2: FloatArray, command: StepCommand) -> StepResponse:
+    """Return the figures of one step from samples of q2 (n,) at `time` (n,), s, that cover the step."""
+    inside = (time > command.time) & (time < command.time + command.duration)
+    t = np.concatenate([[0.0], time[inside] - command.time])
+    y = np.concatenate([[np.interp(command.time, time, q2)], q2[inside]])
+    steady = math.nan
+    if command.duration >= 2.0 * STEADY_STATE_S:  # the slew of a shorter step may last into the last 30 s
+        last = y[t >= command.duration - STEADY_STATE_S]
+        error = _angle(last) - _angle(np.array([command.target]))
+        steady = float(np.degrees(np.max(np.abs(error)))) if len(last) else math.nan
+    step = command.target - command.start
+    if abs(step) < MIN_STEP:
+        return StepResponse(steady)
+    progress = (y - command.start) / step
+    rise = _first_crossing(t, progress, 0.9) - _first_crossing(t, progress, 0.1)
+    distance = np.abs(progress - 1.0)
+    outside = np.flatnonzero(distance > SETTLING_BAND)
+    settling = 0.0
+    if len(outside):
+        i = int(outside[-1])
+        settling = math.inf if i == len(t) - 1 else _interpolate(t, distance, i, SETTLING_BAND)
+    return StepResponse(
+        steady_state_deg=steady,
+        overshoot_percent=100.0 * max(0.0, float(progress.max()) - 1.0),
+        rise_s=math.inf if math.isnan(rise) else rise,
+        settling_s=settling,
+    )
+
+
+def _angle(q2: FloatArray) -> FloatArray:
+    """Return theta = 2 asin q2, rad."""
+    return np.asarray(2.0 * np.arcsin(np.clip(q2, -1.0, 1.0)))
+
+
+def _first_crossing(t: FloatArray, progress: FloatArray, level: float) -> float:
+    """Return the time at which `progress` first reaches `level`, or infinity if it never does."""
+    reached = np.flatnonzero(progress >= level)
+    if not len(reached):
+        return math.inf
+    i = int(reached[0])
+    return 0.0 if i == 0 else _interpolate(t, progress, i - 1, level)
+
+
+def _interpolate(t: FloatArray, y: FloatArray, i: int, level: float) -> float:
+    """Return the time at which the line through samples i and i + 1 is at `level`."""
+    return float(t[i] + (level - y[i]) / (y[i + 1] - y[i]) * (t[i + 1] - t[i]))
+
+
+def judged_steps(
+    run: Run, attitude: ThreadMotion, planned_end: float, notes: list[str]
+) -> list[tuple[StepCommand, StepResponse | None]]:
+    """Return each commanded step with its response, or None if it was interrupted or is not in the log.
+
+    The reasons for missing numbers are appended to `notes`.
+    """
+    targets = run["target"]
+    if not len(targets):
+        notes.append("no target packets: no attitude step can be judged")
+        return []
+    if len(attitude.time) < 2:
+        notes.append("no attitude in the log: no attitude step can be judged")
+        return []
+    times = seconds(targets)
+    log_end = float(attitude.time[-1])
+    if math.isfinite(planned_end):
+        end = max(planned_end, float(times[-1]))
+    else:  # without the planned end, the last step is assumed to be as long as the longest one before
+        end = float(times[-1] + np.max(np.diff(times))) if len(times) > 1 else max(log_end, float(times[-1]))
+    release = float(np.interp(times[0], attitude.time, attitude.q2))
+    listed = commanded_steps(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)
+    listed = flown_steps(listed, attitude.time, attitude.q2, _step_ends(run["mode"]))
+    sample = 3.0 * float(np.median(np.diff(attitude.time)))
+    steps: list[tuple[StepCommand, StepResponse | None]] = []
+    for command in listed:
+        complete = (
+            attitude.time[0] - sample <= command.time and command.time + command.duration <= log_end + sample
+        )
+        found = response(attitude.time, attitude.q2, command) if complete else None
+        if found is not None and is_interrupted(command, found):
+            found = None
+            notes.append(f"step {command.index}: interrupted after {command.duration:.1f} s, not judged")
+        else:
+            notes += [f"step {command.index}: {remark}" for remark in _remarks(found)]
+        steps.append((command, found))
+    return steps
+
+
+def _step_ends(packets: PacketArray) -> FloatArray:
+    """Return the times, s, at which a commanded mode or a mode without steering ended any step."""
+    by_command = np.array([to_text(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
+    steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
+    return seconds(packets)[by_command | ~steering]
+
+
+def _remarks(found: StepResponse | None) -> list[str]:
+    """Return the reasons for missing numbers of a step."""
+    if found is None:
+        return ["the log does not cover the whole step, not judged"]
+    if math.isnan(found.settling_s):
+        return ["the target equals the previous one, only the steady state is judged"]
+    remarks = ["too short to judge the steady state"] if math.isnan(found.steady_state_deg) else []
+    never = {"never reached 90 %": found.rise_s, "never settled": found.settling_s}
+    return remarks + [text for text, value in never.items() if math.isinf(value)]
+
+
+def step_row(command: StepCommand, found: StepResponse | None) -> Object:
+    """Return the entry of a step in the report."""
+    answer = found or StepResponse()
+    return {
+        "index": command.index,
+        "again": command.again,
+        "start_s": command.time,
+        "duration_s": command.duration,
+        "complete": found is not None,
+        "from_q2": command.start,
+        "from_target": command.from_target,
+        "target_q2": command.target,
+        "steady_state_deg": answer.steady_state_deg,
+        "overshoot_percent": answer.overshoot_percent,
+        "rise_s": answer.rise_s,
+        "rise_judged": command.rise_is_judged,
+        "settling_s": answer.settling_s,
+    }
+
+
+def judge(quantity: str, values: Sequence[float], limit: float, unit: str) -> Object:
+    """Return the largest of `values` with its verdict: "pass", "miss", or "unknown" if all are NaN."""
+    known = [value for value in values if not math.isnan(value)]
+    worst = max(known, default=math.nan)
+    within = worst <= limit * (1.0 + 1e-9)
+    verdict = ("pass" if within else "miss") if known else "unknown"
+    return {"quantity": quantity, "worst": worst, "limit": limit, "unit": unit, "verdict": verdict}
+
+
+def against_thesis(steps: list[tuple[StepCommand, StepResponse | None]], power: Object) -> list[Object]:
+    """Return the worst of each figure beside the limit of the thesis. `power` is that of the report."""
+    judged = [(command, found) for command, found in steps if found is not None]
+    rise = [found.rise_s for command, found in judged if command.rise_is_judged]
+    steady, overshoot, settling = (
+        [getattr(found, name) for _, found in judged]
+        for name in ("steady_state_deg", "overshoot_percent", "settling_s")
+    )
+    return [
+        judge("steady-state error", steady, STEADY_STATE_LIMIT_DEG, "deg"),
+        judge("overshoot", overshoot, OVERSHOOT_LIMIT_PERCENT, "%"),
+        judge("rise time", rise, RISE_LIMIT_S, "s"),
+        judge("settling time", settling, SETTLING_LIMIT_S, "s"),
+        *(
+            judge(f"average supply power at the {place}", [average], AVERAGE_SUPPLY_POWER_LIMIT_W, "W")
+            for place, average in (("coils", power["supply_average_w"]), ("bus", power["bus_average_w"]))
+        ),
+        judge("largest current", [power["peak_current_a"]], CURRENT_LIMIT_A, "A"),
+    ]

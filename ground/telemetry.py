@@ -1,0 +1,145 @@
+"""Reads recorded packets: from bytes, of which all are accounted for, and from the folder of a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.packets import (
+    HEADER_BYTES,
+    LAYOUTS,
+    SEQUENCE_MODULUS,
+    Layout,
+    PacketArray,
+    TelemetryError,
+    truncated_bytes,
+    walk,
+)
+from knightcube.errors import UsageError
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """Packets found in a sequence of bytes, and the account of its bytes.
+
+    Attributes:
+        packets: structured array of each packet type of the table in order of arrival, which may be empty.
+        total_bytes: number of bytes scanned.
+        skipped_bytes: bytes that belong to no valid packet, without those of a truncated last packet.
+        truncated_bytes: bytes at the end that look like the beginning of a packet.
+        missing: number of packets of each type that are missing according to the sequence counts. A gap of
+            16,384 packets or more counts modulo 16,384.
+        other_versions: valid packets in another version than that of the table, which are not decoded.
+    """
+
+    packets: dict[str, PacketArray]
+    total_bytes: int
+    skipped_bytes: int
+    truncated_bytes: int
+    missing: dict[str, int]
+    other_versions: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of packets by name, without the types that have none."""
+        return {name: len(array) for name, array in self.packets.items() if len(array)}
+
+    @property
+    def intact(self) -> bool:
+        """Whether every byte and every sequence count is accounted for."""
+        damage = self.skipped_bytes + self.truncated_bytes + self.other_versions
+        return damage + sum(self.missing.values()) == 0
+
+
+def scan(data: bytes) -> ScanResult:
+    """Return the packets in `data` and the account of all its bytes."""
+    found: dict[str, list[bytes]] = {name: [] for name in LAYOUTS}
+    claimed = other_versions = last = 0
+    for layout, begin, end in walk(data):
+        if data[begin + HEADER_BYTES] == layout.packet.version:
+            found[layout.packet.name].append(data[begin:end])
+        else:
+            other_versions += 1
+        claimed += end - begin
+        last = end
+    truncated = truncated_bytes(data, last)
+    joined = {name: b"".join(packets) for name, packets in found.items()}
+    return ScanResult(
+        packets={name: LAYOUTS[name].array(raw) for name, raw in joined.items()},
+        total_bytes=len(data),
+        skipped_bytes=len(data) - claimed - truncated,
+        truncated_bytes=truncated,
+        missing={name: _missing(LAYOUTS[name], raw) for name, raw in joined.items()},
+        other_versions=other_versions,
+    )
+
+
+def _missing(layout: Layout, packets: bytes) -> int:
+    """Return the number of packets missing between those found, according to their sequence counts."""
+    if len(packets) <= layout.length:  # most datagrams contain few packet types
+        return 0
+    steps = np.diff(layout.sequence_counts(packets))
+    return int(np.sum((steps - 1) % SEQUENCE_MODULUS))
+
+
+def decode(data: bytes) -> dict[str, PacketArray]:
+    """Return the packets of `data` by name.
+
+    Raises TelemetryError if a byte belongs to no valid packet or a packet is of another version.
+    """
+    result = scan(data)
+    bad = result.skipped_bytes + result.truncated_bytes
+    if bad or result.other_versions:
+        others = result.other_versions
+        raise TelemetryError(f"{bad} bytes belong to no packet, {others} packets are of another version")
+    return result.packets
+
+
+@dataclass(frozen=True)
+class Run:
+    """The logs in the folder of a run. `truth` and `performance` are empty if the run has no such log."""
+
+    folder: Path
+    flight: ScanResult
+    truth: ScanResult
+    performance: ScanResult
+
+    @property
+    def logs(self) -> dict[str, ScanResult]:
+        """The three logs by the stems of their files."""
+        return {"flight": self.flight, "truth": self.truth, "performance": self.performance}
+
+    def dropped_segments(self, stem: str) -> int:
+        """Return how many of a log's oldest segments were deleted to keep its size budget."""
+        names = [path.stem for path in find_segments(self.folder, stem)]
+        return int(names[0].rpartition("-")[2]) - 1 if names else 0
+
+    def __getitem__(self, name: str) -> PacketArray:
+        """Return the packets of a type from the log that has them, or an empty array."""
+        for log in self.logs.values():
+            if len(log.packets[name]):
+                return log.packets[name]
+        return LAYOUTS[name].array(b"")
+
+
+def read_run(folder: Path) -> Run:
+    """Read a run's folder. Raises UsageError if it has no flight log with a valid packet."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: no such folder; give the folder that a run was written to (--out)")
+    if not find_segments(folder, "flight"):
+        raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
+    flight, truth, performance = (_read_log(folder, stem) for stem in ("flight", "truth", "performance"))
+    if not flight.counts:
+        raise UsageError(f"{folder}: no valid packet in the {flight.total_bytes} bytes of the flight log")
+    return Run(folder, flight, truth, performance)
+
+
+def _read_log(folder: Path, stem: str) -> ScanResult:
+    try:
+        return scan(b"".join(path.read_bytes() for path in find_segments(folder, stem)))
+    except OSError as error:
+        raise UsageError(f"{folder}: the {stem} log cannot be read: {error.strerror or error}") from error
