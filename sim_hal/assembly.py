@@ -19,19 +19,19 @@ from hal.drivers.h_bridge import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from sim_hal.device import EmulatedDevice, FaultTimeline, SerialEnd
+from sim_hal.emulators.camera import EmulatedCamera, Expose
 from sim_hal.emulators.coil_circuit import CoilCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
-from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.objects import Objects
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
 from sim_hal.orbit_sky import from_orbit
-from sim_hal.settings import Simulation, Sky
+from sim_hal.settings import Simulation, SkySection
 from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
-from sim_hal.worlds.world import Motion, OrbitingWorld, World, WorldInputs, make_world
+from sim_hal.worlds.world import BodyMotion, OrbitingWorld, World, WorldInputs, make_world
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack, StarCameraModel
@@ -100,7 +100,7 @@ class Hardware:
     pwm: EmulatedPca9685
     monitor: EmulatedIna219 | None
     circuit: CoilCircuit
-    camera: EmulatedStarCamera | None
+    camera: EmulatedCamera | None
     truth: TruthRecorder | None
     faults: FaultTimeline
     orbit: OrbitDevices
@@ -141,7 +141,7 @@ def assemble(
     objects = Objects(section.objects, section.utc, now_ns(), world)
     camera = _camera(config.camera, section, world, expose, now_ns, objects)
     orbit = _orbit(config, section, world, now_ns, gps_line, expose_wide)
-    for part in orbit.strings.parts if orbit.strings is not None else ():
+    for part in orbit.cells.parts if orbit.cells is not None else ():
         coils.bus.attach(part)
     faults = FaultTimeline()
     if truth is not None:
@@ -155,7 +155,7 @@ def assemble(
 
 def _sense(
     world: World, circuit: CoilCircuit, coil_field: FloatArray, bias: FloatArray
-) -> Callable[[int], Motion]:
+) -> Callable[[int], BodyMotion]:
     """Return the motion that the inertial unit measures, with the coils' field and the magnetometer's bias.
 
     `coil_field` is (3, 3) T/A, `bias` (3,) T, body axes.
@@ -165,7 +165,7 @@ def _sense(
     if not (coil_field.any() or bias.any()):
         return world.motion
 
-    def sense(time_ns: int) -> Motion:
+    def sense(time_ns: int) -> BodyMotion:
         motion = world.motion(time_ns)
         return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
 
@@ -175,7 +175,7 @@ def _sense(
 def _unit(
     config: Config,
     section: Simulation,
-    sense: Callable[[int], Motion],
+    sense: Callable[[int], BodyMotion],
     line: SerialEnd,
     generator: np.random.Generator,
     now_ns: int,
@@ -200,7 +200,7 @@ def _camera(
     expose: Expose | None,
     now_ns: Callable[[], int],
     objects: Objects,
-) -> EmulatedStarCamera | None:
+) -> EmulatedCamera | None:
     if camera is None:
         return None
     make = expose or inline_exposure(StarRenderer(camera, section.sky, section.seed))
@@ -209,7 +209,7 @@ def _camera(
     readout_ns = round(section.sky.readout * 1e9)
     scan_ns = round(section.sky.line_time * camera.rows * 1e9)
     mounting = np.array(camera.mounting)
-    return EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns, objects.tracks)
+    return EmulatedCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns, objects.tracks)
 
 
 def _orbit(
@@ -237,7 +237,7 @@ def fault_generator(seed: int) -> np.random.Generator:
     return np.random.default_rng([seed, _FAULT_STREAM])
 
 
-def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
+def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
     """Return the optics and detector of an emulated camera."""
     # Imported late: half of a server's start-up time, and another process renders its frames.
     from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415
@@ -263,7 +263,7 @@ def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
 class StarRenderer:
     """Renders the frames of one camera; the noise of frame k depends on the seed and k only."""
 
-    def __init__(self, camera: Camera, sky: Sky, seed: int) -> None:
+    def __init__(self, camera: Camera, sky: SkySection, seed: int) -> None:
         self._model = camera_model(camera, sky)
         catalogue = load().brighter_than(sky.magnitude_limit)
         self._directions = catalogue.directions_at(sky.year)

@@ -28,20 +28,20 @@ from sim_hal.assembly import (
     line_generator,
 )
 from sim_hal.clock import SimClock
-from sim_hal.emulators.serial_line import SerialLine
-from sim_hal.emulators.star_camera import EmulatedStarCamera
+from sim_hal.emulators.camera import EmulatedCamera
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import put, scheduled
 from sim_hal.objects import Objects
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.settings import Simulation
 from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
-from sim_hal.worlds.world import Motion, WorldInputs, make_world
+from sim_hal.worlds.world import BodyMotion, WorldInputs, make_world
 
 
 def posed_camera(
     config: Config, section: Simulation, clock: SimClock, rate: FloatArray
-) -> tuple[EmulatedStarCamera, Callable[[int], FloatArray]]:
+) -> tuple[EmulatedCamera, Callable[[int], FloatArray]]:
     """Return the camera of a configuration on a clock, and its attitude (4,), ICRS into camera, at a time.
 
     It turns at `rate` (3,) rad/s, camera axes, from the attitude at which the body is released. Raises
@@ -55,11 +55,11 @@ def posed_camera(
     held, body_rate = world.motion(begun_ns), attitude_matrix(mounting).T @ rate
     nothing = np.zeros(3)
 
-    def motion(time_ns: int) -> Motion:
+    def motion(time_ns: int) -> BodyMotion:
         turned = from_rotation_vector(body_rate * ((time_ns - begun_ns) * 1e-9))
-        return Motion(time_ns, multiply(turned, held.quaternion), body_rate, nothing, nothing)
+        return BodyMotion(time_ns, multiply(turned, held.quaternion), body_rate, nothing, nothing)
 
-    device = EmulatedStarCamera(
+    device = EmulatedCamera(
         motion,
         inline_exposure(StarRenderer(camera, section.sky, section.seed)),
         clock.now_ns,
@@ -80,8 +80,8 @@ class LockStep:
     wires: Wires
     release: Callable[[int], None]
     hardware: Hardware
-    line: SerialLine
-    gps_line: SerialLine | None = None
+    line: EmulatedSerialLine
+    gps_line: EmulatedSerialLine | None = None
 
 
 def utc_ns(label: str) -> int:
@@ -91,11 +91,11 @@ def utc_ns(label: str) -> int:
 
 def build(config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock) -> LockStep:
     """Put the simulated hardware on a clock."""
-    line = SerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
+    line = EmulatedSerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
     gps_line = None
     if config.gps is not None:
         generator = line_generator(section.seed, GPS_LINE)
-        gps_line = SerialLine(clock.now_ns, config.gps.baud_rate, generator)
+        gps_line = EmulatedSerialLine(clock.now_ns, config.gps.baud_rate, generator)
     gps_end = None if gps_line is None else gps_line.device
     hardware = assemble(config, section, clock.now_ns, line.device, truth, gps_line=gps_end)
     clock.attach(hardware.simulation)

@@ -15,9 +15,9 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.device import SerialEnd
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
+from sim_hal.emulators.camera import EmulatedCamera, Expose
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
-from sim_hal.emulators.solar_strings import EmulatedStrings, SolarStringsModel
-from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
+from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices
 from sim_hal.settings import OrbitDeviceTruth, Simulation
 from sim_hal.worlds import sun
@@ -65,8 +65,8 @@ def _strings(
     now_ns: Callable[[], int],
     generator: np.random.Generator,
     errors: np.random.Generator,
-) -> EmulatedStrings:
-    model = SolarStringsModel(
+) -> EmulatedSolarCells:
+    model = SolarCellsModel(
         normals=np.array([string.normal for string in section.strings]),
         peaks=np.array([string.peak for string in section.strings]),
         gain_errors=truth.string_gain * errors.standard_normal(len(section.strings)),
@@ -74,7 +74,7 @@ def _strings(
         albedo=truth.albedo,
     )
     wirings = [StringWiring(s.address, s.channel, s.volt_per_ampere) for s in section.strings]
-    return EmulatedStrings(world, model, wirings, now_ns, generator)
+    return EmulatedSolarCells(world, model, wirings, now_ns, generator)
 
 
 def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
@@ -104,7 +104,7 @@ def _wide(
     world: OrbitingWorld,
     now_ns: Callable[[], int],
     expose: ExposeWide | None,
-) -> EmulatedStarCamera:
+) -> EmulatedCamera:
     model, make = wide_model(camera, seed[-1]), expose or inline_wide
 
     def exposed(sequence: int, _: FloatArray, attitudes: FloatArray, __: object) -> Future[Image]:
@@ -118,7 +118,7 @@ def _wide(
         return make(model, scene, (*seed, sequence))
 
     shown: Expose = exposed
-    return EmulatedStarCamera(world.motion, shown, now_ns, READOUT_NS, np.array(camera.mounting))
+    return EmulatedCamera(world.motion, shown, now_ns, READOUT_NS, np.array(camera.mounting))
 
 
 def render_wide(model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]) -> Image:

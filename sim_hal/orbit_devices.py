@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from flight.schema.sections import Config
 from knightcube.astro.arrays import Image
-from sim_hal.emulators.star_camera import EmulatedStarCamera
+from sim_hal.emulators.camera import EmulatedCamera
 
 if TYPE_CHECKING:  # they take half a second to import, and the testbed has none
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
     from sim_hal.emulators.gps import EmulatedGps
-    from sim_hal.emulators.solar_strings import EmulatedStrings
+    from sim_hal.emulators.solar_cells import EmulatedSolarCells
 
 GPS_LINE = 1
 """The number of the receiver's line; the inertial unit's has none."""
@@ -28,8 +28,8 @@ class OrbitDevices:
     """The devices that are fitted."""
 
     gps: EmulatedGps | None = None
-    strings: EmulatedStrings | None = None
-    wide: tuple[EmulatedStarCamera, ...] = ()
+    cells: EmulatedSolarCells | None = None
+    wide: tuple[EmulatedCamera, ...] = ()
 
 
 def wanted(config: Config) -> bool:

@@ -19,8 +19,8 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.emulators.star_camera import Expose
-from sim_hal.worlds.world import OrbitingWorld, Surroundings
+from sim_hal.emulators.camera import Expose
+from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack
@@ -73,7 +73,7 @@ def aberrated(attitudes: FloatArray, velocity: FloatArray) -> FloatArray:
     return quaternion.multiply(quaternion.from_rotation_vector(-in_camera), attitudes)
 
 
-def view(pinhole: Pinhole, to_camera: FloatArray, around: Surroundings) -> tuple[bool, BoolArray | None]:
+def view(pinhole: Pinhole, to_camera: FloatArray, around: OrbitEnvironment) -> tuple[bool, BoolArray | None]:
     """Return whether sunlight blinds the camera, and the pixels (rows, columns) behind the dark Earth."""
     corner = float(np.arccos(pinhole.unit_vectors(np.zeros((1, 2)))[0, 2]))
     sun = to_camera @ around.sun

@@ -146,8 +146,8 @@ class CageTruth(Section, frozen=True, kw_only=True):
     ring_current: NotNegative = 1.0
 
 
-class Sky(Section, frozen=True, kw_only=True):
-    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
+class SkySection(Section, frozen=True, kw_only=True):
+    """SkySection and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
@@ -243,7 +243,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     current_noise: NotNegative = 0.0
     coil_field: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
     imu: ImuNoise = ImuNoise()
-    sky: Sky = Sky()
+    sky: SkySection = SkySection()
     objects: Annotated[tuple[SkyObject, ...], Meta(max_length=32)] = ()
     truth: Truth = Truth()
     free_body: FreeBodySection | None = None

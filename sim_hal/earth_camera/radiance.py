@@ -97,7 +97,7 @@ _DARKEST = -0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class EarthIntersection:
     """Where lines of sight (n, 3) pass: their first meeting with the ellipsoid, or their nearest point to it.
 
     Attributes:
@@ -112,7 +112,7 @@ class Sight:
     places: FloatArray
 
 
-def look(scene: EarthScene, rays: FloatArray) -> Sight:
+def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
     """Return where `rays` (n, 3), of any length, in camera axes, pass the Earth."""
     axes = semi_axes()
     origin = scene.in_earth(scene.position) / axes
@@ -131,10 +131,10 @@ def look(scene: EarthScene, rays: FloatArray) -> Sight:
     length = np.sqrt(distance)
     local = np.sqrt(nearest**2 @ axes**2) / length
     heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32)
-    return Sight(np.asarray(hits), heights, places)
+    return EarthIntersection(np.asarray(hits), heights, places)
 
 
-def radiance(scene: EarthScene, rays: FloatArray, sight: Sight) -> Float32Array:
+def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
     """Return the radiance (n,) along unit `rays` (n, 3) in camera axes that pass the Earth as `sight` says.
 
     The Sun's disc is left out.

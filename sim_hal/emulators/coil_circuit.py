@@ -127,25 +127,25 @@ _LOW, _HIGH = (0, 0), (0, COUNTS)
 _OFF = Bridge(_LOW, _LOW, _HIGH)
 
 
-class Condition(Enum):
+class CoilCondition(Enum):
     """The condition of a coil or its bridge; beside a stuck leg the other leg still follows its input."""
 
     SOUND = "sound"
     OPEN = "open"
     SHORTED = "shorted"
     REVERSED = "reversed"
-    A_HIGH = "A stuck high"
-    A_LOW = "A stuck low"
-    B_HIGH = "B stuck high"
-    B_LOW = "B stuck low"
+    A_HIGH = "a-high"
+    A_LOW = "a-low"
+    B_HIGH = "b-high"
+    B_LOW = "b-low"
 
 
 _FREE: tuple[Pulse | None, Pulse | None] = (None, None)
-_STUCK: dict[Condition, tuple[Pulse | None, Pulse | None]] = {
-    Condition.A_HIGH: (_HIGH, None),
-    Condition.A_LOW: (_LOW, None),
-    Condition.B_HIGH: (None, _HIGH),
-    Condition.B_LOW: (None, _LOW),
+_STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
+    CoilCondition.A_HIGH: (_HIGH, None),
+    CoilCondition.A_LOW: (_LOW, None),
+    CoilCondition.B_HIGH: (None, _HIGH),
+    CoilCondition.B_LOW: (None, _LOW),
 }
 """The pulses of the legs A and B that do not follow their inputs."""
 
@@ -182,7 +182,7 @@ class CoilCircuit:
         self._uncertainty = uncertainty
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
         self._supply_voltage = truth.supply_voltage
-        self._conditions = [Condition.SOUND] * 3
+        self._conditions = [CoilCondition.SOUND] * 3
         self._stuck = [_FREE] * 3
         self._short_ohm = [1.0, 1.0, 1.0]
         self._bridges = [_OFF] * 3
@@ -197,7 +197,7 @@ class CoilCircuit:
         """Return the mean currents (3,) in A of the present PWM setting."""
         return self._currents
 
-    def become(self, axis: int, condition: Condition, short_ohm: float = 5.0) -> None:
+    def become(self, axis: int, condition: CoilCondition, short_ohm: float = 5.0) -> None:
         """Set the condition of a coil; a shorted coil loads its bridge with `short_ohm`."""
         self._conditions[axis] = condition
         self._stuck[axis] = _STUCK.get(condition, _FREE)
@@ -219,13 +219,13 @@ class CoilCircuit:
                 current = min(limit, max(-limit, current))
                 drawn = abs(current) * COUNTS / abs(counts)
             match self._conditions[axis]:
-                case Condition.SOUND:
+                case CoilCondition.SOUND:
                     pass
-                case Condition.OPEN:
+                case CoilCondition.OPEN:
                     current, drawn = 0.0, 0.0
-                case Condition.SHORTED:
+                case CoilCondition.SHORTED:
                     current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
-                case Condition.REVERSED:
+                case CoilCondition.REVERSED:
                     current = -current
                 case _:
                     pass

@@ -155,7 +155,7 @@ class Wire:
         return data
 
 
-class SerialLine:
+class EmulatedSerialLine:
     """The line with both its ends.
 
     Attributes:
@@ -176,7 +176,7 @@ class SerialLine:
 class HostEnd:
     """The host's end; implements `hal.interfaces.wires.SerialPort`."""
 
-    def __init__(self, line: SerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
+    def __init__(self, line: EmulatedSerialLine, now_ns: Callable[[], int], baud_rate: int) -> None:
         self.baud_rate = baud_rate
         self.unplugged = False
         self._line = line
@@ -208,7 +208,7 @@ class HostEnd:
 class DeviceEnd:
     """The device's end; implements `sim_hal.device.SerialEnd`."""
 
-    def __init__(self, line: SerialLine, baud_rate: int) -> None:
+    def __init__(self, line: EmulatedSerialLine, baud_rate: int) -> None:
         self.baud_rate = baud_rate
         self._line = line
 

@@ -47,17 +47,17 @@ from sim_hal.emulators.vn100_registers import (
 from sim_hal.emulators.vn100_sensors import (
     FIELD_VALUES,
     IMU_RATE_HZ,
+    OUTPUT_BY_REGISTER,
+    OUTPUT_BY_TYPE,
     PROFILES,
-    REPORT_BY_REGISTER,
-    REPORT_BY_TYPE,
-    Instant,
-    Measured,
+    AsciiOutput,
+    MessageData,
     NoiseProfile,
-    Report,
     Sensors,
-    report_length,
+    Vn100Sample,
+    sentence_length,
 )
-from sim_hal.worlds.world import Motion
+from sim_hal.worlds.world import BodyMotion
 
 ATTITUDE_COMMANDS = frozenset({"KMD", "KAD", "TAR", "SIH", "SGB", "SFB"})
 _DISTURBANCES = {"KMD": 1 << 11, "KAD": 1 << 12}
@@ -83,13 +83,13 @@ class AttitudeCommands:
         self._turn = None
         self.status = 0
 
-    def turned(self, measured: Measured) -> Measured:
+    def turned(self, measured: Vn100Sample) -> Vn100Sample:
         """Return a sample with the heading that commands have set."""
         if self._turn is None:
             return measured
         return replace(measured, quaternion=multiply(measured.quaternion, self._turn))
 
-    def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Measured]) -> None:
+    def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Vn100Sample]) -> None:
         """Execute one of ATTITUDE_COMMANDS; `sample` measures now. Raises UnitError."""
         if command in _DISTURBANCES:
             bit = _DISTURBANCES[command]
@@ -103,7 +103,7 @@ class AttitudeCommands:
             else:
                 self._store_biases(everything=command == "SFB")
 
-    def _set_heading(self, yaw: float, sample: Callable[[], Measured]) -> None:
+    def _set_heading(self, yaw: float, sample: Callable[[], Vn100Sample]) -> None:
         """Turn the attitude about the vertical so that the yaw is now `yaw`, rad."""
         if self._registers.integer(_VPE_CONTROL, _HEADING_MODE) == _ABSOLUTE:
             return
@@ -145,7 +145,7 @@ def _yaw_of(values: list[float]) -> float:
         return math.radians(values[0])
     if not any(values):
         raise UnitError(INVALID_PARAMETER)
-    attitude = Measured(normalise(np.array(values)), np.zeros(3), np.zeros(3), np.zeros(3))
+    attitude = Vn100Sample(normalise(np.array(values)), np.zeros(3), np.zeros(3), np.zeros(3))
     return math.radians(attitude.yaw_pitch_roll[0])
 
 
@@ -158,7 +158,7 @@ class Stream:
 
     divisor: int
     length: int
-    message: Callable[[Instant], bytes]
+    message: Callable[[MessageData], bytes]
     sent_ns: int
 
 
@@ -183,11 +183,11 @@ class OutputStreams:
         """Rebuild the streams from the registers. Raises UnitError, unchanged, when the line is too slow."""
         registers = self._registers
         streams: dict[int, Stream] = {}
-        report = REPORT_BY_TYPE.get(registers.integer(6))
+        report = OUTPUT_BY_TYPE.get(registers.integer(6))
         if report is not None and not self.muted & {6, 7}:
             divisor = IMU_RATE_HZ // registers.integer(7)
             crc_bytes = 2 * (self.checksum() == "crc16")
-            length = report_length(report) + len(self._suffix(0)) + crc_bytes
+            length = sentence_length(report) + len(self._suffix(0)) + crc_bytes
             streams[6] = Stream(divisor, length, lambda now: self._sentence(report, now), device_ns)
         for number in sorted(set(BINARY_OUTPUTS) - self.muted):
             output = binary_output(registers.read(number))
@@ -217,12 +217,12 @@ class OutputStreams:
         count = ",T0000000000" if self._registers.integer(30, 0) else ""
         return count + (f",S{status:04X}" if self._registers.integer(30, 1) else "")
 
-    def _sentence(self, report: Report, now: Instant) -> bytes:
+    def _sentence(self, report: AsciiOutput, now: MessageData) -> bytes:
         fields = [*report.text(now), *self._suffix(now.status).split(",")[1:]]
         return build(report.header, *fields, checksum=self.checksum())
 
 
-def packer(output: BinaryOutput) -> Callable[[Instant], bytes]:
+def packer(output: BinaryOutput) -> Callable[[MessageData], bytes]:
     """Return the function that packs a binary output."""
     sources = [FIELD_VALUES[key] for key in output.layout.fields]
     return lambda now: output.layout.pack([value for source in sources for value in source(now)])
@@ -242,7 +242,7 @@ class UnitActions:
         restart: resets the unit.
     """
 
-    sample: Callable[[int], Instant]
+    sample: Callable[[int], MessageData]
     build_streams: Callable[[int], None]
     write_flash: Callable[[int, Callable[[int], None]], None]
     restart: Callable[[int], None]
@@ -344,13 +344,13 @@ class CommandInterface:
                 raise UnitError(INVALID_COMMAND)
 
     def _read(self, number: int, now_ns: int) -> tuple[str, ...]:
-        report = REPORT_BY_REGISTER.get(number)
+        report = OUTPUT_BY_REGISTER.get(number)
         if report is not None:
             return tuple(report.text(self._actions.sample(now_ns)))
         return self._registers.read(number)
 
     def _write(self, number: int, fields: tuple[str, ...], answer: Callable[..., None], now_ns: int) -> None:
-        if number in REPORT_BY_REGISTER:
+        if number in OUTPUT_BY_REGISTER:
             raise UnitError(UNAUTHORIZED)
         before = self._registers.read(number)
         echo = self._registers.write(number, fields[1:])
@@ -422,7 +422,7 @@ class Vn100Emulator:
 
     def __init__(
         self,
-        sense: Callable[[int], Motion],
+        sense: Callable[[int], BodyMotion],
         line: SerialEnd,
         rng: np.random.Generator,
         settings: Vn100EmulatorSettings,
@@ -430,7 +430,7 @@ class Vn100Emulator:
     ) -> None:
         """Start at `now_ns`, the unit on for `settings.uptime_ns`; `sense` returns the motion at a time."""
         self.registers = RegisterFile()
-        self.alter: Callable[[Measured], Measured] | None = None
+        self.alter: Callable[[Vn100Sample], Vn100Sample] | None = None
         self._sense = sense
         self._line = line
         self._settings = settings
@@ -469,7 +469,7 @@ class Vn100Emulator:
     def set_baud_rate(self, baud_rate: int) -> None:
         """Save this speed in the flash, with the fastest output rate that fits. Raises UnitError."""
         self.registers.write(5, (str(baud_rate),))
-        length = report_length(REPORT_BY_TYPE[14])
+        length = sentence_length(OUTPUT_BY_TYPE[14])
         fitting = [rate for rate in ASYNC_RATES_HZ if rate <= 40 and 10 * length * rate <= baud_rate]
         self.registers.write(7, (str(fitting[-1]),))
         self._build_streams(self._origin_ns)
@@ -540,19 +540,19 @@ class Vn100Emulator:
 
     # Output.
 
-    def _measure(self, now_ns: int) -> Measured:
+    def _measure(self, now_ns: int) -> Vn100Sample:
         windows = tuple(self.registers.integer(85, index) for index in range(3))
         measured = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return measured if self.alter is None else self.alter(measured)
 
-    def _instant(self, device_ns: int, measured: Measured, since_ns: int) -> Instant:
+    def _instant(self, device_ns: int, measured: Vn100Sample, since_ns: int) -> MessageData:
         interval = (device_ns - since_ns) * 1e-9
         settings = self._settings
-        return Instant(
+        return MessageData(
             device_ns, measured, self._attitude.status, interval, settings.temperature, settings.pressure
         )
 
-    def _instant_now(self, now_ns: int) -> Instant:
+    def _instant_now(self, now_ns: int) -> MessageData:
         device_ns = self._device_ns(now_ns)
         return self._instant(device_ns, self._measure(now_ns), device_ns - TICK_NS)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply, normalise
-from sim_hal.worlds.world import STANDARD_GRAVITY, Motion
+from sim_hal.worlds.world import STANDARD_GRAVITY, BodyMotion
 
 IMU_RATE_HZ = 800
 GAUSS_PER_TESLA = 1e4
@@ -73,7 +73,7 @@ PROFILES: dict[ProfileName, NoiseProfile] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class Vn100Sample:
     """One sample, in the unit's own axes and units.
 
     Attributes:
@@ -139,7 +139,7 @@ class Sensors:
         if self._free_fall:
             self._static = normalise(self._rng.standard_normal(4))
 
-    def measure(self, motion: Motion, windows: tuple[int, ...]) -> Measured:
+    def measure(self, motion: BodyMotion, windows: tuple[int, ...]) -> Vn100Sample:
         """Return one sample; `windows` are the filter lengths of magnetometer, accelerometer and gyro."""
         profile = self._profile
         bounded = 2.0 * self._rng.random(6) - 1.0
@@ -153,7 +153,7 @@ class Sensors:
         if self._static is not None:
             q = multiply(q, self._static)
         turn = self._to_sensor
-        return Measured(
+        return Vn100Sample(
             quaternion=q,
             rate=turn @ (motion.rate + profile.rate_bound * bounded[3:]) + self._bias + white[:3],
             mag=GAUSS_PER_TESLA * (turn @ motion.field_body + white[3:6]),
@@ -178,7 +178,7 @@ GRAVITY_NED: FloatArray = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
 @dataclass(frozen=True, slots=True)
-class Instant:
+class MessageData:
     """The data of all messages at one time.
 
     Attributes:
@@ -190,7 +190,7 @@ class Instant:
     """
 
     device_ns: int
-    measured: Measured
+    measured: Vn100Sample
     status: int
     interval: float
     temperature: float
@@ -209,44 +209,44 @@ class Instant:
 Values = tuple[float, ...]
 
 
-def _time(now: Instant) -> Values:
+def _time(now: MessageData) -> Values:
     return (now.device_ns,)
 
 
-def _zero(_: Instant) -> Values:
+def _zero(_: MessageData) -> Values:
     return (0,)
 
 
-def _yaw_pitch_roll(now: Instant) -> Values:
+def _yaw_pitch_roll(now: MessageData) -> Values:
     return now.measured.yaw_pitch_roll
 
 
-def _quaternion(now: Instant) -> Values:
+def _quaternion(now: MessageData) -> Values:
     return tuple(now.measured.quaternion.tolist())
 
 
-def _rate(now: Instant) -> Values:
+def _rate(now: MessageData) -> Values:
     return tuple(now.measured.rate.tolist())
 
 
-def _mag(now: Instant) -> Values:
+def _mag(now: MessageData) -> Values:
     return tuple(now.measured.mag.tolist())
 
 
-def _accel(now: Instant) -> Values:
+def _accel(now: MessageData) -> Values:
     return tuple(now.measured.accel.tolist())
 
 
-def _status(now: Instant) -> Values:
+def _status(now: MessageData) -> Values:
     return (now.status,)
 
 
-def _in_ned(vector: FloatArray, now: Instant) -> Values:
+def _in_ned(vector: FloatArray, now: MessageData) -> Values:
     return tuple((now.measured.matrix.T @ vector).tolist())
 
 
 # By (group bit, field bit), the numbers of `hal.drivers.vn100.protocol.FIELDS`.
-FIELD_VALUES: Mapping[tuple[int, int], Callable[[Instant], Values]] = {
+FIELD_VALUES: Mapping[tuple[int, int], Callable[[MessageData], Values]] = {
     (0, 0): _time,
     (0, 2): _zero,
     (0, 3): _yaw_pitch_roll,
@@ -255,7 +255,7 @@ FIELD_VALUES: Mapping[tuple[int, int], Callable[[Instant], Values]] = {
     (0, 8): _accel,
     (0, 9): lambda now: _accel(now) + _rate(now),
     (0, 10): lambda now: (*_mag(now), now.temperature, now.pressure),
-    (0, 11): Instant.deltas,
+    (0, 11): MessageData.deltas,
     (0, 12): _status,
     (0, 13): _zero,
     (1, 0): _time,
@@ -290,78 +290,78 @@ def _print(form: str, values: Iterable[float]) -> list[str]:
     return [form % value for value in values]
 
 
-def _angles_text(now: Instant) -> list[str]:
+def _angles_text(now: MessageData) -> list[str]:
     return _print("%+08.3f", now.measured.yaw_pitch_roll)
 
 
-def _quaternion_text(now: Instant) -> list[str]:
+def _quaternion_text(now: MessageData) -> list[str]:
     return _print("%+09.6f", _quaternion(now))
 
 
-def _mag_text(now: Instant) -> list[str]:
+def _mag_text(now: MessageData) -> list[str]:
     return _print("%+08.4f", _mag(now))
 
 
-def _accel_text(now: Instant) -> list[str]:
+def _accel_text(now: MessageData) -> list[str]:
     return _print("%+07.3f", _accel(now))
 
 
-def _rate_text(now: Instant) -> list[str]:
+def _rate_text(now: MessageData) -> list[str]:
     return _print("%+010.6f", _rate(now))
 
 
-def _sensors_text(now: Instant) -> list[str]:
+def _sensors_text(now: MessageData) -> list[str]:
     return _mag_text(now) + _accel_text(now) + _rate_text(now)
 
 
-def _deltas_text(now: Instant) -> list[str]:
+def _deltas_text(now: MessageData) -> list[str]:
     interval, *deltas = now.deltas()
     return [f"{interval:+09.6f}", *_print("%+08.3f", deltas)]
 
 
-def _linear_text(now: Instant, key: tuple[int, int]) -> list[str]:
+def _linear_text(now: MessageData, key: tuple[int, int]) -> list[str]:
     return _angles_text(now) + _print("%+07.3f", FIELD_VALUES[key](now)) + _rate_text(now)
 
 
-def _imu_text(now: Instant) -> list[str]:
+def _imu_text(now: MessageData) -> list[str]:
     return [*_sensors_text(now), f"{now.temperature:+05.1f}", f"{now.pressure:+010.3f}"]
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class AsciiOutput:
     """One kind of ASCII output: header after `$VN`, number in register 6, register that reads it."""
 
     header: str
     async_type: int
     register: int | None
-    text: Callable[[Instant], list[str]]
+    text: Callable[[MessageData], list[str]]
 
 
 REPORTS = (
-    Report("YPR", 1, 8, _angles_text),
-    Report("QTN", 2, 9, _quaternion_text),
-    Report("QMR", 8, 15, lambda now: _quaternion_text(now) + _sensors_text(now)),
-    Report("DCM", 9, None, lambda now: _print("%+09.6f", now.measured.matrix.flatten().tolist())),
-    Report("MAG", 10, 17, _mag_text),
-    Report("ACC", 11, 18, _accel_text),
-    Report("GYR", 12, 19, _rate_text),
-    Report("MAR", 13, 20, _sensors_text),
-    Report("YMR", 14, 27, lambda now: _angles_text(now) + _sensors_text(now)),
-    Report("YBA", 16, 239, lambda now: _linear_text(now, (4, 6))),
-    Report("YIA", 17, 240, lambda now: _linear_text(now, (4, 7))),
-    Report("IMU", 19, 54, _imu_text),
-    Report("DTV", 30, 80, _deltas_text),
+    AsciiOutput("YPR", 1, 8, _angles_text),
+    AsciiOutput("QTN", 2, 9, _quaternion_text),
+    AsciiOutput("QMR", 8, 15, lambda now: _quaternion_text(now) + _sensors_text(now)),
+    AsciiOutput("DCM", 9, None, lambda now: _print("%+09.6f", now.measured.matrix.flatten().tolist())),
+    AsciiOutput("MAG", 10, 17, _mag_text),
+    AsciiOutput("ACC", 11, 18, _accel_text),
+    AsciiOutput("GYR", 12, 19, _rate_text),
+    AsciiOutput("MAR", 13, 20, _sensors_text),
+    AsciiOutput("YMR", 14, 27, lambda now: _angles_text(now) + _sensors_text(now)),
+    AsciiOutput("YBA", 16, 239, lambda now: _linear_text(now, (4, 6))),
+    AsciiOutput("YIA", 17, 240, lambda now: _linear_text(now, (4, 7))),
+    AsciiOutput("IMU", 19, 54, _imu_text),
+    AsciiOutput("DTV", 30, 80, _deltas_text),
 )
-REPORT_BY_TYPE = {report.async_type: report for report in REPORTS}
-REPORT_BY_REGISTER = {report.register: report for report in REPORTS if report.register is not None}
+OUTPUT_BY_TYPE = {report.async_type: report for report in REPORTS}
+OUTPUT_BY_REGISTER = {report.register: report for report in REPORTS if report.register is not None}
 
-_LEVEL = Measured(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), -GRAVITY_NED)
-STILL = Instant(0, _LEVEL, 0, 0.025, 20.0, 101.325)
+_LEVEL = Vn100Sample(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), -GRAVITY_NED)
+STILL = MessageData(0, _LEVEL, 0, 0.025, 20.0, 101.325)
 """A level unit at rest, from which sentence lengths are computed."""
 
 SENTENCE_FRAME = len("$VN") + len("*XX\r\n")
 
 
-def report_length(report: Report) -> int:
+def sentence_length(report: AsciiOutput) -> int:
     """Return the bytes of one sentence with an 8-bit checksum."""
     return SENTENCE_FRAME + len(",".join([report.header, *report.text(STILL)]))

@@ -1,42 +1,49 @@
-"""The hardware that faults act on, the types of the fault tables, and combined and repeated faults."""
+"""The simulated hardware that faults act on, and the description of one kind of fault."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import reduce
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_hal.emulators.serial_line import SOUND, HostEnd, LineFaults, Wire
+from sim_hal.emulators.serial_line import SOUND, EmulatedSerialLine, HostEnd, LineFaults, PtyLine, Wire
 
 if TYPE_CHECKING:  # parsing faults needs no hardware
     from sim_hal.assembly import Hardware
-from collections.abc import Mapping
-from enum import Enum
 
-Lift = Callable[[], None]
-"""Removes a fault."""
+Removal = Callable[[], None]
+"""Removes a fault that has begun."""
 
 
-class Line(Protocol):
-    """A serial line, in memory or on a pseudo-terminal."""
-
-    to_host: Wire
-    to_device: Wire
+def no_removal() -> None:
+    """Remove nothing: the effect of the fault stays until something repairs it."""
 
 
-def no_lift() -> None:
-    """Remove nothing: the effect stays until something repairs it."""
-
-
-def held(part: object | None, attribute: str, value: object, sound: object) -> Lift:
-    """Give an attribute of a part a value until the fault is removed; a part that is not fitted has none."""
+def hold(part: object | None, attribute: str, value: object, sound: object) -> Removal:
+    """Set an attribute of a part until the fault is removed; a part that is not fitted is left alone."""
     if part is None:
-        return no_lift
+        return no_removal
     setattr(part, attribute, value)
-    return lambda: setattr(part, attribute, sound)
+
+    def remove() -> None:
+        if getattr(part, attribute) is value:
+            setattr(part, attribute, sound)
+
+    return remove
+
+
+def all_of(removals: Sequence[Removal]) -> Removal:
+    """Return the removal of several faults together."""
+
+    def remove() -> None:
+        for removal in removals:
+            removal()
+
+    return remove
 
 
 @dataclass(slots=True)
@@ -44,69 +51,65 @@ class Bench:
     """The parts that faults act on from outside the flight process.
 
     Attributes:
-        now_ns: the simulation's time.
-        generator: for random faults.
-        host: the line's host end, where it is in memory.
-        flight_process: its process identifier, where it is not this process.
-        gps_line: the GPS receiver's line, where one is fitted.
+        line: serial line of the inertial unit.
+        now_ns: returns the simulation's time.
+        generator: random numbers of the faults.
+        host: host end of the line in memory; None for a pseudo-terminal.
+        flight_process: process identifier of the flight; None in lock-step.
+        gps_line: serial line of the GPS receiver, if one is fitted.
     """
 
     hardware: Hardware
-    line: Line
+    line: EmulatedSerialLine | PtyLine
     now_ns: Callable[[], int]
     generator: np.random.Generator
     host: HostEnd | None = None
     flight_process: int | None = None
-    gps_line: Line | None = None
+    gps_line: EmulatedSerialLine | PtyLine | None = None
     _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
 
-    def disturb(self, wire: Wire, faults: LineFaults) -> Lift:
+    def disturb(self, wire: Wire, faults: LineFaults) -> Removal:
         """Add a fault to those of a wire."""
         present = self._on_wires.setdefault(id(wire), [])
         present.append(faults)
-        wire.faults = _together(present)
+        wire.faults = reduce(_combined, present, SOUND)
 
-        def lift() -> None:
+        def remove() -> None:
             present.remove(faults)
-            wire.faults = _together(present)
+            wire.faults = reduce(_combined, present, SOUND)
 
-        return lift
+        return remove
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
         """Run `action` after `seconds` of simulated time."""
         self.hardware.faults.at(self.now_ns() + round(seconds * 1e9), action)
 
-    def toggle(self, begin: Callable[[], Lift], period: float, share: float) -> Lift:
+    def toggle(self, begin: Callable[[], Removal], period: float, share: float) -> Removal:
         """Apply a fault intermittently: for `share` of each `period` s."""
-        state: dict[str, Lift | None] = {"lift": None}
+        removals: list[Removal] = []
         stopped = False
 
-        def mend() -> None:
-            lift, state["lift"] = state["lift"], None
-            if lift is not None:
-                lift()
+        def pause() -> None:
+            if removals:
+                removals.pop()()
 
-        def turn() -> None:
+        def resume() -> None:
             if stopped:
                 return
-            state["lift"] = begin()
-            self.after(share * period, mend)
-            self.after(period, turn)
+            removals.append(begin())
+            self.after(share * period, pause)
+            self.after(period, resume)
 
-        def lift() -> None:
+        def remove() -> None:
             nonlocal stopped
             stopped = True
-            mend()
+            pause()
 
-        turn()
-        return lift
-
-
-def _together(faults: Sequence[LineFaults]) -> LineFaults:
-    return reduce(_both, faults, SOUND)
+        resume()
+        return remove
 
 
-def _both(a: LineFaults, b: LineFaults) -> LineFaults:
+def _combined(a: LineFaults, b: LineFaults) -> LineFaults:
     return replace(
         a,
         silent=a.silent or b.silent,
@@ -119,9 +122,17 @@ def _both(a: LineFaults, b: LineFaults) -> LineFaults:
 
 
 Parameters = Mapping[str, float]
+Begin = Callable[[Bench, "FaultKind", Parameters], Removal]
+"""Applies a fault of a kind to the bench and returns its removal."""
 
-Begin = Callable[[Bench, Parameters], Lift]
-"""Applies a fault to the bench and returns its removal."""
+
+def intermittently(begin: Begin) -> Begin:
+    """Return the intermittent form of a fault, with the parameters `period` (s) and `share`."""
+
+    def toggled(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+        return bench.toggle(lambda: begin(bench, fault, given), given["period"], given["share"])
+
+    return toggled
 
 
 class Where(Enum):
@@ -137,11 +148,11 @@ class Parameter:
     """A numeric parameter of a fault.
 
     Attributes:
-        default: where it is not given; None where it is then drawn.
+        default: value if none is given; None for a parameter that is then drawn at random.
         low, high: its bounds.
-        unit: of all three, empty for a mere number.
+        unit: unit of default and bounds; empty for a number without unit.
         whole: whether it must be a whole number.
-        choices: the allowed values, where not all between the bounds are.
+        choices: the allowed values; empty if all values between the bounds are allowed.
     """
 
     default: float | None
@@ -160,55 +171,32 @@ class Parameter:
     def bounds(self) -> str:
         """Return the allowed values in words."""
         unit = f" {self.unit}" if self.unit else ""
-        if self.choices:
-            return f"one of {', '.join(_runs(self.choices))}{unit}"
-        return f"{'a whole number ' if self.whole else ''}from {self.low:g} to {self.high:g}{unit}"
-
-
-def _runs(values: Sequence[float]) -> list[str]:
-    """Return values in words; three or more consecutive values as a range."""
-    runs: list[list[float]] = []
-    for value in values:
-        if runs and value == runs[-1][-1] + 1.0:
-            runs[-1].append(value)
-        else:
-            runs.append([value])
-    words = (
-        [f"{run[0]:g} to {run[-1]:g}"] if len(run) > 2 else [f"{value:g}" for value in run] for run in runs
-    )
-    return [word for run in words for word in run]
-
-
-CHANCE = Parameter(0.5, 1e-6, 1.0)
-"""Probability; at 0 a fault would have no effect."""
-PERIOD = Parameter(0.5, 0.05, 3600.0, "s")
-SHARE = Parameter(0.5, 0.01, 0.99)
-"""Fraction of its period for which an intermittent fault is present."""
-TURNS = {"period": PERIOD, "share": SHARE}
-
-
-def intermittently(begin: Begin) -> Begin:
-    """Return the fault that comes and goes, with the parameters TURNS."""
-    return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
-
-
-def delay(default: float) -> Parameter:
-    """Return the parameter of a delay."""
-    return Parameter(default, 1e-3, 60.0, "s")
+        if not self.choices:
+            return f"{'a whole number ' if self.whole else ''}from {self.low:g} to {self.high:g}{unit}"
+        runs: list[list[float]] = []
+        for value in self.choices:
+            if runs and value == runs[-1][-1] + 1.0:
+                runs[-1].append(value)
+            else:
+                runs.append([value])
+        words = []
+        for run in runs:  # three or more consecutive values are written as a range
+            words += [f"{run[0]:g} to {run[-1]:g}"] if len(run) > 2 else [f"{value:g}" for value in run]
+        return f"one of {', '.join(words)}{unit}"
 
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """One fault.
+    """One kind of fault.
 
     Attributes:
-        device, kind: its name is "device: kind".
-        meaning: what happens, in words.
+        device, kind: the two parts of its name "device: kind".
+        meaning: the effect, in words.
         begin: applies it to the bench and returns its removal; None for faults in the flight process.
-        parameters: by name.
-        momentary: it has no duration; its effect stays until something repairs it.
-        where: in which kind of simulation.
-        adds: it may be present together with other faults of its device.
+        parameters: its parameters by name.
+        momentary: whether it has no duration; its effect then stays until something repairs it.
+        where: the kind of simulation in which it can occur.
+        adds: whether it may be present together with other faults of its device.
     """
 
     device: str
@@ -226,6 +214,6 @@ class FaultKind:
         return f"{self.device}: {self.kind}"
 
     @property
-    def thing(self) -> str:
-        """The affected part: coil and bridge share one condition, as do unit and magnetometer."""
+    def part(self) -> str:
+        """The affected part: a coil with its bridge, and the inertial unit with its magnetometer, are one."""
         return self.device.replace("bridge-", "coil-").replace("magnetometer", "imu")

@@ -1,95 +1,597 @@
-"""All faults by name, and the faults of the computer: flight process, workers, wall clock, disk."""
+"""The table of all faults: name, meaning, parameters, and effect on the emulated hardware.
+
+A fault that radiation causes in one register bit is an upset; the driver has to find and repair its effect.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
 
-from sim_hal.faults.bench import Bench, FaultKind, Lift, Parameter, Parameters, Where, delay, no_lift
-from sim_hal.faults.bus_faults import BUS, COILS, IMU_UPSET, MONITOR, MONITOR_UPSET, PWM, PWM_UPSET
-from sim_hal.faults.sensor_faults import CAMERA, GPS, IMU, MAGNETOMETER, STRINGS, WIDE
+import numpy as np
 
-_STEP = Parameter(3600.0, -3.2e8, 3.2e8, "s")
-"""Ten years either way."""
+from hal.drivers.pca9685 import CHANNELS, LED0_ON_L, MODE1, MODE2, PRE_SCALE
+from knightcube.astro.quaternion import from_rotation_vector, multiply
+from sim_hal.emulators.coil_circuit import CoilCondition
+from sim_hal.emulators.ina219 import CALIBRATION, CONFIG
+from sim_hal.emulators.serial_line import LineFaults
+from sim_hal.emulators.vn100_registers import BAUD_RATES, FIELD_BITS, UnitError
+from sim_hal.emulators.vn100_sensors import GAUSS_PER_TESLA, Vn100Sample
+from sim_hal.faults.bench import (
+    Begin,
+    Bench,
+    FaultKind,
+    Parameter,
+    Parameters,
+    Removal,
+    Where,
+    all_of,
+    hold,
+    intermittently,
+    no_removal,
+)
+
+if TYPE_CHECKING:  # the table of faults needs no devices
+    from sim_hal.emulators.i2c_bus import I2cPart
+    from sim_hal.emulators.ina219 import EmulatedIna219
+    from sim_hal.emulators.pca9685 import EmulatedPca9685
+    from sim_hal.emulators.solar_cells import EmulatedAds1115
 
 
-def _killed(bench: Bench, _: Parameters) -> Lift:
+def _fault(
+    name: str,
+    meaning: str,
+    begin: Begin | None,
+    parameters: Mapping[str, Parameter] | None = None,
+    *,
+    momentary: bool = False,
+    adds: bool = False,
+    where: Where = Where.BOTH,
+) -> FaultKind:
+    device, _, kind = name.partition(": ")
+    return FaultKind(device, kind, meaning, begin, parameters or {}, momentary, where, adds)
+
+
+def _chance(default: float) -> Parameter:
+    return Parameter(default, 1e-6, 1.0)  # a probability of 0 would have no effect
+
+
+def _delay(default: float) -> Parameter:
+    return Parameter(default, 1e-3, 60.0, "s")
+
+
+def _count(default: float, low: float, high: float) -> Parameter:
+    return Parameter(default, low, high, whole=True)
+
+
+def _gain(default: float) -> Parameter:
+    return Parameter(default, 0.0, 10.0)
+
+
+def _turns(period: float = 0.5) -> dict[str, Parameter]:
+    """Return period, and share of the period during which an intermittent fault is present."""
+    return {"period": Parameter(period, 0.05, 3600.0, "s"), "share": Parameter(0.5, 0.01, 0.99)}
+
+
+def _nanoseconds(given: Parameters) -> int:
+    return round(given["delay"] * 1e9)
+
+
+def _held(attribute: str, value: Callable[[FaultKind, Parameters], object], sound: object) -> Begin:
+    """Return the fault that holds an attribute of a device, or of the cameras that `camera` names."""
+
+    def begin(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+        hardware = bench.hardware
+        parts: dict[str, Sequence[object]] = {
+            "monitor": (hardware.monitor,),
+            "camera": (hardware.camera,),
+            "gps": (hardware.orbit.gps,),
+            "strings": (hardware.orbit.cells,),
+            "wide": hardware.orbit.wide,
+        }
+        number = round(given.get("camera", 0.0))
+        chosen = [part for index, part in enumerate(parts[fault.device], start=1) if number in {0, index}]
+        held = value(fault, given)
+        return all_of([hold(part, attribute, held, sound) for part in chosen])
+
+    return begin
+
+
+_frozen = _held("frozen", lambda *_: True, False)
+_multiplied = _held("gain", lambda _, given: given["gain"], 1.0)
+_shown = _held("fault", lambda fault, _: "off" if fault.kind == "intermittent" else fault.kind, "")
+_old_conversions = _held("lag_ns", lambda _, given: _nanoseconds(given), 0)
+_wrong_time = _held("clock_ns", lambda _, given: round(given["seconds"] * 1e9), 0)
+_late = _held("late_ns", lambda _, given: _nanoseconds(given), 0)
+_thinned = _held("one_of", lambda _, given: round(given["n"]), 1)
+
+
+# Serial lines of inertial unit and GPS receiver.
+
+_LINE_FAULTS: dict[str, Callable[[Parameters], LineFaults]] = {
+    "silent": lambda _: LineFaults(silent=True),
+    "garbage": lambda _: LineFaults(garbage=True),
+    "slow": lambda given: LineFaults(thinned=round(given["n"])),
+    "delayed": lambda given: LineFaults(delay_ns=_nanoseconds(given)),
+    "intermittent": lambda _: LineFaults(silent=True),
+    "bits": lambda given: LineFaults(flip_probability=given["chance"]),
+    "cut": lambda given: LineFaults(cut_probability=given["chance"]),
+}
+
+
+def _on_line(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+    line = bench.line if fault.device == "imu" else bench.gps_line
+    return no_removal if line is None else bench.disturb(line.to_host, _LINE_FAULTS[fault.kind](given))
+
+
+# Inertial unit and its magnetometer.
+
+
+def _unit_off(bench: Bench, *_: object) -> Removal:
+    bench.hardware.unit.switch_off()
+    return lambda: bench.hardware.unit.switch_on(bench.now_ns())
+
+
+def _unit_reset(bench: Bench, *_: object) -> Removal:
+    bench.hardware.unit.switch_on(bench.now_ns())
+    return no_removal
+
+
+def _unplugged(bench: Bench, *_: object) -> Removal:
+    if bench.host is not None:
+        return hold(bench.host, "unplugged", True, False)
+    # A pseudo-terminal cannot be unplugged; it is silenced in both directions instead.
+    wires = (bench.line.to_host, bench.line.to_device)
+    return all_of([bench.disturb(wire, LineFaults(silent=True)) for wire in wires])
+
+
+def _baud(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    # The speed changes even if the outputs do not fit the line: no command was given.
+    with suppress(UnitError):
+        bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
+    return no_removal
+
+
+def _stuck_samples(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    """Repeat the first sample, or only its magnetic field."""
+    first: list[Vn100Sample] = []
+
+    def alter(sample: Vn100Sample) -> Vn100Sample:
+        if not first:
+            first.append(sample)
+        return first[0] if fault.device == "imu" else replace(sample, mag=first[0].mag)
+
+    return hold(bench.hardware.unit, "alter", alter, None)
+
+
+def _wrong_samples(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    turn = from_rotation_vector(np.array([0.0, given["angle"], 0.0]))
+    bias = np.array([0.0, given["rate"], 0.0])
+
+    def alter(sample: Vn100Sample) -> Vn100Sample:
+        return replace(sample, quaternion=multiply(turn, sample.quaternion), rate=sample.rate + bias)
+
+    return hold(bench.hardware.unit, "alter", alter, None)
+
+
+FULL_SCALE = 2.5
+"""Full scale of one magnetometer axis (gauss) [VN-100 data sheet]."""
+
+
+def _saturated_field(bench: Bench, *_: object) -> Removal:
+    def alter(sample: Vn100Sample) -> Vn100Sample:
+        return replace(sample, mag=np.copysign(FULL_SCALE, sample.mag))
+
+    return hold(bench.hardware.unit, "alter", alter, None)
+
+
+def _false_field(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    direction = bench.generator.standard_normal(3)
+    false = GAUSS_PER_TESLA * given["field"] * direction / np.linalg.norm(direction)
+    return hold(bench.hardware.unit, "alter", lambda sample: replace(sample, mag=sample.mag + false), None)
+
+
+# I2C bus and the parts on it.
+
+
+class AlteredPart:
+    """A part whose data are altered between it and the bus; it acknowledges as before."""
+
+    def __init__(
+        self,
+        part: I2cPart,
+        write: Callable[[int, bytes], None] | None = None,
+        read: Callable[[bytes], bytes] | None = None,
+    ) -> None:
+        """Pass writes to `write` instead of the part, and bytes read from the part through `read`."""
+        self._part = part
+        self._write = write or part.write
+        self._read = read or (lambda data: data)
+        self.answers = part.answers
+
+    def write(self, address: int, data: bytes) -> None:
+        """Accept a write; a register pointer alone is never altered."""
+        (self._part.write if len(data) == 1 else self._write)(address, data)
+
+    def read(self, count: int) -> bytes:
+        """Return altered bytes."""
+        return self._read(self._part.read(count))
+
+
+def _parts(bench: Bench, device: str) -> Sequence[EmulatedPca9685 | EmulatedIna219 | EmulatedAds1115]:
+    """Return the parts of a device; none if the device is not fitted."""
+    hardware = bench.hardware
+    if device == "strings":
+        return () if hardware.orbit.cells is None else hardware.orbit.cells.parts
+    if device == "monitor":
+        return () if hardware.monitor is None else (hardware.monitor,)
+    return (hardware.pwm,)
+
+
+def _parts_off(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    bus, parts = bench.hardware.bus, _parts(bench, fault.device)
+    for part in parts:
+        part.brown_out()
+        bus.detach(part)
+    return all_of([partial(bus.attach, part) for part in parts])
+
+
+def _brown_out(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    for part in _parts(bench, fault.device):
+        part.brown_out()
+    return no_removal
+
+
+def _random_reads(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    def read(data: bytes) -> bytes:
+        return bench.generator.bytes(len(data))
+
+    cover = bench.hardware.bus.put_before
+    return all_of([cover(part, AlteredPart(part, read=read)) for part in _parts(bench, fault.device)])
+
+
+def _flipped_bits(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+    def flipped(data: bytes) -> bytes:
+        flips = np.packbits(bench.generator.random(8 * len(data)) < given["chance"])
+        return (np.frombuffer(data, dtype=np.uint8) ^ flips).tobytes()
+
+    def write(part: I2cPart, address: int, data: bytes) -> None:
+        part.write(address, data[:1] + flipped(data[1:]))
+
+    cover, parts = bench.hardware.bus.put_before, _parts(bench, fault.device)
+    return all_of([cover(part, AlteredPart(part, partial(write, part), flipped)) for part in parts])
+
+
+def _refused(bench: Bench, fault: FaultKind, _: Parameters) -> Removal:
+    return all_of([bench.hardware.bus.nack(part.address, None) for part in _parts(bench, fault.device)])
+
+
+def _stretched(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+    def chance() -> bool:
+        return bench.generator.random() < given["chance"]
+
+    return all_of([bench.hardware.bus.time_out(part.address, chance) for part in _parts(bench, fault.device)])
+
+
+def _part_faults(device: str) -> tuple[FaultKind, ...]:
+    """Return the faults that PWM chip and current monitor share."""
+    low = "it stretches the clock beyond the bus's time-out, with this probability"
+    flips = "each bit read or written flips with this probability"
+    lost = "its registers return to their power-on values"
+    off = "no power: nothing acknowledges, the registers are lost"
+    refused = intermittently(_refused)
+    return (
+        _fault(f"{device}: off", off, _parts_off),
+        _fault(f"{device}: nack", "it acknowledges nothing", _refused, adds=True),
+        _fault(f"{device}: garbage", "reads return random bytes", _random_reads),
+        _fault(f"{device}: bits", flips, _flipped_bits, {"chance": _chance(5e-3)}),
+        _fault(f"{device}: slow", low, _stretched, {"chance": _chance(0.5)}, adds=True),
+        _fault(f"{device}: intermittent", "it acknowledges intermittently", refused, _turns(), adds=True),
+        _fault(f"{device}: brown-out", lost, _brown_out, momentary=True, adds=True),
+    )
+
+
+def _stuck_pwm(bench: Bench, *_: object) -> Removal:
+    pwm = bench.hardware.pwm
+    return bench.hardware.bus.put_before(pwm, AlteredPart(pwm, lambda address, data: None))
+
+
+def _delayed_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    pwm = bench.hardware.pwm
+
+    def later(address: int, data: bytes) -> None:
+        bench.after(given["delay"], lambda: pwm.write(address, data))
+
+    return bench.hardware.bus.put_before(pwm, AlteredPart(pwm, later))
+
+
+def _wrong_frequency(bench: Bench, *_: object) -> Removal:
+    bench.hardware.pwm.upset(PRE_SCALE, 0x1E)
+    return no_removal
+
+
+def _stuck_monitor(bench: Bench, *_: object) -> Removal:
+    monitor = bench.hardware.monitor
+    if monitor is None:
+        return no_removal
+    monitor.frozen = {number: monitor.register(number) for number in range(6)}
+    monitor.frozen[2] |= 0b10  # keep the conversion-ready flag set
+    return monitor.frozen.clear
+
+
+def _silent_bus(bench: Bench, *_: object) -> Removal:
+    return bench.hardware.bus.nack(None, None)
+
+
+def _busy_bus(bench: Bench, *_: object) -> Removal:
+    return bench.hardware.bus.lose_arbitration(None)
+
+
+def _lossy_bus(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    return bench.hardware.bus.nack(
+        None, times=None, chance=lambda: bench.generator.random() < given["chance"]
+    )
+
+
+def _hanging_bus(bench: Bench, *_: object) -> Removal:
+    return bench.hardware.bus.hang(times=None)
+
+
+# Upsets.
+
+_SET_UP = (MODE1, MODE2, PRE_SCALE)
+_OUTPUTS = tuple(range(LED0_ON_L, LED0_ON_L + 4 * CHANNELS))
+_MONITOR = (CONFIG, CALIBRATION)
+_UNIT = (6, 7, 75)
+"""Registers of the unit's stream: type of sentence, its rate, and binary packet."""
+_MAX_FIELDS = 11
+"""Fields of register 75: ports, divisor, groups, and one word for each of eight groups."""
+
+
+def _given_or_drawn(bench: Bench, given: Parameters, name: str, values: Sequence[int]) -> int:
+    return round(given[name]) if name in given else int(bench.generator.choice(values))
+
+
+def _upset_pwm(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    # Uniform draws over all registers would seldom select the three that configure the chip.
+    among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
+    register = _given_or_drawn(bench, given, "register", among)
+    bench.hardware.pwm.flip(register, _given_or_drawn(bench, given, "bit", range(8)))
+    return no_removal
+
+
+def _upset_monitor(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    monitor = bench.hardware.monitor
+    if monitor is not None:
+        register = _given_or_drawn(bench, given, "register", _MONITOR)
+        monitor.upset(register, _given_or_drawn(bench, given, "bit", range(16)))
+    return no_removal
+
+
+def _upset_unit(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    unit = bench.hardware.unit
+    register = _given_or_drawn(bench, given, "register", _UNIT)
+    bits = FIELD_BITS * len(unit.registers.read(register))
+    unit.upset(register, _given_or_drawn(bench, given, "bit", range(bits)), bench.now_ns())
+    return no_removal
+
+
+def _upset(name: str, begin: Begin, registers: tuple[int, ...], bits: int, meaning: str = "") -> FaultKind:
+    register = Parameter(None, min(registers), max(registers), choices=tuple(sorted(registers)))
+    given = {"register": register, "bit": Parameter(None, 0.0, bits - 1.0, whole=True)}
+    return _fault(name, f"a bit of a register flips{meaning}", begin, given, momentary=True, adds=True)
+
+
+# Coils, cameras, GPS receiver, solar strings, and the flight process.
+
+
+def _coil(bench: Bench, fault: FaultKind, given: Parameters) -> Removal:
+    circuit, axis = bench.hardware.circuit, "xyz".index(fault.device[-1])
+    circuit.become(axis, CoilCondition(fault.kind), given.get("ohm", 0.0))
+    return lambda: circuit.become(axis, CoilCondition.SOUND)
+
+
+def _coil_faults(axis: str) -> tuple[FaultKind, ...]:
+    """Return the faults of the coil and the bridge of an axis x, y or z."""
+    ohm = Parameter(5.0, 0.1, 1000.0, "ohm")
+    return (
+        _fault(f"coil-{axis}: open", "broken wire: no current", _coil),
+        _fault(
+            f"coil-{axis}: shorted",
+            "the bridge drives `ohm`, the coil carries no current",
+            _coil,
+            {"ohm": ohm},
+        ),
+        _fault(f"coil-{axis}: reversed", "reversed polarity", _coil),
+        *(
+            _fault(f"bridge-{axis}: {leg.lower()}-{level}", f"the output of input {leg} stays {level}", _coil)
+            for leg in "AB"
+            for level in ("high", "low")
+        ),
+    )
+
+
+def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[FaultKind, ...]:
+    """Return the faults of the star camera or of the horizon cameras; all of them have `parameters`."""
+    rows: tuple[tuple[str, str, Begin, dict[str, Parameter]], ...] = (
+        ("off", "ignores triggers, delivers no frame", _shown, {}),
+        ("black", "frames without light", _shown, {}),
+        ("saturated", "saturated frames", _shown, {}),
+        ("blinded", "the Sun's stray light over the whole frame", _shown, {}),
+        ("frozen", "the same frame repeatedly", _shown, {}),
+        ("torn", "upper part of the previous frame, lower part of this one", _shown, {}),
+        ("garbage", "random pixels", _shown, {}),
+        ("wrong", "rows in the opposite order", _shown, {}),
+        ("slow", "one trigger of n gives a frame", _thinned, {"n": _count(3.0, 2.0, 1000.0)}),
+        ("delayed", "frames arrive later, s", _late, {"delay": _delay(3.0)}),
+        ("intermittent", "off intermittently", intermittently(_shown), _turns(6.0)),
+    )
+    return tuple(
+        _fault(f"{device}: {kind}", meaning, begin, {**parameters, **more})
+        for kind, meaning, begin, more in rows
+        if kind not in without
+    )
+
+
+def _gps_off(bench: Bench, *_: object) -> Removal:
+    gps = bench.hardware.orbit.gps
+    if gps is None:
+        return no_removal
+    gps.switch_off()
+    return lambda: gps.switch_on(bench.now_ns())
+
+
+def _false_position(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    gps = bench.hardware.orbit.gps
+    if gps is None:
+        return no_removal
+    direction = bench.generator.standard_normal(3)
+    return hold(gps, "shift", given["distance"] * direction / np.linalg.norm(direction), np.zeros(3))
+
+
+def _dead(bench: Bench, _: FaultKind, given: Parameters) -> Removal:
+    cells = bench.hardware.orbit.cells
+    if cells is None:
+        return no_removal
+    dead = np.zeros(len(cells.dead), dtype=bool)
+    number = round(given["string"])
+    dead[number - 1 if number else slice(None)] = True
+    return hold(cells, "dead", dead, np.zeros(len(dead), dtype=bool))
+
+
+def _killed(bench: Bench, *_: object) -> Removal:
     if bench.flight_process is not None:
         os.kill(bench.flight_process, signal.SIGKILL)
-    return no_lift
+    return no_removal
 
 
-def _stopped(bench: Bench, _: Parameters) -> Lift:
+def _stopped(bench: Bench, *_: object) -> Removal:
     process = bench.flight_process
     if process is None:
-        return no_lift
+        return no_removal
     os.kill(process, signal.SIGSTOP)
     return lambda: os.kill(process, signal.SIGCONT)
 
 
-def _worker(device: str) -> tuple[FaultKind, ...]:
+def _worker_faults(device: str) -> tuple[FaultKind, ...]:
     return (
-        FaultKind(device, "nan", "all numbers of its result are NaN", None),
-        FaultKind(device, "exception", "it raises an exception", None),
-        FaultKind(device, "endless", "it never returns", None),
-        FaultKind(device, "killed", "its process is killed during a job", None),
-        FaultKind(device, "slow", "results arrive later, s", None, {"delay": delay(1.5)}),
+        _fault(f"{device}: nan", "all numbers of its result are NaN", None),
+        _fault(f"{device}: exception", "it raises an exception", None),
+        _fault(f"{device}: endless", "it never returns", None),
+        _fault(f"{device}: killed", "its process is killed during a job", None),
+        _fault(f"{device}: slow", "results arrive later, s", None, {"delay": _delay(1.5)}),
     )
 
 
-MACHINE = (
-    *_worker("planner"),
-    *_worker("vision"),
-    FaultKind(
-        "process", "killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME
+_EACH_BIT = "each bit flips with this probability"
+_EACH_FIELD = f", {FIELD_BITS} to each of its fields"
+_LOW_AT_TIMES = "the clock line is held low intermittently"
+_WRONG = {"angle": Parameter(0.2, -math.pi, math.pi, "rad"), "rate": Parameter(0.05, -10.0, 10.0, "rad/s")}
+_RATE = Parameter(230400.0, min(BAUD_RATES), max(BAUD_RATES), "baud", choices=BAUD_RATES)
+_FIELD = Parameter(2e-5, 1e-8, 1e-3, "T")
+_DISTANCE = Parameter(2e4, 1.0, 2e7, "m")
+_SECONDS = Parameter(180.0, -86_400.0, 86_400.0, "s")
+_STEP = Parameter(3600.0, -3.2e8, 3.2e8, "s")
+
+_ALL = (
+    _fault("imu: off", "no power; restarts from its saved settings afterwards", _unit_off),
+    _fault("imu: silent", "no byte arrives", _on_line, adds=True),
+    _fault("imu: unplugged", "the serial port disappears", _unplugged),
+    _fault("imu: stuck", "valid packets, constant values", _stuck_samples),
+    _fault("imu: garbage", "random bytes replace its own", _on_line, adds=True),
+    _fault("imu: wrong", "valid packets, wrong values", _wrong_samples, _WRONG),
+    _fault("imu: slow", "one packet of n arrives", _on_line, {"n": _count(8.0, 2.0, 1000.0)}, adds=True),
+    _fault("imu: delayed", "every byte arrives later, s", _on_line, {"delay": _delay(0.2)}, adds=True),
+    _fault("imu: intermittent", "silent intermittently", intermittently(_on_line), _turns(), adds=True),
+    _fault("imu: bits", _EACH_BIT, _on_line, {"chance": _chance(1e-3)}, adds=True),
+    _fault(
+        "imu: cut", "packets lose bytes with this probability", _on_line, {"chance": _chance(0.3)}, adds=True
     ),
-    FaultKind("process", "stopped", "SIGSTOP of the flight process", _stopped, where=Where.REALTIME),
-    FaultKind("clock", "stepped", "the wall clock steps forward, s", None, {"by": _STEP}),
-    FaultKind("disk", "full", "the log cannot grow", None),
-    FaultKind("disk", "failing", "every write of the log fails", None),
-    FaultKind(
-        "config",
-        "corrupted",
+    _fault("imu: reset", "restarts from its saved settings", _unit_reset, momentary=True),
+    _fault("imu: baud", "its baud rate changes", _baud, {"rate": _RATE}, momentary=True),
+    _upset("imu: upset", _upset_unit, _UNIT, FIELD_BITS * _MAX_FIELDS, _EACH_FIELD),
+    _fault("magnetometer: stuck", "the same field for ever", _stuck_samples),
+    _fault("magnetometer: saturated", "all axes at full scale", _saturated_field),
+    _fault("magnetometer: false", "a constant field is added, T", _false_field, {"field": _FIELD}),
+    *_part_faults("pwm"),
+    _fault("pwm: stuck", "it acknowledges, but its outputs do not change", _stuck_pwm),
+    _fault("pwm: delayed", "writes take effect later, s", _delayed_pwm, {"delay": _delay(0.2)}),
+    _fault(
+        "pwm: wrong", "a register upset: wrong PWM frequency", _wrong_frequency, momentary=True, adds=True
+    ),
+    _upset("pwm: upset", _upset_pwm, (*_SET_UP, *_OUTPUTS), 8),
+    *_part_faults("monitor"),
+    _fault("monitor: stuck", "always the same conversion", _stuck_monitor),
+    _fault("monitor: delayed", "it reports old measurements, s", _old_conversions, {"delay": _delay(2.0)}),
+    _fault("monitor: wrong", "measured values are multiplied by gain", _multiplied, {"gain": _gain(2.0)}),
+    _upset("monitor: upset", _upset_monitor, _MONITOR, 16),
+    _fault("bus: off", "no part acknowledges", _silent_bus, adds=True),
+    _fault(
+        "bus: nack", "no acknowledge, with this probability", _lossy_bus, {"chance": _chance(0.5)}, adds=True
+    ),
+    _fault("bus: arbitration", "another master always wins", _busy_bus, adds=True),
+    _fault("bus: hang", "the clock line is held low", _hanging_bus, adds=True),
+    _fault("bus: intermittent", _LOW_AT_TIMES, intermittently(_hanging_bus), _turns(), adds=True),
+    *(fault for axis in "xyz" for fault in _coil_faults(axis)),
+    *_frame_faults("camera"),
+    _fault("gps: off", "no power; afterwards set-up and satellites are lost", _gps_off),
+    _fault("gps: silent", "no byte arrives", _on_line, adds=True),
+    _fault("gps: no-fix", "no satellite is received", _held("blind", lambda *_: True, False)),
+    _fault("gps: stuck", "the same epoch repeatedly", _frozen),
+    _fault("gps: false", "a valid fix at a false place, m away", _false_position, {"distance": _DISTANCE}),
+    _fault("gps: clock", "a valid fix with the wrong time, s", _wrong_time, {"seconds": _SECONDS}, adds=True),
+    _fault("gps: garbage", "random bytes replace its own", _on_line, adds=True),
+    _fault("gps: bits", _EACH_BIT, _on_line, {"chance": _chance(1e-3)}, adds=True),
+    _fault("gps: delayed", "every byte arrives later, s", _on_line, {"delay": _delay(2.0)}, adds=True),
+    _fault("gps: intermittent", "silent intermittently", intermittently(_on_line), _turns(), adds=True),
+    _fault("strings: off", "no power: no converter acknowledges", _parts_off),
+    _fault(
+        "strings: dead",
+        "this string gives no current; 0: none does",
+        _dead,
+        {"string": _count(1.0, 0.0, 4.0)},
+    ),
+    _fault("strings: stuck", "the same currents for ever", _frozen),
+    _fault("strings: wrong", "all currents are multiplied by gain", _multiplied, {"gain": _gain(0.5)}),
+    _fault("strings: garbage", "reads return random bytes", _random_reads),
+    # `camera` is the number of a camera in the order of the configuration; 0 means all.
+    *_frame_faults("wide", "torn", "slow", camera=_count(0.0, 0.0, 6.0)),
+    *_worker_faults("planner"),
+    *_worker_faults("vision"),
+    _fault("process: killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME),
+    _fault("process: stopped", "SIGSTOP of the flight process", _stopped, where=Where.REALTIME),
+    _fault("clock: stepped", "the wall clock steps forward, s", None, {"by": _STEP}),
+    _fault("disk: full", "the log cannot grow", None),
+    _fault("disk: failing", "every write of the log fails", None),
+    _fault(
+        "config: corrupted",
         "one bit flips in each of `bytes` bytes of the file before it is read",
         None,
-        {"bytes": Parameter(3.0, 1.0, 10000.0, whole=True)},
+        {"bytes": _count(3.0, 1.0, 10000.0)},
         momentary=True,
         where=Where.COMMAND_LINE,
     ),
-)
-
-
-_ALL = (
-    *IMU,
-    IMU_UPSET,
-    *MAGNETOMETER,
-    *PWM,
-    PWM_UPSET,
-    *MONITOR,
-    MONITOR_UPSET,
-    *BUS,
-    *COILS,
-    *CAMERA,
-    *GPS,
-    *STRINGS,
-    *WIDE,
-    *MACHINE,
 )
 
 CATALOGUE: dict[str, FaultKind] = {kind.name: kind for kind in _ALL}
 
 
 def listing() -> str:
-    """Return every fault with its parameters and meaning, a line each."""
+    """Return every fault with its parameters and meaning, one fault to a line."""
     lines = []
     for kind in CATALOGUE.values():
-        given = ", ".join(_written(name, parameter) for name, parameter in kind.parameters.items())
+        given = ", ".join(
+            f"{name}={'drawn' if parameter.default is None else f'{parameter.default:g}'}"
+            for name, parameter in kind.parameters.items()
+        )
         name = f"{kind.name} ({given})" if given else kind.name
         only = "" if kind.where is Where.BOTH else f"; {kind.where.value}"
         bounds = "".join(f"; {name} {parameter.bounds()}" for name, parameter in kind.parameters.items())
         lines.append(f"  {name:44} {kind.meaning}{bounds}{only}")
     return "\n".join(lines)
-
-
-def _written(name: str, parameter: Parameter) -> str:
-    return f"{name}=drawn" if parameter.default is None else f"{name}={parameter.default:g}"

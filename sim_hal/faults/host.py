@@ -13,20 +13,20 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from hal.interfaces.wires import Clock, Ticker
+from hal.interfaces.wires import Clock
 from sim_hal.faults.schedule import ScheduledFault, parse, schedule
 from sim_hal.settings import Simulation
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A job: its function as MODULE:NAME, its argument, and its fault, empty for none."""
+    """A job of a worker: its function as MODULE:NAME, its argument, and its fault, empty for none."""
 
     function: str
     argument: Any
@@ -56,7 +56,7 @@ def without_numbers(value: Any) -> Any:
         return float("nan")
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":
         return np.full_like(value, np.nan)
-    if isinstance(value, tuple) and type(value) is tuple:
+    if type(value) is tuple:
         return tuple(map(without_numbers, value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         names = [field.name for field in dataclasses.fields(value) if field.init]
@@ -65,16 +65,23 @@ def without_numbers(value: Any) -> Any:
 
 
 DEVICES = ("planner", "vision", "clock", "disk")
+"""The devices whose faults act inside the flight process."""
 
 
-class HostFaults:
-    """The faults of one flight process; dormant until `begin`."""
+class ProcessFaults:
+    """The faults inside one flight process; none occurs before `begin`.
+
+    Attributes:
+        realtime: whether jobs run in processes of their own, which can hang and be killed.
+        now_ns: returns the flight's time.
+    """
 
     def __init__(self, faults: Sequence[ScheduledFault], clock: Clock, realtime: bool) -> None:
         self._faults = [fault for fault in faults if fault.kind.device in DEVICES]
         self._clock = clock
-        self._realtime = realtime
         self._epoch_ns: int | None = None
+        self.realtime = realtime
+        self.now_ns = clock.now_ns
 
     def begin(self, epoch_ns: int) -> None:
         """Set mission time zero."""
@@ -84,7 +91,7 @@ class HostFaults:
         """Return the fault that a device has now."""
         if self._epoch_ns is None:
             return None
-        now = (self._clock.now_ns() - self._epoch_ns) * 1e-9
+        now = (self.now_ns() - self._epoch_ns) * 1e-9
         for fault in self._faults:
             if fault.kind.device == device and fault.at <= now < fault.end:
                 return fault
@@ -96,7 +103,7 @@ class HostFaults:
 
     def clock(self) -> Clock:
         """Return the clock of the flight process, with its faults."""
-        return _SteppedClock(self._clock, self) if self.concerns("clock") else self._clock
+        return cast("Clock", _SteppedClock(self._clock, self)) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
         """Return an opener of files on a disk that may fail."""
@@ -106,26 +113,17 @@ class HostFaults:
         """Return workers whose function may fail."""
         if not self.concerns("planner", "vision"):
             return list(specs)
-        return [replace(spec, function=perform) for spec in specs]
+        return [dataclasses.replace(spec, function=perform) for spec in specs]
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
         """Return a runner that passes the faults on to the workers; `result` makes a job's result."""
         return _FaultyRunner(runner, specs, result, self) if self.concerns("planner", "vision") else runner
 
-    @property
-    def realtime(self) -> bool:
-        """Whether jobs have processes of their own, which can hang and be killed."""
-        return self._realtime
 
-    def now_ns(self) -> int:
-        """Return the flight's time."""
-        return self._clock.now_ns()
-
-
-def host_faults(section: Simulation, clock: Clock, realtime: bool) -> HostFaults | None:
-    """Return the faults inside the flight process, None without any."""
-    faults = schedule(section.faults)
-    return HostFaults(faults, clock, realtime) if any(f.kind.device in DEVICES for f in faults) else None
+def host_faults(section: Simulation, clock: Clock, realtime: bool) -> ProcessFaults | None:
+    """Return the faults inside the flight process; None if it has none."""
+    faults = ProcessFaults(schedule(section.faults), clock, realtime)
+    return faults if faults.concerns(*DEVICES) else None
 
 
 def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
@@ -140,44 +138,30 @@ def corrupted(text: str, count: int, seed: int) -> str:
     """Return a file's text with one bit flipped in each of `count` of its bytes."""
     data = bytearray(text.encode())
     rng = np.random.default_rng([seed, count, len(data)])
-    for place in rng.choice(len(data), min(count, len(data)), replace=False):
-        data[place] ^= 1 << int(rng.integers(8))
+    for index in rng.choice(len(data), min(count, len(data)), replace=False):
+        data[index] ^= 1 << int(rng.integers(8))
     return data.decode("utf-8", errors="replace")
 
 
 class _SteppedClock:
     """A clock whose UTC label may step; its monotonic time is unchanged."""
 
-    def __init__(self, clock: Clock, faults: HostFaults) -> None:
+    def __init__(self, clock: Clock, faults: ProcessFaults) -> None:
         self._clock = clock
         self._faults = faults
 
-    def now_ns(self) -> int:
-        return self._clock.now_ns()
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        self._clock.sleep_until_ns(deadline_ns)
-
-    def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
-        return self._clock.ticker(name, period_ns, job)
-
-    @property
-    def tickers(self) -> Sequence[Ticker]:
-        return self._clock.tickers
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._clock, name)
 
     def utc_ns(self) -> int:
         fault = self._faults.active("clock")
-        step = 0 if fault is None else round(fault.parameters["by"] * 1e9)
-        return self._clock.utc_ns() + step
-
-
-_DISK_ERRORS = {"full": errno.ENOSPC, "failing": errno.EIO}
+        return self._clock.utc_ns() + (0 if fault is None else round(fault.parameters["by"] * 1e9))
 
 
 class _FailingFile:
-    """A file of the log on a disk that may be full."""
+    """A file of the log on a disk that may be full or failing."""
 
-    def __init__(self, opener: Callable[[Path], Any], path: Path, faults: HostFaults) -> None:
+    def __init__(self, opener: Callable[[Path], Any], path: Path, faults: ProcessFaults) -> None:
         self._faults = faults
         self._check()
         self._file = opener(path)
@@ -192,13 +176,13 @@ class _FailingFile:
     def _check(self) -> None:
         fault = self._faults.active("disk")
         if fault is not None:
-            code = _DISK_ERRORS[fault.kind.kind]
+            code = errno.ENOSPC if fault.kind.kind == "full" else errno.EIO
             raise OSError(code, os.strerror(code))
 
 
 @dataclass(slots=True)
-class _Held:
-    """A job that no worker will answer, and the outcome that its runner reports at `due_ns`."""
+class _ModelledOutcome:
+    """The outcome of a job that no worker answers; its runner reports it at `due_ns`."""
 
     due_ns: int
     outcome: str
@@ -210,54 +194,49 @@ class _FaultyRunner:
     """A JobRunner that wraps another and adds faults."""
 
     def __init__(
-        self, runner: Any, specs: Sequence[Any], result: Callable[..., Any], faults: HostFaults
+        self, runner: Any, specs: Sequence[Any], result: Callable[..., Any], faults: ProcessFaults
     ) -> None:
         self._runner = runner
         self._specs = {spec.name: spec for spec in specs}
         self._result = result
         self._faults = faults
-        self._held: dict[str, _Held] = {}
+        self._modelled: dict[str, _ModelledOutcome] = {}
         self._late: list[tuple[int, Any]] = []
 
     def submit(self, worker: str, argument: Any) -> bool:
-        if worker in self._held or any(result.worker == worker for _, result in self._late):
+        if worker in self._modelled or any(result.worker == worker for _, result in self._late):
             return False
         fault = self._faults.active(worker)
         kind = "" if fault is None else fault.kind.kind
-        delay = 0.0 if fault is None else fault.parameters.get("delay", 0.0)
-        spec = self._specs[worker]
-        if not self._faults.realtime:
-            now_ns = self._faults.now_ns()
-            # In lock-step this process runs the jobs itself, so the outcome is modelled.
-            if kind == "endless":
-                text = f"no result within {spec.timeout_ns * 1e-9:g} s"
-                self._held[worker] = _Held(now_ns + spec.timeout_ns, "timed-out", text, now_ns)
-                return True
-            if kind == "killed":
-                text = "the worker's process ended"
-                self._held[worker] = _Held(now_ns + spec.latency_ns, "died", text, now_ns)
-                return True
+        spec, now_ns, realtime = self._specs[worker], self._faults.now_ns(), self._faults.realtime
+        # In lock-step this process runs the jobs itself, so these outcomes are modelled.
+        if kind == "endless" and not realtime:
+            text = f"no result within {spec.timeout_ns * 1e-9:g} s"
+            self._modelled[worker] = _ModelledOutcome(now_ns + spec.timeout_ns, "timed-out", text, now_ns)
+            return True
+        if kind == "killed" and not realtime:
+            text = "the worker's process ended"
+            self._modelled[worker] = _ModelledOutcome(now_ns + spec.latency_ns, "died", text, now_ns)
+            return True
         function = f"{spec.function.__module__}:{spec.function.__qualname__}"
-        sleeps = delay if self._faults.realtime else 0.0
-        done: bool = self._runner.submit(worker, Task(function, argument, kind, sleeps))
+        delay = fault.parameters.get("delay", 0.0) if fault is not None and realtime else 0.0
+        done: bool = self._runner.submit(worker, Task(function, argument, kind, delay))
         return done
 
     def collect(self) -> list[Any]:
         now_ns = self._faults.now_ns()
         for result in self._runner.collect():
-            fault = self._faults.active(result.worker)
-            slow = fault is not None and fault.kind.kind == "slow" and not self._faults.realtime
-            delay = fault.parameters["delay"] if slow and fault is not None else 0.0
+            fault, delay = self._faults.active(result.worker), 0.0
+            if fault is not None and fault.kind.kind == "slow" and not self._faults.realtime:
+                delay = fault.parameters["delay"]
             self._late.append((now_ns + round(delay * 1e9), result))
         ready = [result for due_ns, result in self._late if due_ns <= now_ns]
         self._late = [(due_ns, result) for due_ns, result in self._late if due_ns > now_ns]
-        for worker, held in list(self._held.items()):
-            if held.due_ns <= now_ns:
-                del self._held[worker]
-                spent = now_ns - held.submitted_ns
-                ready.append(
-                    self._result(worker, held.outcome, None, held.error, held.submitted_ns, now_ns, spent)
-                )
+        for worker, job in list(self._modelled.items()):
+            if job.due_ns <= now_ns:
+                del self._modelled[worker]
+                times = job.submitted_ns, now_ns, now_ns - job.submitted_ns
+                ready.append(self._result(worker, job.outcome, None, job.error, *times))
         return ready
 
     def __getattr__(self, name: str) -> Any:

@@ -12,17 +12,18 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from flight.schema.sections import Config
 from knightcube.errors import UsageError
-from sim_hal.faults.bench import Bench, FaultKind, Lift, Where
+from sim_hal.faults.bench import Bench, FaultKind, Removal, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
 
 LONGEST = 1e9
-"""s, thirty years; more would not fit into 64 bits of ns."""
+"""Latest begin and longest duration of a fault (s): thirty years, which fits into 64 bits of ns."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -32,7 +33,7 @@ _FAULT = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ScheduledFault:
-    """A fault and its time: from `at` s of mission time for `span` s, None to the end."""
+    """A fault that begins at `at` s of mission time and lasts `span` s; None for a fault without end."""
 
     kind: FaultKind
     at: float
@@ -41,7 +42,7 @@ class ScheduledFault:
 
     @property
     def end(self) -> float:
-        """The end, s: the beginning for a momentary fault, infinity for a lasting one."""
+        """The end (s): the beginning for a momentary fault, infinity for a fault without end."""
         if self.kind.momentary:
             return self.at
         return math.inf if self.span is None else self.at + self.span
@@ -58,69 +59,29 @@ def parse(text: str) -> ScheduledFault:
     found = _FAULT.fullmatch(text)
     if found is None:
         raise UsageError(f"fault {text!r}: write it as {GRAMMAR}")
-    device, _, kind = found["name"].partition(":")
-    known = _known(f"{device.strip()}: {kind.strip()}", text)
+    device, _, kind = (part.strip() for part in found["name"].lower().partition(":"))
+    known = CATALOGUE.get(f"{device}: {kind}")
+    if known is None:
+        name = ": ".join(part.strip() for part in found["name"].split(":"))
+        same = [other for other in CATALOGUE if other.startswith(f"{device}:")]
+        near = difflib.get_close_matches(name.lower(), same or list(CATALOGUE), n=1, cutoff=0.0)
+        rest = f" ({device} has {', '.join(other.partition(': ')[2] for other in same)})" if same else ""
+        raise UsageError(f"fault {text!r}: there is no {name!r}, did you mean {near[0]!r}?{rest}")
     at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
     span = _seconds(found["span"], "for", text) if found["span"] is not None else None
     if span == 0.0:
-        raise UsageError(f"fault {text!r}: for 0 is no time at all: give more, or leave `for` out")
-    return ScheduledFault(known, at, span, _parameters(known, found["given"] or "", text))
-
-
-def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a `simulation` section. Raises UsageError naming the entry."""
-    made = []
-    for number, entry in enumerate(entries):
-        place = f"simulation.faults[{number}]"
-        try:
-            fault = parse(entry.fault)
-        except UsageError as error:
-            raise UsageError(f"{place}: {error}") from error
-        if entry.at is not None and "@" in entry.fault:
-            raise UsageError(f"{place}: `at` and `@` in one fault; which?")
-        if entry.span is not None and fault.span is not None:
-            raise UsageError(f"{place}: `for` stands twice; which?")
-        at = fault.at if entry.at is None else entry.at
-        span = fault.span if entry.span is None else entry.span
-        if max(at, span or 0.0) > LONGEST:
-            raise UsageError(f"{place}: seconds go up to {LONGEST:g}")
-        made.append(replace(fault, at=at, span=span))
-    return tuple(made)
-
-
-def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
-    """Return faults of the command line as those of a section. Raises UsageError for a bad one.
-
-    Leaves out faults that only the command line can inject: they were applied to the text already.
-    """
-    faults = map(parse, texts)
-    return tuple(
-        FaultEntry(fault=str(fault)) for fault in faults if fault.kind.where is not Where.COMMAND_LINE
-    )
-
-
-def _known(name: str, text: str) -> FaultKind:
-    kind = CATALOGUE.get(name.lower())
-    if kind is not None:
-        return kind
-    device = name.lower().partition(":")[0]
-    same = [other for other in CATALOGUE if other.startswith(f"{device}:")]
-    near = difflib.get_close_matches(name.lower(), same or list(CATALOGUE), n=1, cutoff=0.0)
-    rest = f" ({device} has {', '.join(other.partition(': ')[2] for other in same)})" if same else ""
-    raise UsageError(f"fault {text!r}: there is no {name!r}, did you mean {near[0]!r}?{rest}")
-
-
-def _parameters(kind: FaultKind, given: str, text: str) -> dict[str, float]:
-    values = {name: value.default for name, value in kind.parameters.items() if value.default is not None}
-    for word in filter(None, (word.strip() for word in given.split(","))):
+        raise UsageError(f"fault {text!r}: `for 0` is an empty duration: give more, or leave `for` out")
+    values = {name: value.default for name, value in known.parameters.items() if value.default is not None}
+    for word in filter(None, (word.strip() for word in (found["given"] or "").split(","))):
         name, equals, value = (part.strip() for part in word.partition("="))
-        if name not in kind.parameters or not equals:
-            has = ", ".join(kind.parameters) or "no parameters"
-            raise UsageError(f"fault {text!r}: {word!r}: {kind.name} has {has}")
+        if name not in known.parameters or not equals:
+            has = ", ".join(known.parameters) or "no parameters"
+            raise UsageError(f"fault {text!r}: {word!r}: {known.name} has {has}")
         values[name] = _number(value, name, text)
-        if not kind.parameters[name].accepts(values[name]):
-            raise UsageError(f"fault {text!r}: {name}={value}: it is {kind.parameters[name].bounds()}")
-    return values
+        if not known.parameters[name].accepts(values[name]):
+            bounds = known.parameters[name].bounds()
+            raise UsageError(f"fault {text!r}: {name}={value}: the value must be {bounds}")
+    return ScheduledFault(known, at, span, values)
 
 
 def _seconds(word: str, after: str, text: str) -> float:
@@ -138,8 +99,61 @@ def _number(word: str, what: str, text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise UsageError(f"fault {text!r}: {what} {word!r} is no number")
+        raise UsageError(f"fault {text!r}: {what} {word!r} is not a number")
     return value
+
+
+def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
+    """Read the faults of a `simulation` section. Raises UsageError naming the entry."""
+    read = []
+    for number, entry in enumerate(entries):
+        key = f"simulation.faults[{number}]"
+        try:
+            fault = parse(entry.fault)
+        except UsageError as error:
+            raise UsageError(f"{key}: {error}") from error
+        if entry.at is not None and "@" in entry.fault:
+            raise UsageError(f"{key}: both `at` and `@` give the begin: remove one")
+        if entry.span is not None and fault.span is not None:
+            raise UsageError(f"{key}: `for` is given twice: remove one")
+        at = fault.at if entry.at is None else entry.at
+        span = fault.span if entry.span is None else entry.span
+        if max(at, span or 0.0) > LONGEST:
+            raise UsageError(f"{key}: seconds go up to {LONGEST:g}")
+        read.append(replace(fault, at=at, span=span))
+    return tuple(read)
+
+
+def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
+    """Return faults of the command line as those of a section. Raises UsageError for an invalid fault.
+
+    Faults that only the command line can inject are left out: they were applied to the text already.
+    """
+    faults = map(parse, texts)
+    return tuple(
+        FaultEntry(fault=str(fault)) for fault in faults if fault.kind.where is not Where.COMMAND_LINE
+    )
+
+
+def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
+    """Read a section's faults for this kind of simulation. Raises UsageError for an impossible fault."""
+    faults = schedule(entries)
+    for fault in faults:
+        if fault.kind.where is Where.REALTIME and not realtime:
+            raise UsageError(f"fault {str(fault)!r}: it exists in real time only: add --realtime")
+        if fault.kind.where is Where.COMMAND_LINE:
+            raise UsageError(f"fault {str(fault)!r}: give it with --fault; a file cannot corrupt itself")
+    alone = [fault for fault in faults if not fault.kind.adds]
+    for number, fault in enumerate(alone):
+        for other in alone[:number]:
+            first, second = sorted((fault, other), key=lambda one: one.at)
+            meet = second.at < first.end or second.at == first.at
+            if fault.kind.part == other.kind.part and meet:
+                raise UsageError(
+                    f"fault {str(fault)!r} would replace {str(other)!r}: "
+                    "let one end (`for`) before the other begins"
+                )
+    return faults
 
 
 _SECTIONS = {
@@ -153,16 +167,12 @@ _SECTIONS = {
 """The optional configuration section of each device that can be absent."""
 
 
-def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read a section's faults for this kind of simulation. Raises UsageError for an impossible fault."""
-    faults = schedule(entries)
-    for fault in faults:
-        if fault.kind.where is Where.REALTIME and not realtime:
-            raise UsageError(f"fault {str(fault)!r}: makes sense in real time only: add --realtime")
-        if fault.kind.where is Where.COMMAND_LINE:
-            raise UsageError(f"fault {str(fault)!r}: give it with --fault; a file cannot corrupt itself")
-    _check_apart(faults)
-    return faults
+def fitted(device: str, config: Config) -> bool:
+    """Return whether a configuration has the device of a fault."""
+    if device == "planner":
+        return config.replan_period() is not None
+    section = _SECTIONS.get(device)
+    return section is None or getattr(config, section) not in (None, ())
 
 
 def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
@@ -174,54 +184,32 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
                 f"fault {str(fault)!r}: the flight is over after {config.duration:g} s: "
                 "begin it earlier, or fly longer (--duration)"
             )
-        section = _SECTIONS.get(fault.kind.device)
-        if not fitted(fault.kind.device, config):
+        device = fault.kind.device
+        if not fitted(device, config):
+            section = _SECTIONS.get(device)
             cure = f"the configuration needs a `{section}` section" if section else "the body plans no paths"
-            raise UsageError(f"fault {str(fault)!r}: no {fault.kind.device} flies here: {cure}")
+            raise UsageError(f"fault {str(fault)!r}: this flight has no {device}: {cure}")
         if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
-            raise UsageError(f"fault {str(fault)!r}: it speaks at this speed already: give another rate")
+            raise UsageError(f"fault {str(fault)!r}: the unit has this rate already: give another rate")
     return faults
-
-
-def fitted(device: str, config: Config) -> bool:
-    """Return whether a configuration has the device of a fault."""
-    if device == "planner":
-        return config.replan_period() is not None
-    section = _SECTIONS.get(device)
-    return section is None or getattr(config, section) not in (None, ())
-
-
-def _check_apart(faults: Sequence[ScheduledFault]) -> None:
-    """Raise UsageError for two faults that would replace each other."""
-    alone = [fault for fault in faults if not fault.kind.adds]
-    for number, fault in enumerate(alone):
-        for other in alone[:number]:
-            if fault.kind.thing == other.kind.thing and _meet(fault, other):
-                raise UsageError(
-                    f"fault {str(fault)!r} would take the place of {str(other)!r}: "
-                    "let one end (`for`) before the other begins"
-                )
-
-
-def _meet(fault: ScheduledFault, other: ScheduledFault) -> bool:
-    first, second = sorted((fault, other), key=lambda one: one.at)
-    return second.at < first.end or second.at == first.at
 
 
 def put(faults: Sequence[ScheduledFault], bench: Bench, epoch_ns: int) -> None:
     """Schedule the beginning and end of each fault, relative to `epoch_ns`."""
     for fault in faults:
-        _put(fault, bench, epoch_ns)
+        if fault.kind.begin is None:
+            continue
+        removals: list[Removal] = []
+        timeline, begin_ns = bench.hardware.faults, epoch_ns + round(fault.at * 1e9)
+        timeline.at(begin_ns, partial(_begin, fault, bench, removals))
+        if fault.span is not None and not fault.kind.momentary:
+            timeline.at(begin_ns + round(fault.span * 1e9), partial(_end, removals))
 
 
-def _put(fault: ScheduledFault, bench: Bench, epoch_ns: int) -> None:
-    begin = fault.kind.begin
-    if begin is None:
-        return
-    lifts: list[Lift] = []
-    timeline = bench.hardware.faults
-    begin_ns = epoch_ns + round(fault.at * 1e9)
-    timeline.at(begin_ns, lambda: lifts.append(begin(bench, fault.parameters)))
-    if fault.span is not None and not fault.kind.momentary:
-        # The function that removes the fault exists only after the fault has begun.
-        timeline.at(begin_ns + round(fault.span * 1e9), lambda: lifts.pop()())  # noqa: PLW0108 - see above
+def _begin(fault: ScheduledFault, bench: Bench, removals: list[Removal]) -> None:
+    assert fault.kind.begin is not None  # `put` schedules no other fault
+    removals.append(fault.kind.begin(bench, fault.kind, fault.parameters))
+
+
+def _end(removals: list[Removal]) -> None:
+    removals.pop()()

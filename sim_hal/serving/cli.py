@@ -31,7 +31,7 @@ from sim_hal.serving import emulate_i2c
 from sim_hal.serving.options import number, positive, seed
 from sim_hal.serving.server import DeviceServer
 from sim_hal.settings import Simulation
-from sim_hal.worlds.world import Motion, about_thread
+from sim_hal.worlds.world import BodyMotion, about_thread
 
 
 def _add_serve(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -181,11 +181,11 @@ def _emulate_vn100(options: argparse.Namespace) -> int:
     return 0
 
 
-def _demonstration(options: argparse.Namespace, start_ns: int) -> Callable[[int], Motion]:
+def _demonstration(options: argparse.Namespace, start_ns: int) -> Callable[[int], BodyMotion]:
     """Return the motion on the thread that the options ask for: a steady turn or a swing."""
     amplitude, pulse = math.radians(options.amplitude_deg), 2.0 * math.pi / options.period_s
 
-    def motion(time_ns: int) -> Motion:
+    def motion(time_ns: int) -> BodyMotion:
         seconds = (time_ns - start_ns) * 1e-9
         if options.rate_deg_s is not None:
             rate = math.radians(options.rate_deg_s)

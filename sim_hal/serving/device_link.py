@@ -42,7 +42,7 @@ class Inbox:
         return [json.loads(line) for line in lines]
 
 
-class Link:
+class DeviceLink:
     """One connection to the server."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -94,7 +94,7 @@ class RemoteI2cBus:
     """An I2cBus whose parts are in the server's process. Safe for several threads."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._link = Link(path)
+        self._link = DeviceLink(path)
         self._lock = threading.Lock()
 
     def call(self, name: str, *arguments: Any) -> Any:

@@ -25,7 +25,7 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Wires
 from knightcube.errors import UsageError
-from sim_hal.serving.device_link import Link, RemoteI2cBus
+from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
 
 PATIENCE_S = 5.0
 """How long the devices outlive a flight process that died."""
@@ -41,7 +41,7 @@ class RemoteFrameSource:
     def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
         """Connect to the star camera, number 0, or to a wide one."""
         self._number = number
-        self._link = Link(path)
+        self._link = DeviceLink(path)
         self._folder = path.parent
         self._clock = clock
 

@@ -28,13 +28,13 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
+from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import PtyLine
-from sim_hal.emulators.star_camera import EmulatedStarCamera
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import parse, put
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.serving.device_link import Inbox, pack
-from sim_hal.settings import Simulation, Sky
+from sim_hal.settings import Simulation, SkySection
 from sim_hal.worlds.simulation import TruthRecorder
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ _PR_SET_PDEATHSIG = 1
 _renderer: list[StarRenderer] = []
 
 
-def _prepare_renderer(camera: Camera | None, sky: Sky, seed: int) -> None:
+def _prepare_renderer(camera: Camera | None, sky: SkySection, seed: int) -> None:
     """Load the sky once in the rendering process, which ends whenever the server does."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -240,7 +240,7 @@ class DeviceServer:
         )
         put([parse(text) for text in faults], bench, epoch_ns)
 
-    def _cameras(self) -> tuple[EmulatedStarCamera | None, ...]:
+    def _cameras(self) -> tuple[EmulatedCamera | None, ...]:
         """Return the star camera, which has number 0, and the wide ones."""
         return self.hardware.camera, *self.hardware.orbit.wide
 

@@ -90,7 +90,7 @@ NEAREST = 1.0
 """m; nearer, an object would not be a point."""
 
 
-class Way(Protocol):
+class Trajectory(Protocol):
     """Where a body is: an `Orbit`, or a stretch of it."""
 
     def states_at(self, times: FloatArray) -> FloatArray:
@@ -109,7 +109,7 @@ class ResidentSpaceObject:
 
 
 def source_tracks(
-    camera: Way,
+    camera: Trajectory,
     objects: Sequence[ResidentSpaceObject],
     epoch: float,
     start: float,
@@ -147,7 +147,7 @@ def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
     return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
-def _track_times(camera: Way, orbit: Orbit, start: float, end: float) -> FloatArray:
+def _track_times(camera: Trajectory, orbit: Orbit, start: float, end: float) -> FloatArray:
     """Return times close enough that an even motion between them stays within `TRACK_ERROR` of the track.
 
     The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the

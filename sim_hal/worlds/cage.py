@@ -20,7 +20,7 @@ from sim_hal.settings import CageTruth, Disturbances
 from sim_hal.worlds.free_body.body import elements, julian_date
 from sim_hal.worlds.free_body.environment import Environment
 from sim_hal.worlds.testbed import Testbed, TestbedModel, model_of
-from sim_hal.worlds.world import Motion, WorldInputs
+from sim_hal.worlds.world import BodyMotion, WorldInputs
 
 _STREAM = 0xCA6E
 
@@ -68,7 +68,7 @@ class CagedTestbed(Testbed):
             self._bx, self._bz = self._orbit.at((time_ns - self._start_ns) * 1e-9)
         super().advance_to(time_ns)
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         """Advance to `time_ns` and return the motion there."""
         motion = super().motion(time_ns)
         bx, bz = self._in_body(self.angle)

@@ -18,7 +18,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.testbed import TestbedConfig, as_testbed
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
-from sim_hal.worlds.world import Motion, WorldInputs, WorldTruth, about_thread
+from sim_hal.worlds.world import BodyMotion, WorldInputs, WorldTruth, about_thread
 
 VACUUM_PERMEABILITY = 4e-7 * math.pi
 """T m/A, as the thesis has it."""
@@ -109,7 +109,7 @@ class Testbed:
         self.supply_energy += span * self._model.supply_voltage * (abs(ix) + abs(iy) + abs(iz))
         self.time_ns = time_ns
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         """Advance to `time_ns` and return the motion there; `time_ns` is never before the state."""
         self.advance_to(time_ns)
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)

@@ -24,7 +24,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class BodyMotion:
     """The measurements of an ideal inertial unit at one time.
 
     Attributes:
@@ -42,9 +42,9 @@ class Motion:
     specific_force_body: FloatArray
 
 
-def about_thread(time_ns: int, angle: float, rate: float, field: float) -> Motion:
+def about_thread(time_ns: int, angle: float, rate: float, field: float) -> BodyMotion:
     """Return the motion of a body turned on the thread by `angle` rad, at `rate` rad/s, `field` T on -z_T."""
-    return Motion(
+    return BodyMotion(
         time_ns=time_ns,
         quaternion=about_axis_y(angle),
         rate=np.array([0.0, rate, 0.0]),
@@ -86,7 +86,7 @@ class World(Protocol):
     def advance_to(self, time_ns: int) -> None:
         """Advance the state to `time_ns` under the present currents."""
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         """Return attitude, rate, field and specific force at `time_ns`, which is never before the state."""
 
     def truth(self) -> WorldTruth:
@@ -135,7 +135,7 @@ Floats = tuple[float, float, float]
 CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
 
 
-class Surroundings(NamedTuple):
+class OrbitEnvironment(NamedTuple):
     """What surrounds the craft at an instant, ICRS.
 
     Attributes:
@@ -190,7 +190,7 @@ class OrbitTruth(WorldTruth):
 class OrbitingWorld(World, Protocol):
     """A world with an orbit: what GPS receiver, solar strings and wide cameras measure."""
 
-    def surroundings(self) -> Surroundings:
+    def surroundings(self) -> OrbitEnvironment:
         """Return what surrounds the craft at the present state."""
 
     def utc_ns(self) -> int:

@@ -14,7 +14,7 @@ from knightcube.astro import quaternion
 from knightcube.vision.solar_cells import CoarseSunStatus, SolarStringModel, coarse_sun
 from sim_hal.clock import SimClock
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
-from sim_hal.emulators.solar_strings import EmulatedAds1115, EmulatedStrings, SolarStringsModel
+from sim_hal.emulators.solar_cells import EmulatedAds1115, EmulatedSolarCells, SolarCellsModel
 from sim_hal.settings import FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.simulation import TimedSimulation
@@ -28,7 +28,7 @@ class Bench:
     clock: SimClock
     body: FreeBody
     bus: EmulatedI2cBus
-    strings: EmulatedStrings
+    strings: EmulatedSolarCells
     driver: AdsSolarStrings
 
     def wait(self, seconds: float) -> None:
@@ -40,8 +40,8 @@ def bench(peak: float = 0.5, after_noon: float = 0.0) -> Bench:
     clock = SimClock()
     orbit = OrbitSection(local_time=12.0, true_anomaly_deg=after_noon)
     body = FreeBody(FreeBodySection(orbit=orbit, release=TipOff(speed=0.0)), lambda: np.zeros(3))
-    model = SolarStringsModel(FACES, np.full(6, peak), np.zeros(6), noise=0.0)
-    strings = EmulatedStrings(body, model, WIRINGS, clock.now_ns, np.random.default_rng(1))
+    model = SolarCellsModel(FACES, np.full(6, peak), np.zeros(6), noise=0.0)
+    strings = EmulatedSolarCells(body, model, WIRINGS, clock.now_ns, np.random.default_rng(1))
     bus = EmulatedI2cBus(strings.parts)
     clock.attach(TimedSimulation(body.advance_to, []))
     return Bench(clock, body, bus, strings, AdsSolarStrings(bus, clock, WIRINGS))

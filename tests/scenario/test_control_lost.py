@@ -20,7 +20,7 @@ from ground import report
 from ground.telemetry import Run
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.emulators.vn100_sensors import Vn100Sample
 from tests.scenario.mode_flights import commanded, currents, released
 from tests.support.flights import Rigged, demo_config, event_names, fly, thesis_config
 
@@ -48,11 +48,11 @@ def on_the_line(faults: LineFaults) -> Break:
     return lambda rigged: setattr(rigged.lock.line.to_host, "faults", faults)
 
 
-def in_the_unit(alter: Callable[[Measured], Measured] | None) -> Break:
+def in_the_unit(alter: Callable[[Vn100Sample], Vn100Sample] | None) -> Break:
     return lambda rigged: setattr(rigged.lock.hardware.unit, "alter", alter)
 
 
-def elsewhere(seen: Measured) -> Measured:
+def elsewhere(seen: Vn100Sample) -> Vn100Sample:
     """Return a sample that no estimate agrees with."""
     turn = from_rotation_vector(np.array([0.0, 0.2, 0.0]))
     return replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + 0.1)

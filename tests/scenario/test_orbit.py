@@ -138,5 +138,5 @@ def test_a_fault_of_the_planner_is_refused_only_where_no_path_is_planned(
     config, fault = orbit_config(5.0), (FaultEntry(fault="planner: nan"),)
     check(fault, config, realtime=False)
     monkeypatch.setattr(OrbitConfig, "replan_period", lambda _: None)
-    with pytest.raises(UsageError, match="no planner flies here: the body plans no paths"):
+    with pytest.raises(UsageError, match="this flight has no planner: the body plans no paths"):
         check(fault, config, realtime=False)

@@ -21,7 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.camera.images import grey_stretch
 from sim_hal.assembly import StarRenderer
-from sim_hal.settings import Sky
+from sim_hal.settings import SkySection
 from sim_hal.star_camera import SourceTrack
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object.yaml"
@@ -71,7 +71,7 @@ def _frame(axes: Axes, run: Run, cameras: FloatArray) -> None:
     directions = track["direction"][place] + times[:, None] * track["rate"][place]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     tracks = [SourceTrack(times, directions, float(track["magnitude"][place]))]
-    pixels = StarRenderer(camera, Sky(), 1).render(0, times, attitudes, tracks)
+    pixels = StarRenderer(camera, SkySection(), 1).render(0, times, attitudes, tracks)
     axes.imshow(grey_stretch(pixels), cmap="gray", origin="upper")
     seen = sightings[sightings["found"] > 0]
     axes.plot(seen["x"][:, 0], seen["y"][:, 0], ".", color="tab:blue", markersize=3, label="sightings")

@@ -37,7 +37,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
-from sim_hal.settings import Sky
+from sim_hal.settings import SkySection
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns import nadir
@@ -83,7 +83,7 @@ def _draw_frame(path: Path) -> None:
     assert camera is not None
     times = np.linspace(0.0, camera.exposure, 101)
     attitudes = np.array([about_axis_y(-0.3 + RATE * t) for t in times])
-    pixels = StarRenderer(camera, Sky(), 1).render(1, times, attitudes)
+    pixels = StarRenderer(camera, SkySection(), 1).render(1, times, attitudes)
     found = estimate_motion(
         pixels,
         camera_model(camera).ideal,

@@ -51,7 +51,7 @@ _MOST_DIPOLE = 10.0
 _TASK = "craft"
 
 
-class Scenario:
+class BasiliskScenario:
     """A craft in Basilisk; time begins at zero and moves in steps of 25 ms."""
 
     def __init__(

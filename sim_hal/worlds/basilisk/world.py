@@ -24,18 +24,18 @@ from sim_hal.settings import FreeBodySection
 from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.body import (
-    KNIGHTCUBE_POWER,
-    CoilPower,
+    KNIGHTCUBE_SUPPLY,
+    CoilSupply,
     elements,
     generators,
     julian_date,
     released,
 )
 from sim_hal.worlds.free_body.craft import CRAFTS, build
-from sim_hal.worlds.world import Floats, Motion, OrbitTruth, Surroundings, WorldInputs, WorldTruth
+from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
 if TYPE_CHECKING:
-    from sim_hal.worlds.basilisk.scenario import Scenario
+    from sim_hal.worlds.basilisk.scenario import BasiliskScenario
 
 
 class BasiliskWorld:
@@ -45,7 +45,7 @@ class BasiliskWorld:
         self,
         section: FreeBodySection,
         currents: Callable[[], FloatArray],
-        power: CoilPower = KNIGHTCUBE_POWER,
+        power: CoilSupply = KNIGHTCUBE_SUPPLY,
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
@@ -90,7 +90,7 @@ class BasiliskWorld:
                 self._scenario.set_rotation(self._attitude, self._tip_off)
             self._step(since)
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         """Advance to `time_ns` and return the motion there; in free fall nothing presses on the body."""
         self.advance_to(time_ns)
         attitude, rate = self._attitude, np.zeros(3)
@@ -100,9 +100,9 @@ class BasiliskWorld:
             turn = quaternion.from_rotation_vector(rate * self._behind())
             attitude = quaternion.multiply(turn, _of_rodrigues(np.array(state.sigma_BN)))
         field = quaternion.attitude_matrix(attitude) @ self._field()
-        return Motion(self.time_ns, attitude, rate, field, np.zeros(3))
+        return BodyMotion(self.time_ns, attitude, rate, field, np.zeros(3))
 
-    def surroundings(self) -> Surroundings:
+    def surroundings(self) -> OrbitEnvironment:
         """Return what surrounds the craft now, ICRS."""
         state = self._scenario.craft.scStateOutMsg.read()
         velocity = np.array(state.v_BN_N)
@@ -110,7 +110,7 @@ class BasiliskWorld:
         away = sun.position(self._date()) - position
         distance = float(np.linalg.norm(away))
         seen = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
-        return Surroundings(
+        return OrbitEnvironment(
             _floats(position),
             _floats(velocity),
             _floats(self._field()),
@@ -182,13 +182,13 @@ class BasiliskWorld:
         self.supply_energy += span * self._power.supply_voltage * float(np.abs(self._acting).sum())
 
 
-def _scenario() -> type[Scenario]:
+def _scenario() -> type[BasiliskScenario]:
     try:
-        from sim_hal.worlds.basilisk.scenario import Scenario  # noqa: PLC0415 - seven seconds, and optional
+        from sim_hal.worlds.basilisk.scenario import BasiliskScenario  # noqa: PLC0415 - seven seconds, and optional
     except ImportError as error:
         problem = f"needs Basilisk ({error}): pip install 'knightcube-flight[worlds]'"
         raise ConfigError("simulation.world", problem) from error
-    return Scenario
+    return BasiliskScenario
 
 
 def _of_rodrigues(parameters: FloatArray) -> FloatArray:
@@ -207,7 +207,7 @@ def make(inputs: WorldInputs) -> BasiliskWorld:
     config, section = inputs.config, inputs.section
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
-    power = CoilPower(
+    power = CoilSupply(
         section.truth.resistance or config.coils.resistance,
         section.truth.supply_voltage or config.coils.supply_voltage,
     )

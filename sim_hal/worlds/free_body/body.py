@@ -26,17 +26,9 @@ from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.craft import CRAFTS, build
 from sim_hal.worlds.free_body.environment import Environment
 from sim_hal.worlds.free_body.loads import LoadModel
-from sim_hal.worlds.free_body.rotation import (
-    Floats,
-    Loads,
-    Rotation,
-    State,
-    matrix,
-    steps_within,
-    turned,
-)
+from sim_hal.worlds.free_body.rotation import Floats, Loads, Rotation, State, matrix, steps_within, turned
 from sim_hal.worlds.orbit import KeplerianElements
-from sim_hal.worlds.world import Motion, OrbitTruth, Surroundings, WorldInputs, WorldTruth
+from sim_hal.worlds.world import BodyMotion, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
 _STREAM = 0xF4EE
 
@@ -55,14 +47,14 @@ ZERO: Floats = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class CoilPower:
+class CoilSupply:
     """What the coils take: resistance (3,) ohm, and the supply's voltage."""
 
     resistance: tuple[float, float, float]
     supply_voltage: float
 
 
-KNIGHTCUBE_POWER = CoilPower((23.0, 23.0, 23.0), 3.4)
+KNIGHTCUBE_SUPPLY = CoilSupply((23.0, 23.0, 23.0), 3.4)
 
 
 class FreeBody:
@@ -72,7 +64,7 @@ class FreeBody:
         self,
         section: FreeBodySection,
         currents: Callable[[], FloatArray],
-        power: CoilPower = KNIGHTCUBE_POWER,
+        power: CoilSupply = KNIGHTCUBE_SUPPLY,
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
@@ -98,7 +90,7 @@ class FreeBody:
         self._start_ns, self._release_ns = start_ns, NEVER
         self._held = True
         self._acting: Floats = ZERO
-        self._seen: tuple[State, Motion | None] = self._state, None
+        self._seen: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
         # The state is of `_done_ns`; from there to `time_ns` the currents `_acting` act.
@@ -121,13 +113,13 @@ class FreeBody:
             self._acting = x, y, z
         self.time_ns = time_ns
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         """Advance to `time_ns` and return the motion there; in free fall nothing presses on the body."""
         self.advance_to(time_ns)
         self._integrate()
         state, motion = self._seen
         if motion is None or motion.time_ns != self.time_ns or state is not self._state:
-            motion = Motion(
+            motion = BodyMotion(
                 time_ns=self.time_ns,
                 quaternion=self._attitude(),
                 rate=np.array(turned(self._to_body, self._state[4:])),
@@ -137,7 +129,7 @@ class FreeBody:
             self._seen = self._state, motion  # the truth recorder looks when the inertial unit does
         return motion
 
-    def surroundings(self) -> Surroundings:
+    def surroundings(self) -> OrbitEnvironment:
         """Return what surrounds the craft now, ICRS."""
         return self.environment.at(self._seconds(self.time_ns))
 
@@ -170,7 +162,7 @@ class FreeBody:
             causes=lambda: self._torques(around, state, acting),
         )
 
-    def _torques(self, around: Surroundings, state: State, acting: Floats) -> dict[str, FloatArray]:
+    def _torques(self, around: OrbitEnvironment, state: State, acting: Floats) -> dict[str, FloatArray]:
         """Return the torques (3,) N m, body axes, by their causes."""
         turn = matrix(*state[:4])
         attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
@@ -288,7 +280,7 @@ def make(inputs: WorldInputs) -> FreeBody:
     config, section = inputs.config, inputs.section
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")
-    power = CoilPower(
+    power = CoilSupply(
         section.truth.resistance or config.coils.resistance,
         section.truth.supply_voltage or config.coils.supply_voltage,
     )

@@ -26,7 +26,7 @@ from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, sunlit_share
 from sim_hal.settings import Disturbances
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
-from sim_hal.worlds.world import Floats, Surroundings
+from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 _PROFILE = np.array(
     [
@@ -127,7 +127,7 @@ class Environment:
             ),
         )
 
-    def at(self, time: float) -> Surroundings:
+    def at(self, time: float) -> OrbitEnvironment:
         """Return everything at `time` s."""
         part, (a, b, c, d) = self._cubic(time)
         values = [((i * part + j) * part + k) * part + m for i, j, k, m in zip(a, b, c, d, strict=True)]
@@ -137,7 +137,7 @@ class Environment:
         distance = math.sqrt(sx * sx + sy * sy + sz * sz)
         seen = self._sunlit(time)
         vx, vy, vz = slope
-        return Surroundings(
+        return OrbitEnvironment(
             (px, py, pz),
             (vx, vy, vz),
             (bx, by, bz),
@@ -200,7 +200,7 @@ class Environment:
         return np.array(rows)
 
 
-def air_flow(surroundings: Surroundings) -> Floats:
+def air_flow(surroundings: OrbitEnvironment) -> Floats:
     """Return the craft's velocity (3,) m/s through air that turns with the Earth, ICRS."""
     (x, y, _), (vx, vy, vz) = surroundings.position, surroundings.velocity
     return vx + ROTATION_RATE * y, vy - ROTATION_RATE * x, vz

@@ -18,7 +18,7 @@ from sim_hal.settings import Disturbances
 from sim_hal.worlds.free_body.craft import Face, TrueCraft
 from sim_hal.worlds.free_body.environment import air_flow
 from sim_hal.worlds.free_body.rotation import Floats, Matrix, turned
-from sim_hal.worlds.world import Surroundings
+from sim_hal.worlds.world import OrbitEnvironment
 
 DRAG_COEFFICIENT = 2.2
 SOLAR_PRESSURE = 4.56e-6
@@ -85,7 +85,7 @@ class LoadModel:
         """Return the coils' dipole (3,) A m^2 at currents (3,) A."""
         return turned(self._coils, currents)
 
-    def residual_dipole(self, around: Surroundings) -> Floats:
+    def residual_dipole(self, around: OrbitEnvironment) -> Floats:
         """Return the residual dipole (3,) A m^2."""
         light, walking = around.light, self._walking
         (a, b, c), (d, e, f), (x, y, z) = self._constant, self._sunlit, around.walk
@@ -98,7 +98,7 @@ class LoadModel:
         scale = self._gradient / (squared * math.sqrt(math.sqrt(squared)))
         return scale * x, scale * y, scale * z
 
-    def pressures(self, around: Surroundings, to_body: Matrix) -> tuple[Floats, Floats]:
+    def pressures(self, around: OrbitEnvironment, to_body: Matrix) -> tuple[Floats, Floats]:
         """Return the torques (3,) N m of air and sunlight; `to_body` turns ICRS into body axes."""
         flow = turned(to_body, air_flow(around))
         drag = air_torque(self._faces, flow, self._drag * around.density)

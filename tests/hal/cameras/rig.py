@@ -20,8 +20,8 @@ from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import Refused
 from hal.interfaces.wires import Clock
 from knightcube.astro.arrays import FloatArray, Image
-from sim_hal.emulators.star_camera import EmulatedStarCamera
-from sim_hal.worlds.world import Motion
+from sim_hal.emulators.camera import EmulatedCamera
+from sim_hal.worlds.world import BodyMotion
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.manual_clock import ManualClock
 
@@ -73,7 +73,7 @@ class VideoRig:
 class _World:
     """Lets an emulated camera live along with a clock."""
 
-    def __init__(self, camera: EmulatedStarCamera) -> None:
+    def __init__(self, camera: EmulatedCamera) -> None:
         self._camera = camera
 
     def next_event_ns(self) -> int:
@@ -94,10 +94,8 @@ def emulated_rig() -> Rig:
         promise.set_result(np.full((48, 64), sequence, np.uint16))
         return promise
 
-    still = Motion(0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))
-    camera = EmulatedStarCamera(
-        lambda _: still, expose, clock.now_ns, 5_000_000, np.array([0.0, 0.0, 0.0, 1.0])
-    )
+    still = BodyMotion(0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))
+    camera = EmulatedCamera(lambda _: still, expose, clock.now_ns, 5_000_000, np.array([0.0, 0.0, 0.0, 1.0]))
     clock.attach(_World(camera))
 
     def unplug() -> None:

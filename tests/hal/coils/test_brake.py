@@ -9,7 +9,7 @@ import pytest
 from hal.drivers.h_bridge import CoilWiring, brake
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.errors import Refused
-from sim_hal.emulators.coil_circuit import Condition
+from sim_hal.emulators.coil_circuit import CoilCondition
 from tests.hal.coils.rig import PCA, THESIS, Rig
 
 MS = 1_000_000
@@ -17,7 +17,7 @@ FULL = 3.4 / 23.0
 Y = (False, True, False)
 
 
-def stuck(condition: Condition = Condition.A_HIGH) -> Rig:
+def stuck(condition: CoilCondition = CoilCondition.A_HIGH) -> Rig:
     """Return a rig that has been started, with a leg of coil y's bridge broken."""
     rig = Rig()
     rig.coils.start()
@@ -25,9 +25,9 @@ def stuck(condition: Condition = Condition.A_HIGH) -> Rig:
     return rig
 
 
-@pytest.mark.parametrize(("condition", "sign"), [(Condition.A_HIGH, 1.0), (Condition.B_HIGH, -1.0)])
+@pytest.mark.parametrize(("condition", "sign"), [(CoilCondition.A_HIGH, 1.0), (CoilCondition.B_HIGH, -1.0)])
 def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
-    condition: Condition, sign: float
+    condition: CoilCondition, sign: float
 ) -> None:
     """Which leg it is need not be known: both inputs are high."""
     rig = stuck(condition)
@@ -52,7 +52,7 @@ def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig
 
 def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
     """Why no bridge is braked on a guess alone: the current is looked at, and the brake taken back."""
-    rig = stuck(Condition.A_LOW)
+    rig = stuck(CoilCondition.A_LOW)
     assert rig.currents() == [0.0, 0.0, 0.0]
     rig.coils.brake(Y)
     assert rig.currents()[1] == pytest.approx(-FULL)
@@ -123,7 +123,7 @@ def test_an_enable_that_is_wired_lets_a_braked_coil_coast() -> None:
     wiring = CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0, enable_channel=6), CoilWiring(4, 5, 23.0)
     rig = Rig(replace(THESIS, coils=wiring))
     rig.coils.start()
-    rig.wire.circuit.become(1, Condition.A_HIGH)
+    rig.wire.circuit.become(1, CoilCondition.A_HIGH)
     assert rig.currents() == [0.0, 0.0, 0.0]
     rig.coils.brake(Y)
     assert rig.currents() == [0.0, 0.0, 0.0]

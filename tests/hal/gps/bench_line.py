@@ -11,7 +11,7 @@ from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
-from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.simulation import TimedSimulation
@@ -24,7 +24,7 @@ EXACT = GpsErrors(walk=0.0, noise=0.0, velocity_noise=0.0)
 class GpsBench:
     clock: SimClock
     body: FreeBody
-    line: SerialLine
+    line: EmulatedSerialLine
     gps: EmulatedGps
     driver: UbloxReceiver
 
@@ -40,7 +40,7 @@ class GpsBench:
 def bench(errors: GpsErrors = EXACT, baud_rate: int = 115200) -> GpsBench:
     clock = SimClock()
     body = FreeBody(FreeBodySection(), lambda: np.zeros(3), utc=UTC)
-    line = SerialLine(clock.now_ns, baud_rate, np.random.default_rng(1))
+    line = EmulatedSerialLine(clock.now_ns, baud_rate, np.random.default_rng(1))
     gps = EmulatedGps(body, line.device, np.random.default_rng(2), errors)
     clock.attach(TimedSimulation(body.advance_to, [gps]))
     return GpsBench(clock, body, line, gps, UbloxReceiver(line.host, clock))

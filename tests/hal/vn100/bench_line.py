@@ -11,9 +11,9 @@ from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map
 from sim_hal.clock import SimClock
-from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
-from sim_hal.worlds.world import Motion, about_thread
+from sim_hal.worlds.world import BodyMotion, about_thread
 
 MISSION = Vn100Settings(
     attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED),
@@ -24,11 +24,11 @@ MISSION = Vn100Settings(
 )
 
 
-def at_rest(time_ns: int) -> Motion:
+def at_rest(time_ns: int) -> BodyMotion:
     return about_thread(time_ns, 0.4, 0.0, 4.5e-4)
 
 
-def turning(time_ns: int) -> Motion:
+def turning(time_ns: int) -> BodyMotion:
     """Turn through q2 = 0 at 0.1 rad/s."""
     return about_thread(time_ns, 0.1 * (time_ns * 1e-9 - 2.0), 0.1, 4.5e-4)
 
@@ -55,7 +55,7 @@ class BenchLine:
     """Everything on the bench."""
 
     clock: SimClock
-    line: SerialLine
+    line: EmulatedSerialLine
     unit: Vn100Emulator
     driver: Vn100
 
@@ -70,7 +70,7 @@ class BenchLine:
 
 
 def bench_line(
-    sense: Callable[[int], Motion] = turning,
+    sense: Callable[[int], BodyMotion] = turning,
     settings: Vn100Settings = MISSION,
     unit_settings: Vn100EmulatorSettings | None = None,
     seed: int = 1,
@@ -78,7 +78,7 @@ def bench_line(
 ) -> BenchLine:
     clock = SimClock()
     rng = np.random.default_rng(seed)
-    line = SerialLine(clock.now_ns, baud_rate, rng)
+    line = EmulatedSerialLine(clock.now_ns, baud_rate, rng)
     unit = Vn100Emulator(sense, line.device, rng, replace(unit_settings or Vn100EmulatorSettings()))
     clock.attach(Alone(unit))
     return BenchLine(clock, line, unit, Vn100(line.host, clock, settings))

@@ -25,7 +25,7 @@ from knightcube.astro.quaternion import (
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.worlds.world import Motion, about_thread
+from sim_hal.worlds.world import BodyMotion, about_thread
 from tests.hal.vn100.bench_line import MISSION, at_rest, bench_line, turning
 
 QUIET = Vn100EmulatorSettings(noise=PROFILES["none"])
@@ -66,8 +66,8 @@ def test_any_mounting_and_attitude_come_back_in_body_axes() -> None:
     attitude = from_rotation_vector(rng.normal(size=3))
     field, force, rate = attitude_matrix(attitude) @ [0, 0, -4e-4], rng.normal(size=3), rng.normal(size=3)
 
-    def sense(time_ns: int) -> Motion:
-        return Motion(time_ns, attitude, rate, field, force)
+    def sense(time_ns: int) -> BodyMotion:
+        return BodyMotion(time_ns, attitude, rate, field, force)
 
     settings = replace(
         MISSION, attitude_map=attitude_map(mounting, NED_TO_TESTBED), mounting=attitude_matrix(mounting)
@@ -82,7 +82,7 @@ def test_any_mounting_and_attitude_come_back_in_body_axes() -> None:
 
 
 def test_both_signs_of_the_quaternion_read_as_the_shorter_turn() -> None:
-    def sense(time_ns: int) -> Motion:
+    def sense(time_ns: int) -> BodyMotion:
         return replace(about_thread(time_ns, 0.4, 0.0, 4.5e-4), quaternion=-about_axis_y(0.4))
 
     bench = bench_line(sense, unit_settings=QUIET)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.device import NEVER
-from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS
 from sim_hal.emulators.vn100_sensors import PROFILES, REPORTS
@@ -25,7 +25,7 @@ class Bench:
     def __init__(self, unit: Vn100EmulatorSettings | None = None) -> None:
         rng = np.random.default_rng(2)
         self.now_ns = 0
-        self.line = SerialLine(lambda: self.now_ns, 115200, rng)
+        self.line = EmulatedSerialLine(lambda: self.now_ns, 115200, rng)
         self.unit = Vn100Emulator(
             lambda t: about_thread(t, 0.3, 0.02, 4.5e-4),
             self.line.device,

@@ -11,7 +11,7 @@ from hal.drivers.vn100.protocol import build
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.errors import NotResponding
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.emulators.vn100_sensors import Vn100Sample
 from tests.hal.vn100.bench_line import BenchLine, bench_line
 
 PERIOD_NS = 25_000_000
@@ -160,9 +160,9 @@ def test_noise_that_leaves_readings_starts_no_recovery(bench: BenchLine) -> None
 
 
 def test_values_that_never_change_are_no_readings(bench: BenchLine) -> None:
-    kept: list[Measured] = []
+    kept: list[Vn100Sample] = []
 
-    def same(measured: Measured) -> Measured:
+    def same(measured: Vn100Sample) -> Vn100Sample:
         kept.append(measured)
         return kept[0]
 

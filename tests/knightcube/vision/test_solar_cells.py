@@ -13,11 +13,11 @@ from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import cameras_by_sun
-from sim_hal.emulators.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_cells import SolarCellsModel
 from tests.sim_hal.earth_camera.scenes import pointing, random_direction
 
 STRINGS = SolarStringModel()
-IDEAL = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0, albedo=0.0)
+IDEAL = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0, albedo=0.0)
 CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 
@@ -26,7 +26,7 @@ def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray
     generator = np.random.default_rng(seed)
     errors, squares, false_dark, false_light = [], [], 0, 0
     for _ in range(count):
-        model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, 0.02 * generator.standard_normal(6))
+        model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, 0.02 * generator.standard_normal(6))
         position = (EARTH_RADIUS + generator.uniform(200e3, 2000e3)) * random_direction(generator)
         sun = ASTRONOMICAL_UNIT * random_direction(generator)
         body = quaternion.attitude_matrix(quaternion.normalise(generator.standard_normal(4)))
@@ -76,7 +76,7 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     The mean solar cosine of the ground, weighted by the plate's, is near one: within some percent at 200 km.
     """
     position = np.array([EARTH_RADIUS + 200e3, 0.0, 0.0])
-    model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
+    model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
     sun = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
     currents = model.currents(position, sun, np.eye(3), np.random.default_rng(0))
     view = (EARTH_RADIUS / position[0]) ** 2
@@ -89,7 +89,7 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
 
 
 def test_in_eclipse_the_strings_say_dark() -> None:
-    model = SolarStringsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6))
+    model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6))
     position = np.array([-7e6, 0.0, 0.0])
     sun = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
     reading = coarse_sun(model.currents(position, sun, np.eye(3), np.random.default_rng(1)), STRINGS)

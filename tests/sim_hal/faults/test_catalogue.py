@@ -11,7 +11,7 @@ from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.device import NEVER
-from sim_hal.emulators.coil_circuit import Condition
+from sim_hal.emulators.coil_circuit import CoilCondition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.faults.bench import Bench, FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
@@ -59,7 +59,7 @@ def is_sound(lock: LockStep) -> bool:
         and set(hardware.bus._parts) == {hardware.pwm, hardware.monitor}
         and not hardware.monitor.frozen
         and hardware.monitor.gain == 1.0
-        and set(hardware.circuit._conditions) == {Condition.SOUND}
+        and set(hardware.circuit._conditions) == {CoilCondition.SOUND}
         and hardware.camera.fault == ""
         and hardware.camera.late_ns == 0
         and hardware.camera.one_of == 1
@@ -70,7 +70,7 @@ def is_sound(lock: LockStep) -> bool:
 def orbit_is_sound(lock: LockStep) -> bool:
     """Return whether no effect of any fault remains on the devices of an orbit."""
     devices, bus = lock.hardware.orbit, lock.hardware.bus
-    gps, strings = devices.gps, devices.strings
+    gps, strings = devices.gps, devices.cells
     assert gps is not None
     assert strings is not None
     assert lock.gps_line is not None
@@ -163,21 +163,21 @@ def test_legs_that_are_stuck_drive_their_coil_and_are_braked_by_the_other(lock: 
     circuit, pwm = lock.hardware.circuit, lock.hardware.pwm
     full = 3.4 / 23.0
     pwm.write(0x40, bytes([0x00, 0x20]))
-    circuit.become(0, Condition.A_HIGH)
+    circuit.become(0, CoilCondition.A_HIGH)
     assert circuit.currents()[0] == pytest.approx(full, abs=3.5e-3)
     pwm.write(0x40, bytes([0x0A, 0x00, 0x10, 0x00, 0x00]))  # B full on
     assert circuit.currents()[0] == 0.0
-    circuit.become(0, Condition.SOUND)
+    circuit.become(0, CoilCondition.SOUND)
     assert circuit.currents()[0] == pytest.approx(-full, abs=3.5e-3)
-    circuit.become(0, Condition.B_LOW)
+    circuit.become(0, CoilCondition.B_LOW)
     assert circuit.currents()[0] == 0.0
-    circuit.become(0, Condition.REVERSED)
+    circuit.become(0, CoilCondition.REVERSED)
     assert circuit.currents()[0] == pytest.approx(full, abs=3.5e-3)
-    circuit.become(0, Condition.OPEN)
+    circuit.become(0, CoilCondition.OPEN)
     assert circuit.currents()[0] == 0.0
     now = lock.clock.now_ns()
     lock.clock.sleep_until_ns(now + 200_000_000)
-    circuit.become(0, Condition.SHORTED, 5.0)
+    circuit.become(0, CoilCondition.SHORTED, 5.0)
     lock.clock.sleep_until_ns(now + 400_000_000)
     assert circuit.currents()[0] == 0.0
     _, drawn = circuit.mean_supply(now + 300_000_000, now + 400_000_000)

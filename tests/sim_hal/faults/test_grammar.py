@@ -66,9 +66,9 @@ def test_a_fault_is_read_with_its_time_and_parameters(
         ("imu: silnt @ 3", "did you mean 'imu: silent'"),
         ("coil-q: open", "did you mean 'coil-"),
         ("imu silent", "write it as DEVICE: KIND"),
-        ("imu: silent @ soon", "'soon' is no number"),
+        ("imu: silent @ soon", "'soon' is not a number"),
         ("imu: silent @ -3", "cannot be below zero"),
-        ("imu: silent @ nan", "'nan' is no number"),
+        ("imu: silent @ nan", "'nan' is not a number"),
         ("imu: bits (chanc=0.1)", "imu: bits has chance"),
         ("imu: bits (chance)", "imu: bits has chance"),
         ("imu: silent (delay=1)", "has no parameters"),
@@ -111,7 +111,7 @@ def test_a_fault_in_a_configuration_is_complained_of_with_its_place() -> None:
     bad = (FaultEntry(fault="imu: silent"), FaultEntry(fault="imu: quiet"))
     with pytest.raises(UsageError, match=r"simulation\.faults\[1\].*'imu: quiet'"):
         schedule(bad)
-    with pytest.raises(UsageError, match="`for` stands twice"):
+    with pytest.raises(UsageError, match="`for` is given twice"):
         schedule((FaultEntry(fault="imu: silent for 3", span=2.0),))
     text = TEXT.replace("  seed: 1\n", "  seed: 1\n  faults: [{fault: 'imu: silent', att: 120}]\n")
     with pytest.raises(ConfigError, match="att"):
@@ -163,7 +163,7 @@ def test_each_parameter_is_held_to_its_bounds(kind: FaultKind, name: str) -> Non
         assert f"{name}={wrong!r}" in str(caught.value)
         assert parameter.bounds() in str(caught.value)
     for word in ("nan", "inf", "-inf", "", "1e999"):
-        with pytest.raises(UsageError, match="is no number"):
+        with pytest.raises(UsageError, match="is not a number"):
             parse(f"{kind.name} ({name}={word})")
 
 
@@ -240,7 +240,7 @@ def test_a_fault_that_could_do_nothing_is_refused_with_the_cure(
 )
 def test_a_fault_that_would_take_the_place_of_another_is_refused(first: str, second: str) -> None:
     for pair in ((first, second), (second, first)):
-        with pytest.raises(UsageError, match=r"would take the place of .*let one end \(`for`\)"):
+        with pytest.raises(UsageError, match=r"would replace .*let one end \(`for`\)"):
             checked(*pair)
 
 

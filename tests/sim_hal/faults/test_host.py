@@ -15,7 +15,7 @@ from flight.loop.executive.jobs import JobResult, LockStepRunner, Worker
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from sim_hal.clock import SimClock
-from sim_hal.faults.host import HostFaults, Task, corrupted, corrupted_by, perform, without_numbers
+from sim_hal.faults.host import ProcessFaults, Task, corrupted, corrupted_by, perform, without_numbers
 from sim_hal.faults.schedule import parse
 from tests.support.flights import TEXT
 
@@ -37,9 +37,9 @@ def find(argument: float) -> Found:
     return Found(argument, np.array([argument, 1.0]), 3, (argument, "text"))
 
 
-def flown(fault: str) -> tuple[SimClock, HostFaults]:
+def flown(fault: str) -> tuple[SimClock, ProcessFaults]:
     clock = SimClock()
-    faults = HostFaults([parse(fault)], clock, realtime=False)
+    faults = ProcessFaults([parse(fault)], clock, realtime=False)
     faults.begin(SECOND_NS)
     return clock, faults
 

@@ -19,7 +19,15 @@ from knightcube.vision.camera.lens import Pinhole
 from sim_hal.clock import SimClock
 from sim_hal.lockstep import posed_camera
 from sim_hal.objects import Objects
-from sim_hal.settings import FreeBodySection, LineOfSight, ObjectState, Simulation, Sky, SkyObject, Tumble
+from sim_hal.settings import (
+    FreeBodySection,
+    LineOfSight,
+    ObjectState,
+    Simulation,
+    SkyObject,
+    SkySection,
+    Tumble,
+)
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.world import OrbitingWorld
 
@@ -45,7 +53,7 @@ def _frame(config: Config, objects: tuple[SkyObject, ...]) -> tuple[Image, Float
     text = config_path("step_demo").read_text()
     section = simulation_section(text, "step_demo", Simulation)
     assert section is not None
-    changed = Simulation(release=section.release, sky=Sky(magnitude_limit=0.0), objects=objects)
+    changed = Simulation(release=section.release, sky=SkySection(magnitude_limit=0.0), objects=objects)
     clock = SimClock()
     device, attitude = posed_camera(config, changed, clock, np.zeros(3))
     device.trigger(round(EXPOSURE * 1e9))

@@ -11,7 +11,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FreeBodySection, OrbitSection, Simulation, TipOff
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.world import Surroundings
+from sim_hal.worlds.world import OrbitEnvironment
 from tests.support.flights import demo_config, demo_world
 
 UTC = "2026-03-20T12:00:00Z"
@@ -56,7 +56,7 @@ def orbit_world(boresight: FloatArray | None = None) -> Simulation:
     return reader.replace(demo_world(), world="free_body", free_body=body, release=None, utc=UTC, seed=3)
 
 
-def at_first() -> Surroundings:
+def at_first() -> OrbitEnvironment:
     """Return what surrounds the craft at the beginning."""
     section = orbit_world().free_body
     assert section is not None

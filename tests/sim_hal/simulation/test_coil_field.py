@@ -9,7 +9,7 @@ from flight.schema import reader as configuration
 from knightcube.astro.arrays import FloatArray
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.emulators.vn100_sensors import Vn100Sample
 from sim_hal.settings import Row
 from tests.support.flights import demo_config, demo_world
 
@@ -23,7 +23,7 @@ def gauss(coil_field: tuple[Row, Row, Row], driven: bool) -> tuple[FloatArray, F
     lock = lockstep.build(demo_config(10.0, camera=False), section, None, SimClock())
     seen: list[FloatArray] = []
 
-    def note(measured: Measured) -> Measured:
+    def note(measured: Vn100Sample) -> Vn100Sample:
         seen.append(measured.mag)
         return measured
 

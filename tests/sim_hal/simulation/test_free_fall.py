@@ -10,23 +10,25 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.emulators.vn100_sensors import Vn100Sample
 from sim_hal.settings import FreeBodySection, ImuNoise, TipOff
-from sim_hal.worlds.world import Motion
+from sim_hal.worlds.world import BodyMotion
 from tests.support.flights import demo_config, demo_world
 
 BIAS = (2e-6, -1e-6, 3e-6)
 
 
-def measured(imu: ImuNoise, seconds: float, world: str = "free_body") -> tuple[list[Measured], list[Motion]]:
+def measured(
+    imu: ImuNoise, seconds: float, world: str = "free_body"
+) -> tuple[list[Vn100Sample], list[BodyMotion]]:
     """Return what the unit sends at 40 Hz, and the true motion at each time."""
     body = FreeBodySection(release=TipOff(speed=0.02))
     section = reader.replace(demo_world(), world=world, free_body=body, imu=imu)
     lock = lockstep.build(demo_config(10.0, camera=False), section, None, SimClock())
-    seen: list[Measured] = []
-    true: list[Motion] = []
+    seen: list[Vn100Sample] = []
+    true: list[BodyMotion] = []
 
-    def note(sample: Measured) -> Measured:
+    def note(sample: Vn100Sample) -> Vn100Sample:
         seen.append(sample)
         true.append(lock.hardware.world.motion(lock.clock.now_ns()))
         return sample

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema.testbed import as_testbed
-from sim_hal.worlds.world import Motion, WorldInputs, WorldTruth, about_thread
+from sim_hal.worlds.world import BodyMotion, WorldInputs, WorldTruth, about_thread
 
 RATE = 0.05
 NO_FACTORY = "three"
@@ -23,7 +23,7 @@ class SpinningWorld:
     def advance_to(self, time_ns: int) -> None:
         self.time_ns = max(self.time_ns, time_ns)
 
-    def motion(self, time_ns: int) -> Motion:
+    def motion(self, time_ns: int) -> BodyMotion:
         self.advance_to(time_ns)
         turning = self._release_ns is not None and time_ns >= self._release_ns
         angle = (

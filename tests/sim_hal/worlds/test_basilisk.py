@@ -14,13 +14,13 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection
 from sim_hal.worlds.basilisk.world import BasiliskWorld, make
-from sim_hal.worlds.free_body.body import CoilPower, FreeBody
+from sim_hal.worlds.free_body.body import CoilSupply, FreeBody
 from sim_hal.worlds.world import OrbitingWorld, WorldInputs, make_world
 from tests.support.flights import demo_config, demo_world
 
 SECOND = 1_000_000_000
 UTC = "2026-03-20T12:00:00Z"
-POWER = CoilPower((23.0, 23.0, 23.0), 3.4)
+POWER = CoilSupply((23.0, 23.0, 23.0), 3.4)
 CALM = Disturbances(drag=0.0, solar_pressure=0.0, residual_dipole=0.0, ring_current=0.0)
 
 

@@ -19,7 +19,7 @@ from knightcube.gnc.estimation.measurements import (
     RateMeasurement,
 )
 from sim_hal.emulators.vn100_sensors import NoiseProfile, Sensors
-from sim_hal.worlds.world import Motion
+from sim_hal.worlds.world import BodyMotion
 from tests.support.consistency_worlds import CYCLE_NS, DIPOLE, INERTIA, TESTBED_FIELD, World
 
 QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
@@ -46,7 +46,7 @@ class Unit:
 
     def sample(self, now_ns: int, world: World) -> tuple[AttitudeMeasurement, RateMeasurement]:
         """Return what the unit says of now."""
-        motion = Motion(now_ns, world.attitude, world.rate, np.zeros(3), np.zeros(3))
+        motion = BodyMotion(now_ns, world.attitude, world.rate, np.zeros(3), np.zeros(3))
         said = self._sensors.measure(motion, (1, 1, 1))
         return (
             AttitudeMeasurement(now_ns, self._map @ said.quaternion, self._attitude_covariance),

@@ -21,7 +21,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.world import Surroundings
+from sim_hal.worlds.world import OrbitEnvironment
 from tests.support.flights import CONFIG
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
@@ -157,7 +157,7 @@ def _body() -> FreeBody:
     return FreeBody(section.free_body, no_currents, seed=section.seed, utc=section.utc)
 
 
-def _at_release() -> Surroundings:
+def _at_release() -> OrbitEnvironment:
     return _body().surroundings()
 
 

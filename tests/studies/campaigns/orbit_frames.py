@@ -37,7 +37,7 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, RoughAttitude, 
 from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_sun
 from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
-from sim_hal.emulators.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_cells import SolarCellsModel
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band
@@ -110,7 +110,7 @@ class _Flight:
         self._air, self._rotation = random_air(self._rng), self._rng.uniform(0.0, 2.0 * np.pi)
         self._strings = SolarStringModel()
         count = len(self._strings.peaks)
-        self._currents = SolarStringsModel(
+        self._currents = SolarCellsModel(
             self._strings.normals, self._strings.peaks, 0.02 * self._rng.standard_normal(count)
         )
         self._filter = AttitudeDetermination(settings_of(sensors))

@@ -21,7 +21,7 @@ from knightcube.astro.earth.sun import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
-from sim_hal.emulators.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds import sun
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -66,7 +66,7 @@ class SafeFlight:
         self._draws = np.random.default_rng([seed, _STREAM])
         self._strings = SolarStringModel()
         gains = GAIN_ERROR * self._draws.standard_normal(len(self._strings.peaks))
-        self._light = SolarStringsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
+        self._light = SolarCellsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
         seeking = SunAcquisitionSettings(
             inertia=np.diag(self._flight.inertia), axis=AXIS, limit=self._flight.limit
         )

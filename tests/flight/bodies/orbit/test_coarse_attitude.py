@@ -28,14 +28,14 @@ from knightcube.gnc.estimation.estimate import TURN, Knowledge
 from knightcube.gnc.estimation.free_motion import Around
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.solar_cells import SolarStringModel
-from sim_hal.emulators.solar_strings import SolarStringsModel
+from sim_hal.emulators.solar_cells import SolarCellsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])
 SUN = np.array([0.6, -0.48, 0.64])
 SPIN = np.array([3e-3, -2e-3, 4e-3])
 ROUND_NS = SECOND_NS // 2
-MODEL = SolarStringsModel(np.concatenate([np.eye(3), -np.eye(3)]), np.full(6, 0.5), np.zeros(6))
+MODEL = SolarCellsModel(np.concatenate([np.eye(3), -np.eye(3)]), np.full(6, 0.5), np.zeros(6))
 
 
 class Lit:

@@ -18,7 +18,7 @@ from hal.interfaces.errors import NotResponding
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import multiply
 from sim_hal.device import NEVER
-from sim_hal.worlds.world import Motion
+from sim_hal.worlds.world import BodyMotion
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack
@@ -51,7 +51,7 @@ class _Exposure:
         return self.start_ns + self.length_ns + self.scan_ns
 
 
-class EmulatedStarCamera:
+class EmulatedCamera:
     """A FrameSource and an emulated device.
 
     Attributes:
@@ -62,7 +62,7 @@ class EmulatedStarCamera:
 
     def __init__(
         self,
-        motion: Callable[[int], Motion],
+        motion: Callable[[int], BodyMotion],
         expose: Expose,
         now_ns: Callable[[], int],
         readout_ns: int,

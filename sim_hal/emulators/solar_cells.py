@@ -32,7 +32,7 @@ _RINGS, _SPOKES = 16, 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SolarStringsModel:
+class SolarCellsModel:
     """What the strings do.
 
     Attributes:
@@ -183,7 +183,7 @@ _UNIX_EPOCH = 2_440_587.5
 _FRESH_NS = 20_000_000
 
 
-class EmulatedStrings:
+class EmulatedSolarCells:
     """The strings and the converters that measure them.
 
     Attributes:
@@ -195,7 +195,7 @@ class EmulatedStrings:
     def __init__(
         self,
         world: OrbitingWorld,
-        model: SolarStringsModel,
+        model: SolarCellsModel,
         wirings: Sequence[StringWiring],
         now_ns: Callable[[], int],
         generator: np.random.Generator,
