@@ -147,7 +147,7 @@ class CageTruth(Section, frozen=True, kw_only=True):
 
 
 class SkySection(Section, frozen=True, kw_only=True):
-    """SkySection and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
+    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
