@@ -48,12 +48,11 @@ from knightcube.gnc.tracking.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraKnowledge, Exposures
-from knightcube.vision.frame_job import TrackerSettings
+from knightcube.vision.frame_job import StreakEstimator, TrackerSettings
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import SolveSettings
-from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
 BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodies.orbit.body:ORBIT"}
@@ -98,7 +97,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
         max_rate=math.inf if camera.max_rate is None else camera.max_rate,
         mounting=np.array(camera.mounting),
-        estimator=_estimator(camera),
+        estimator=_estimator(camera, body),
         tracker=_tracker(camera),
         angular_acceleration_psd=body.estimation.angular_acceleration_psd,
         velocity=body.estimation.velocity,
@@ -160,13 +159,15 @@ def _saturation(camera: Camera) -> float:
     return camera.saturation or float(2**camera.bits - 1)
 
 
-def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
-    """Return the settings of the configured streak estimator."""
-    saturation = _saturation(camera)
+def _estimator(camera: Camera, body: Body) -> LikelihoodSettings | StreakEstimator:
+    """Return the configured estimator of streaks. Raises ConfigError for one that the body does not have."""
     if camera.estimator == "likelihood":
-        return replace(likelihood_settings(camera), saturation=saturation)
-    settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
-    return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)
+        return replace(likelihood_settings(camera), saturation=_saturation(camera))
+    if body.streak_estimator is None:
+        raise ConfigError(
+            "camera.estimator", f"is {camera.estimator!r}, which this body does not have: use 'likelihood'"
+        )
+    return body.streak_estimator
 
 
 def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:

@@ -26,6 +26,7 @@ from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
+from knightcube.vision.frame_job import StreakEstimator
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 
 COMMANDED = 1000
@@ -412,11 +413,16 @@ class BodyControl(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A body ready to fly."""
+    """A body ready to fly.
+
+    Attributes:
+        streak_estimator: the estimator that `camera.estimator` names, if it is not the usual one.
+    """
 
     estimation: BodyEstimation
     control: BodyControl
     view: BodyView
+    streak_estimator: StreakEstimator | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,15 +18,15 @@ from ground.commands.options import add_field, add_output, add_picture, finite, 
 from ground.pictures.overlay import draw_marks
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import SpaceObject, detect
-from knightcube.vision.objects.settings import ObjectSettings
-from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 LIKELIHOOD = "likelihood"
 
@@ -142,7 +142,7 @@ def _estimate(
     exposure: float,
     likelihood: LikelihoodSettings,
     prior: FloatArray | None,
-) -> StreakResult | MotionResult:
+) -> FrameMotion:
     if method == LIKELIHOOD:
         return estimate_motion(pixels, pinhole, exposure, likelihood, prior, 0.0)
     gain, saturation = likelihood.gain, likelihood.saturation
@@ -151,19 +151,17 @@ def _estimate(
 
 
 def _objects(
-    pixels: Image, pinhole: Pinhole, found: StreakResult | MotionResult, likelihood: LikelihoodSettings
+    pixels: Image, pinhole: Pinhole, found: FrameMotion, likelihood: LikelihoodSettings
 ) -> tuple[SpaceObject, ...]:
     if found.rate is None:
         return ()
-    settings = StreakSettings(gain=likelihood.gain, saturation=likelihood.saturation)
+    settings = EndpointSettings(gain=likelihood.gain, saturation=likelihood.saturation)
     rotation, exposure = found.rate * found.exposure, found.exposure
     report = detect(pixels, pinhole, rotation, exposure, settings, ObjectSettings())
     return report.objects if report is not None else ()
 
 
-def _facts(
-    found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...], method: str
-) -> dict[str, Any]:
+def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) -> dict[str, Any]:
     known = found.rate is not None and found.covariance is not None
     return {
         "method": method,
@@ -192,7 +190,7 @@ def _facts(
     }
 
 
-def _reason(found: StreakResult | MotionResult) -> str:
+def _reason(found: FrameMotion) -> str:
     """Return in a line why there is no rate; empty with a rate."""
     if found.rate is not None:
         return ""
@@ -200,7 +198,7 @@ def _reason(found: StreakResult | MotionResult) -> str:
     return detailed or _REASONS.get(found.status, "")
 
 
-def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) -> str:
+def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:
     lines = [f"status:        {found.status.value}"]
     if _reason(found):
         lines.append(f"why:           {_reason(found)}")

@@ -15,16 +15,15 @@ of MB that it does not need: they are imported where the work is done.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.images import KeptFrames, keep_frame
-from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from knightcube.vision.startracker.index import sky_index
@@ -43,12 +42,8 @@ from knightcube.vision.startracker.solve import (
     solve_near,
     solve_points,
 )
-from knightcube.vision.startracker.two_ends import solve_ends
-from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
-
-Found = StreakResult | MotionResult
+from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 # The motion is fitted again where the focal length was wrong by more.
@@ -77,13 +72,39 @@ class TrackerSettings:
     index: Path | None = None
 
 
+class StreakEstimator(Protocol):
+    """Another estimator of streaks, to compare with; it can be pickled."""
+
+    def motion(
+        self,
+        pixels: Image,
+        pinhole: Pinhole,
+        exposure: float,
+        prior_rate: FloatArray | None,
+        prior_sigma: float,
+        previous_checksum: int | None,
+    ) -> FrameMotion:
+        """Return the motion over the exposure (s), with arguments as `estimate_motion` has them."""
+
+    def solve(
+        self,
+        found: FrameMotion,
+        camera: CameraModel,
+        scale: tuple[float, float],
+        sky: SkyIndex,
+        settings: SolveSettings,
+        prior: AttitudePrior | None,
+    ) -> tuple[FrameSolution, FrameMotion]:
+        """Return the attitude at mid-exposure by the streaks of a motion `found`, and the refined motion."""
+
+
 @dataclass(frozen=True, slots=True)
 class FrameJob:
     """A frame (rows, columns) with its camera, priors and settings.
 
     Attributes:
         exposure: s.
-        estimator: its type selects the estimator of streaks.
+        estimator: settings of the maximum-likelihood estimator, or another estimator of streaks.
         tracker: None: stars are not identified.
         previous_checksum: of the frame before; the same pixels again mean a frozen camera.
         motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
@@ -94,7 +115,7 @@ class FrameJob:
     pixels: Image
     camera: CameraModel
     exposure: float
-    estimator: StreakSettings | LikelihoodSettings
+    estimator: LikelihoodSettings | StreakEstimator
     tracker: TrackerSettings | None
     rate_prior: RatePrior | None
     attitude_prior: AttitudePrior | None
@@ -111,7 +132,7 @@ class FrameFound:
     `objects` are what may be objects; None if they were not looked for, or the attitude is not known.
     """
 
-    motion: Found
+    motion: FrameMotion
     solution: FrameSolution | None
     objects: MeasuredObjects | None = None
 
@@ -158,12 +179,9 @@ def _found(job: FrameJob) -> FrameFound:
     return replace(found, objects=_objects(job, tracker, sky, found.solution, job.objects))
 
 
-def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
-    """Import the two estimators and return them; a worker does so before its first job."""
-    from knightcube.vision.streaks.corners.streak_rate import estimate_rate  # noqa: PLC0415
-    from knightcube.vision.streaks.estimate import estimate_motion  # noqa: PLC0415
-
-    return estimate_motion, estimate_rate
+def prepare() -> None:
+    """Import the estimator; a worker does so before its first job."""
+    from knightcube.vision.streaks import estimate  # noqa: F401, PLC0415
 
 
 def solve_frame(
@@ -225,12 +243,15 @@ def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSoluti
     return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _short_trails(job))
 
 
-def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: Found) -> FrameFound:
+def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
     """Return the attitude of a frame of streaks by the way of the estimator that found their motion."""
-    if isinstance(motion, StreakResult):
-        ends, rate = solve_ends(motion, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
-        return FrameFound(rate, ends)
-    return _from_streaks(job, tracker, sky, motion)
+    if isinstance(motion, MotionResult):
+        return _from_streaks(job, tracker, sky, motion)
+    assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
+    solution, refined = job.estimator.solve(
+        motion, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior
+    )
+    return FrameFound(refined, solution)
 
 
 def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
@@ -273,16 +294,17 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
     return FrameFound(better.motion or motion, better)
 
 
-def _motion(job: FrameJob) -> Found:
-    """Return the motion over the exposure, by the estimator that the job names."""
-    estimate_motion, estimate_rate = prepare()
+def _motion(job: FrameJob) -> FrameMotion:
+    """Return the motion over the exposure, by the estimator of the job."""
+    from knightcube.vision.streaks.estimate import estimate_motion  # noqa: PLC0415
+
     prior = job.rate_prior
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
     if isinstance(estimator, LikelihoodSettings):
         course = prior.course if prior is not None else None
         return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
-    return estimate_rate(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
+    return estimator.motion(job.pixels, lens, job.exposure, rate, sigma, previous)
 
 
 def _objects(
@@ -311,7 +333,7 @@ def _no_motion(job: FrameJob) -> MotionResult:
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
 
 
-def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
+def _shows_no_motion(job: FrameJob, motion: FrameMotion) -> bool:
     """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))

@@ -17,13 +17,12 @@ from matplotlib.figure import Figure
 
 from knightcube.astro import catalogue
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.reference.corner_streaks.detectors import cornerness
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.objects.detect import lengths, olae_residuals, slopes, star_ends
-from knightcube.vision.streaks.corners.detectors import cornerness
-from knightcube.vision.streaks.corners.grouping import centre_of_rotation
-from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from knightcube.vision.objects.streak_ends import centre_of_rotation, measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
 from tests.support.scenes import FIELD, YEAR, slew

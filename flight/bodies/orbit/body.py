@@ -25,6 +25,7 @@ from flight.bodies.orbit.guidance import (
     Sensor,
 )
 from flight.bodies.orbit.view import OrbitView
+from flight.bodies.streak_methods import streak_estimator
 from flight.link.modes import Mode
 from flight.loop.body import Body, BodyControl, BodyEstimation, BodyKind
 from flight.loop.fdir.coil_response import ResponseSettings
@@ -155,7 +156,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     estimation = SatelliteEstimation(config, services, learned)
     control = SatelliteControl(config, estimation, services)
     view = OrbitView(control.field_brake, estimation.orbit_filter, estimation.environment, services)
-    return Body(estimation, control, view)
+    return Body(estimation, control, view, streak_estimator(config.camera))
 
 
 ORBIT = BodyKind(pointing_job.run, make)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from flight.bodies.streak_methods import streak_estimator
 from flight.bodies.testbed.cage import CageField, CageFilter, CageTracker
 from flight.bodies.testbed.control import BdotBrake, ThreadTracker, controller_of
 from flight.bodies.testbed.guidance import Planning, PlanningSettings, Strategy, ThreadTargets, TimedStep
@@ -209,7 +210,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     reader = thread_reader(plant_of(config))
     control = TestbedControl(config, reader, cage, services)
     estimation = TestbedEstimation(config, learned, reader, cage)
-    return Body(estimation, control, ThreadView(reader, control.planning, services))
+    view = ThreadView(reader, control.planning, services)
+    return Body(estimation, control, view, streak_estimator(config.camera))
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:

@@ -21,7 +21,7 @@ from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
-from knightcube.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings
 from knightcube.vision.objects.settings import ObjectMeasurementSettings
 from knightcube.vision.startracker.solve import (
     NODES,
@@ -32,10 +32,9 @@ from knightcube.vision.startracker.solve import (
     middle_covariance,
     weighting_of,
 )
-from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
@@ -73,7 +72,7 @@ class ImagingSettings:
     slow_ns: int
     max_rate: float
     mounting: FloatArray
-    estimator: StreakSettings | LikelihoodSettings
+    estimator: LikelihoodSettings | StreakEstimator
     tracker: TrackerSettings | None
     angular_acceleration_psd: Callable[[int], FloatArray]
     velocity: Callable[[int], FloatArray | None]
@@ -125,7 +124,7 @@ class FrameMeasurer:
             return tracker
         return replace(tracker, solve=replace(tracker.solve, velocity=velocity))
 
-    def _estimator(self, past: Estimate | None) -> StreakSettings | LikelihoodSettings:
+    def _estimator(self, past: Estimate | None) -> LikelihoodSettings | StreakEstimator:
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
             # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
@@ -154,7 +153,7 @@ class FrameMeasurer:
         sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
         return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
 
-    def mean_rate(self, frame: Frame, motion: Found) -> MeanRateMeasurement | None:
+    def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
         """Return the mean body rate over the exposure, None without a rate or without an estimate then."""
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
@@ -171,14 +170,14 @@ class FrameMeasurer:
         quaternion = multiply(conjugate(self._settings.mounting), fix.quaternion)
         return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
 
-    def rate_in_body(self, found: Found | None) -> tuple[FloatArray, FloatArray]:
+    def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
         """Return rate and covariance in body axes; NaN when there is none."""
         if found is None or found.rate is None or found.covariance is None:
             return _NAN
         turn = self._body_to_camera.T
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
-    def _off_middle(self, frame: Frame, motion: Found) -> FloatArray:
+    def _off_middle(self, frame: Frame, motion: FrameMotion) -> FloatArray:
         """Return the covariance (3, 3) rad^2 of the stars' attitude relative to that of mid-exposure."""
         turns = np.zeros((len(NODES), 3))
         middle = self._navigation.past(middle_ns(frame))
@@ -220,7 +219,7 @@ class FrameReport:
         self.accepted = 0
 
     def rate(
-        self, frame: Frame, motion: Found, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
+        self, frame: Frame, motion: FrameMotion, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
     ) -> None:
         """Record the rate from the streaks, and report a rejected rate."""
         self.accepted += accepted
@@ -269,7 +268,9 @@ class FrameReport:
             accepted=int(bool(accepted)),
         )
 
-    def record(self, frame: Frame, status: str, found: Found | None, now_ns: int, accepted: bool) -> None:
+    def record(
+        self, frame: Frame, status: str, found: FrameMotion | None, now_ns: int, accepted: bool
+    ) -> None:
         """Record the streak packet."""
         rate, covariance = self._measurer.rate_in_body(found)
         self._recorder.record(

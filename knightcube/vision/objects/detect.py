@@ -40,7 +40,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
-from knightcube.vision.objects.settings import ObjectSettings
+from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     Explanation,
     StarLight,
@@ -49,14 +49,14 @@ from knightcube.vision.objects.star_light import (
     cut_patch,
     fit_stars,
 )
-from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
-from knightcube.vision.streaks.corners.grouping import centre_of_rotation
-from knightcube.vision.streaks.corners.segmentation import Regions
-from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.corners.streaks import (
+from knightcube.vision.objects.streak_ends import (
+    Regions,
     Segmented,
     Streaks,
+    centre_of_rotation,
+    chord_outward,
     expected_sigma,
+    extend,
     measure_streaks,
     near_border,
     segment_frame,
@@ -214,7 +214,7 @@ def short_regions(
     segmented: Segmented,
     rotation: FloatArray,
     pinhole: Pinhole,
-    settings: StreakSettings,
+    settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return ends (n, 2, 2), errors (n,) px and labels (n,) of bright regions too short for corners.
@@ -325,7 +325,7 @@ class Judge:
     rotation: FloatArray
     pinhole: Pinhole
     exposure: float
-    settings: StreakSettings
+    settings: EndpointSettings
     objects: ObjectSettings
 
     def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
@@ -468,7 +468,7 @@ def detect(
     pinhole: Pinhole,
     rotation: FloatArray,
     exposure: float,
-    settings: StreakSettings,
+    settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> ObjectReport | None:
     """Return the objects of a frame (rows, columns), None when it has too few streaks.
@@ -489,7 +489,7 @@ def examine(
     rotation: FloatArray,
     pinhole: Pinhole,
     exposure: float,
-    settings: StreakSettings,
+    settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> ObjectReport:
     """Return the objects among segmented regions; the camera turns by `rotation` (3,) rad in `exposure` s."""

@@ -22,13 +22,12 @@ from knightcube.astro import catalogue
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.objects.detect import detect
-from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
+from knightcube.vision.objects.settings import EndpointSettings, MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.objects.star_light import spread_over, spread_with_slopes
 from knightcube.vision.startracker.detection import DetectionSettings, FrameKind, survey
 from knightcube.vision.startracker.detection.survey import Areas, Survey
 from knightcube.vision.startracker.sky_map import SkyMap
 from knightcube.vision.startracker.solve import FrameSolution
-from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
@@ -364,7 +363,7 @@ def _among_streaks(
     detection = seen.settings
     if motion.rate is None:
         return _NOTHING
-    streaks = StreakSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
+    streaks = EndpointSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, settings.search)
     if report is None or not report.objects:
         return _NOTHING

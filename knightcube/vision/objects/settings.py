@@ -1,10 +1,61 @@
-"""Settings of the search for objects among the stars, and the objects measured in a frame."""
+"""Settings of the search for objects among the stars and of its streaks, and the objects found in a frame."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from knightcube.astro.arrays import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class EndpointSettings:
+    """How streaks are separated and their ends located; the defaults suit the demonstration's camera.
+
+    Attributes:
+        threshold_sigmas: threshold of the 3 x 3 sum in standard deviations; 0 selects the image's mean, as in
+            the thesis.
+        least_area: minimum number of pixels in a region; a noise peak fills nine pixels of the 3 x 3 sum.
+        most_streaks: maximum number of regions that are measured, strongest first.
+        saturation: counts at which a pixel saturates; None: the maximum of the integer type.
+        gain: electrons per count.
+        smoothing_sigma: px, Gaussian smoothing before the corner detector; 0: none.
+        derivative_sigma: px, of the Gaussian derivative.
+        window_sigma: px, of the window of the structure tensor.
+        harris_k: k of 3.8.
+        peak_relative: minimum cornerness of an endpoint relative to the largest of its streak. The Harris
+            response grows with the fourth power of the brightness, so that 0.005 allows a brightness ratio of
+            3.8 between the ends.
+        intensity_half_width: px, N of 3.15.
+        centre_of: image of which the centre of intensity is computed: the cornerness, or the frame as in the
+            thesis.
+        endpoint_bias: px, outward shift along the streak that compensates the detector, for a given camera:
+            `python -m tests.studies.bench.endpoint_bias`.
+        endpoint_floor: px, error of an endpoint of a bright streak.
+        endpoint_noise: px, error of an endpoint per ratio of noise to counts per px of length.
+        border: px, distance from the frame's border within which streaks are rejected.
+        least_length: px, minimum median length of the streaks.
+        least_streaks: minimum number of streaks.
+    """
+
+    threshold_sigmas: float = 4.5
+    least_area: int = 14
+    most_streaks: int = 30
+    saturation: float | None = None
+    gain: float = 1.0
+    smoothing_sigma: float = 0.0
+    derivative_sigma: float = 1.0
+    window_sigma: float = 1.5
+    harris_k: float = 0.15
+    peak_relative: float = 0.005
+    intensity_half_width: int = 3
+    centre_of: Literal["response", "image"] = "response"
+    endpoint_bias: float = 0.035
+    endpoint_floor: float = 0.03
+    endpoint_noise: float = 4.2
+    border: int = 6
+    least_length: float = 20.0
+    least_streaks: int = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
-from knightcube.vision.streaks.corners.segmentation import Regions
-from knightcube.vision.streaks.corners.streaks import Segmented
+from knightcube.vision.objects.streak_ends import Regions, Segmented
 
 # Star paths along a region are tried at every eighth of a path; a longer chain of stars is a rarity.
 _PATHS_PER_LENGTH = 8

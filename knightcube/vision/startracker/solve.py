@@ -40,7 +40,7 @@ from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, ap
 from knightcube.vision.startracker.verification import expected_stars, track
 from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 
 class SolveStatus(Enum):
@@ -140,7 +140,7 @@ MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
 """Streaks fitted with an acceleration: the middle of the parabola that fits the motion best."""
 
 
-def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
+def weighting_of(motion: FrameMotion) -> Weighting:
     """Return the weighting of a frame with this motion."""
     if motion.status not in MOVED:
         return MEAN

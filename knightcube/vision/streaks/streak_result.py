@@ -86,17 +86,6 @@ class FrameMotion:
 
 
 @dataclass(frozen=True, slots=True)
-class StreakResult(FrameMotion):
-    """The motion by corner detectors.
-
-    Attributes:
-        sigma: (found,) px, expected error of an endpoint, small for the bright.
-    """
-
-    sigma: FloatArray = field(default_factory=no_rows())
-
-
-@dataclass(frozen=True, slots=True)
 class MotionResult(FrameMotion):
     """The motion of one exposure and the stars; the rate is that at mid-exposure.
 

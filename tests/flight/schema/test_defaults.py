@@ -60,6 +60,7 @@ OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
     "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
     "EdgeSettings": "horizon cameras",
+    "EndpointSettings": "limits of the method; gain and saturation come from the star tracker's settings",
     "HorizonSettings": "horizon cameras",
     "FreeFilterSettings": "slow noises of a satellite's torques; the rest is compared as OrbitFilterSettings",
     "IdentificationSettings": "limits of the method",

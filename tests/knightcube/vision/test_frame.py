@@ -20,7 +20,7 @@ from knightcube.vision.frame import (
     label_pixels,
     saturation_level,
 )
-from tests.knightcube.vision.streaks.frames import rate_at, star_camera, star_frame
+from tests.support.streak_frames import rate_at, star_camera, star_frame
 
 
 def test_a_sloping_background_is_followed_within_its_sampling_error() -> None:

@@ -13,7 +13,9 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
 from knightcube.errors import InputError
-from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
+from knightcube.reference.corner_streaks.estimator import CornerEstimator
+from knightcube.reference.corner_streaks.settings import StreakResult, StreakSettings
+from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings, run
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.solve import (
     AttitudePrior,
@@ -23,14 +25,16 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.streaks.corners.settings import StreakSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from tests.flight.loop.executive.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))
-_ESTIMATORS = [LikelihoodSettings(saturation=65_535), StreakSettings()]
+_ESTIMATORS: list[LikelihoodSettings | StreakEstimator] = [
+    LikelihoodSettings(saturation=65_535),
+    CornerEstimator(StreakSettings()),
+]
 # rad, whole angle: the turn about the boresight, ten times the worst, within a pixel at the frame's corner.
 _RIGHT = 1.0 / NARROW.pinhole.half_diagonal / NARROW.pinhole.focal_length
 
@@ -40,7 +44,7 @@ def _frame(streak_px: float) -> SkyFrame:
     return sky_frame(np.random.default_rng(41), streak_px, 0.5)
 
 
-def _job(frame: SkyFrame, estimator: StreakSettings | LikelihoodSettings) -> FrameJob:
+def _job(frame: SkyFrame, estimator: LikelihoodSettings | StreakEstimator) -> FrameJob:
     rate = RatePrior(frame.rate, 1e-5)
     return FrameJob(frame.pixels, NARROW.pinhole, frame.exposure, estimator, _TRACKER, rate, None, None)
 
@@ -60,7 +64,7 @@ def _assert_right(solution: FrameSolution | None, truth: FloatArray) -> None:
 @pytest.mark.parametrize("streak_px", [0.0, 40.0], ids=["at rest", "streaks"])
 @pytest.mark.parametrize("known", [False, True], ids=["lost", "prior"])
 def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost(
-    estimator: StreakSettings | LikelihoodSettings, streak_px: float, known: bool
+    estimator: LikelihoodSettings | StreakEstimator, streak_px: float, known: bool
 ) -> None:
     frame = _frame(streak_px)
     found = run(replace(_job(frame, estimator), attitude_prior=_prior(frame) if known else None))
@@ -77,7 +81,7 @@ def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
 def test_a_streaked_frame_without_a_known_rate_is_solved_all_the_same(
-    estimator: StreakSettings | LikelihoodSettings,
+    estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     """The direction of time is in doubt, the middle of the exposure is not."""
     frame = _frame(40.0)
@@ -100,7 +104,7 @@ def test_a_wrong_prior_is_not_believed() -> None:
     ("level", "status"), [(0, StreakStatus.BLACK), (65_535, StreakStatus.SATURATED)], ids=["black", "white"]
 )
 def test_a_frame_that_shows_nothing_gives_neither(
-    estimator: StreakSettings | LikelihoodSettings, level: int, status: StreakStatus
+    estimator: LikelihoodSettings | StreakEstimator, level: int, status: StreakStatus
 ) -> None:
     job = _job(_frame(0.0), estimator)
     found = run(replace(job, pixels=np.full_like(job.pixels, level)))
@@ -110,7 +114,7 @@ def test_a_frame_that_shows_nothing_gives_neither(
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
 def test_the_same_pixels_again_are_a_frozen_camera_and_no_second_attitude(
-    estimator: StreakSettings | LikelihoodSettings,
+    estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     job = _job(_frame(0.0), estimator)
     again = run(replace(job, previous_checksum=run(replace(job, tracker=None)).motion.checksum))
@@ -120,7 +124,7 @@ def test_the_same_pixels_again_are_a_frozen_camera_and_no_second_attitude(
 
 @pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
 def test_without_a_tracker_there_is_the_same_motion_and_no_attitude(
-    estimator: StreakSettings | LikelihoodSettings,
+    estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
     frame = _frame(40.0)
     found = run(replace(_job(frame, estimator), tracker=None))

@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
-from tests.knightcube.vision.streaks.frames import (
+from knightcube.reference.corner_streaks.detectors import cornerness
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
+from tests.support.streak_frames import (
     Camera,
     expose,
     random_stars,
@@ -68,7 +69,7 @@ def endpoint_errors(
         directions, magnitudes = random_stars(rng, camera.pinhole, 0.05, 7.5)
         electrons = expose(camera, directions, magnitudes, rotation, _EXPOSURE)
         pixels = read_out(camera, electrons, _EXPOSURE, rng)
-        streaks = measure_streaks(segment_frame(pixels, settings), settings)
+        streaks = measure_streaks(segment_frame(pixels, settings), settings, cornerness)
         rows.append(_compare(streaks.endpoints, streaks.sigma, true_endpoints(camera, directions, rotation)))
     return EndpointErrors(*np.concatenate(rows).T)
 

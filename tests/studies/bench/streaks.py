@@ -2,7 +2,7 @@
 
 `python -m tests.studies.bench streaks`: the maximum-likelihood estimator, the thesis's pipeline with each of
 its four detectors, and OpenCV's line segment detector and Hough transform with the thesis's robust rotation
-fit (`knightcube.vision.streaks.corners.rate_fit`) behind them, their constant endpoint bias measured on other
+fit (`knightcube.reference.corner_streaks.rate`) behind them, their constant endpoint bias measured on other
 frames and taken off as the four detectors' is. Frames of the real sky, theta uniform over the range asked
 for, a turn in percent of
 the field (3.28). Errors are rms over the frames that gave a rate; a ratio is the rms of error over
@@ -26,11 +26,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
+from knightcube.reference.corner_streaks import rate as streak_rate
+from knightcube.reference.corner_streaks.rate import RotationFit, fit_rotation
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, DetectorName, StreakSettings
 from knightcube.vision.camera.lens import EXACT
-from knightcube.vision.streaks.corners import streak_rate
-from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
-from knightcube.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
-from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.objects.streak_ends import chord_outward, extend
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
@@ -89,7 +89,7 @@ def by_likelihood(scene: Scene, camera: StarCameraModel) -> Sighting:
 def by_corners(detector: DetectorName, scene: Scene, camera: StarCameraModel) -> Sighting:
     """Return what the thesis's pipeline sees with one of its detectors."""
     settings = StreakSettings.of(detector, saturation=float(camera.highest_count), gain=camera.gain)
-    with clocked(_module_of(streak_rate.estimate_rate), "knightcube.vision.streaks") as stages:
+    with clocked(_module_of(streak_rate.estimate_rate), "knightcube.reference.corner_streaks") as stages:
         found = streak_rate.estimate_rate(
             scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0
         )
@@ -151,7 +151,7 @@ class ByLines:
 
     @staticmethod
     def _unfit(fit: RotationFit, focal_length: float, settings: StreakSettings) -> bool:
-        """Tell whether `streak_rate` would refuse: no shared rotation, or too short streaks."""
+        """Tell whether `estimate_rate` would refuse: no shared rotation, or too short streaks."""
         used = fit.endpoints[fit.used]
         length = float(np.median(np.linalg.norm(used[:, 1] - used[:, 0], axis=-1)))
         return fit.residual * focal_length > settings.worst_residual or length < settings.least_length

@@ -18,11 +18,11 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.camera.lens import EXACT
 from knightcube.vision.objects.detect import ObjectReport, detect
 from knightcube.vision.objects.settings import ObjectSettings
-from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus

@@ -17,10 +17,10 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import FlightError
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.reference.corner_streaks.two_ends import attitudes_of_ends
 from knightcube.vision.camera.lens import EXACT
-from knightcube.vision.startracker.two_ends import attitudes_of_ends
-from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus

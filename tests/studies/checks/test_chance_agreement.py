@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks.corners.settings import DetectorName, StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import DetectorName, StreakSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.streaks import EXPOSURE

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image as Picture
 
-from knightcube.vision.streaks.corners.settings import StreakSettings
-from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from knightcube.reference.corner_streaks.settings import StreakSettings
+from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies import source_pictures
 from tests.studies.campaigns.rso import draw_sky

@@ -27,7 +27,7 @@ from hal.drivers.ublox import NAV_PVT, Pvt, StreamParser, frame, reading_of, unp
 from hal.interfaces.errors import DeviceError, OutOfRange
 from knightcube.errors import FlightError
 from knightcube.vision.frame_job import FrameFound
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 from tests.manual_clock import ManualClock
 from tests.studies.fuzz.door import Door, DoorTarget, Files
 from tests.studies.fuzz.harness import Finding
@@ -232,7 +232,7 @@ def workers() -> DoorTarget:
         {"path": np.linspace(0.0, 1.0, 50), "cost": 1.5},
         [(1, "two", None)],
         (np.float64(2.0), np.arange(6, dtype=np.int16).reshape(2, 3), True),
-        ("done", FrameFound(StreakResult(StreakStatus.BLACK, 1, 0.5), None), "", 7),
+        ("done", FrameFound(FrameMotion(StreakStatus.BLACK, 1, 0.5), None), "", 7),
     )
     examples = [{"message": pack_values(value, slab)} for value in values]
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.olae import gain, rotation_between
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, to_rotation_vector
-from tests.knightcube.vision.streaks.frames import rotate, star_camera
+from tests.support.streak_frames import rotate, star_camera
 
 _PINHOLE = star_camera().pinhole
 

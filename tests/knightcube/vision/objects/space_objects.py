@@ -6,7 +6,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
-from tests.knightcube.vision.streaks.frames import Camera, deposit, expose, random_stars, read_out
+from tests.support.streak_frames import Camera, deposit, expose, random_stars, read_out
 
 _STEPS = 801
 

@@ -30,8 +30,7 @@ from knightcube.vision.objects.detect import (
     slopes,
     star_ends,
 )
-from knightcube.vision.objects.settings import ObjectSettings
-from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
@@ -45,7 +44,7 @@ from tests.knightcube.vision.objects.space_objects import (
     star_field,
 )
 from tests.knightcube.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
-from tests.knightcube.vision.streaks.frames import expose, rate_at, read_out, star_camera, true_endpoints
+from tests.support.streak_frames import expose, rate_at, read_out, star_camera, true_endpoints
 
 _CAMERA = star_camera()
 _PINHOLE = _CAMERA.pinhole
@@ -171,7 +170,7 @@ def test_no_streaks_give_no_indicators() -> None:
 
 _FRAME_CAMERA = star_camera(512)
 _FOCAL = _FRAME_CAMERA.pinhole.focal_length
-_SETTINGS = StreakSettings(saturation=_FRAME_CAMERA.full_well)
+_SETTINGS = EndpointSettings(saturation=_FRAME_CAMERA.full_well)
 _ROTATION = rate_at(np.deg2rad(60.0), 55.0 / _FOCAL, 0.4)
 _PLACE = _FRAME_CAMERA.pinhole.unit_vectors(np.array([[270.0, 230.0]]))[0]
 _FAINTEST = 6.0

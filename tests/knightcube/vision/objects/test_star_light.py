@@ -13,7 +13,7 @@ from knightcube.vision.objects.star_light import (
     spread_with_slopes,
     straight_path,
 )
-from tests.knightcube.vision.streaks.frames import deposit, rate_at, rotate, star_camera
+from tests.support.streak_frames import deposit, rate_at, rotate, star_camera
 
 _CAMERA = star_camera(512)
 _ROTATION = rate_at(np.deg2rad(90.0), 50.0 / _CAMERA.pinhole.focal_length)

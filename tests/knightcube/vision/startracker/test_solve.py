@@ -38,7 +38,7 @@ from knightcube.vision.startracker.solve import (
     solve_places,
     weighting_of,
 )
-from knightcube.vision.streaks.streak_result import MotionResult, StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.sky import ARCSECONDS, photograph
 from tests.support.attitude_errors import attitude_error
@@ -255,8 +255,8 @@ def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) 
 
 def test_the_kind_of_motion_tells_how_the_attitude_comes_about() -> None:
     rest, moved = StreakStatus.TOO_SHORT, StreakStatus.RATE
-    assert weighting_of(StreakResult(rest, 0, 1.0)) is MEAN
+    assert weighting_of(FrameMotion(rest, 0, 1.0)) is MEAN
     assert weighting_of(MotionResult(rest, 0, 1.0)) is MEAN
-    assert weighting_of(StreakResult(moved, 0, 1.0)) is ENDS
+    assert weighting_of(FrameMotion(moved, 0, 1.0)) is ENDS
     assert weighting_of(MotionResult(StreakStatus.AMBIGUOUS, 0, 1.0)) is ENDS
     assert weighting_of(MotionResult(moved, 0, 1.0, rate_model="accelerating")) is MIDDLE

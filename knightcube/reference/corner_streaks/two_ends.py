@@ -1,11 +1,11 @@
-"""The attitudes at both ends of the streaks, and the rate between them: the thesis's method (3.22-3.29).
+"""The attitudes at both ends of an exposure and the rate between them: the thesis's method (3.22-3.29).
 
-The streaks' ends come from corner detectors. Their middles, which a constant bias of the ends does not move,
-are identified. The first ends then give the attitude at the start of the exposure and the second ends that at
-its end, each by ESOQ2; the turn between them over the exposure is the mean rate. The sign: a star fixed in
-the sky moves with v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T x]) and the axis is that
-of Delta^T - Delta (3.24, 3.26 and 3.27 corrected). The angle comes from the quaternion, not from an arc
-cosine of the trace (3.25), which loses half of all digits at small angles.
+The middles of the streaks, which a constant bias of the ends does not move, are identified. The first ends
+then give the attitude at the start of the exposure and the second ends the attitude at its end, each by
+ESOQ2. The rotation between the two over the exposure is the mean rate. A star fixed in the sky moves with
+v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T x]) and the axis is that of Delta^T - Delta
+(3.24, 3.26 and 3.27 corrected). The angle is taken from the quaternion, because the arc cosine of the trace
+(3.25) loses half of the digits at small angles.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import FlightError
+from knightcube.reference.corner_streaks.settings import StreakResult
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.startracker.detection import FrameKind
 from knightcube.vision.startracker.index.sky_index import SkyIndex
@@ -36,9 +37,8 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_places,
 )
-from knightcube.vision.streaks.streak_result import StreakResult
 
-# px, of an endpoint: a residual below is luck of few streaks, not precision.
+# Minimum error (px) of an endpoint; smaller residuals are chance agreement of few streaks.
 _LEAST_SIGMA_PX = 0.02
 
 
@@ -47,11 +47,11 @@ class TwoAttitudes:
     """The attitudes at the two ends of one exposure and the mean rate between them.
 
     Attributes:
-        start, end: of the camera, reference into camera.
-        rotation_vector: (3,) rad, camera frame: principal axis times principal angle (3.25, 3.26).
-        rate: (3,) rad/s, camera frame, of the camera with respect to the stars (3.27 with R_cam the
-            identity).
-        covariance: (3, 3) rad^2/s^2 of `rate`, the errors of the two ends being independent.
+        start: attitude at the start, reference frame into camera axes.
+        end: attitude at the end.
+        rotation_vector: (3,) rad, camera axes: principal axis times principal angle (3.25, 3.26).
+        rate: (3,) rad/s, camera axes, of the camera with respect to the stars (3.27 with identity R_cam).
+        covariance: (3, 3) rad^2/s^2 of `rate`, for independent errors of the two ends.
     """
 
     start: AttitudeFix
@@ -67,13 +67,13 @@ def attitudes_of_ends(
     """Return attitudes and rate from identified streaks.
 
     Args:
-        endpoints: (n, 2, 2) px, streak, end, (x, y); all first ends simultaneous and earlier, without bias.
-        reference: (n, 3) unit vectors of the streaks' stars, in the frame that the attitudes are wanted of.
+        endpoints: (n, 2, 2) px, streak, end, (x, y), without bias; the first ends are the earlier ones.
+        reference: (n, 3) unit vectors of the streaks' stars, in the reference frame of the attitudes.
         sigma: (n,) px, error of an endpoint.
         pinhole: the camera.
         exposure: s.
 
-    Raises AttitudeError when the stars do not fix an attitude, FlightError for an impossible exposure.
+    Raises AttitudeError if the stars do not determine an attitude, FlightError for an invalid exposure.
     """
     if not (np.isfinite(exposure) and exposure > 0.0):
         raise FlightError(f"exposure of {exposure} s: must be finite and positive")
@@ -83,10 +83,10 @@ def attitudes_of_ends(
     end = SOLVERS["esoq2"](vectors[:, 1], reference, errors)
     turn = multiply(end.quaternion, conjugate(start.quaternion))
     rotation = to_rotation_vector(turn)
-    # The start's error is seen from the end's axes; both then turn the rotation vector.
-    carried = attitude_matrix(turn)
+    # The error at the start is rotated into the axes at the end; both errors then change the rotation vector.
+    propagated = attitude_matrix(turn)
     jacobian = _turn_to_vector(rotation)
-    covariance = jacobian @ (end.covariance + carried @ start.covariance @ carried.T) @ jacobian.T
+    covariance = jacobian @ (end.covariance + propagated @ start.covariance @ propagated.T) @ jacobian.T
     return TwoAttitudes(start, end, rotation, rotation / exposure, covariance / exposure**2)
 
 
@@ -100,8 +100,8 @@ def solve_ends(
 ) -> tuple[FrameSolution, StreakResult]:
     """Return the attitude at mid-exposure, and `found` with the rate between the attitudes of its ends.
 
-    Where the streaks cannot be identified `found` is returned unchanged. The rate's covariance is kept in any
-    case: it is from the same ends, and the fit without names separated their errors along and across.
+    If the streaks cannot be identified, `found` is returned unchanged. The covariance of the rate is not
+    changed: it comes from the same ends, with separate errors along and across the streaks.
     """
     ends, sigma = _brightest_first(found, camera)
     covariance = 0.5 * sigma[:, None, None] ** 2 * np.eye(2)
@@ -130,18 +130,17 @@ def solve_ends(
 
 
 def _turn_to_vector(rotation: FloatArray) -> FloatArray:
-    """Return d(rotation vector)/d(small turn after it), (3, 3): the inverse right Jacobian of rotations."""
+    """Return the derivatives (3, 3) of the rotation vector with respect to a small rotation after it."""
     angle = float(np.linalg.norm(rotation))
     cross = cross_matrices(rotation[None])[0]
-    # Both terms of the second coefficient run to infinity at zero, where it is 1/12.
+    # Both terms of the coefficient diverge at zero, where it is 1/12.
     second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
     return np.asarray(np.eye(3) + 0.5 * cross + second * cross @ cross)
 
 
 def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return the ends (n, 2, 2) px of the streaks used, and their errors (n,) px by the residuals."""
+    """Return ends (n, 2, 2) px and errors (n,) px of the streaks used, in order of increasing error."""
     used = np.flatnonzero(found.used)
-    # The brightest have the least errors.
     used = used[np.argsort(found.sigma[used], kind="stable")]
     sigma = found.sigma[used]
     if len(used):
@@ -151,10 +150,10 @@ def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArr
 
 
 def _scatter(both: TwoAttitudes, count: int) -> float:
-    """Return the variance that the residuals of `count` stars at both ends show, over the assumed one.
+    """Return the ratio of the residuals' variance to the assumed one, for `count` stars.
 
-    Each end has two components a star and lost three to its attitude; widened by nu/(nu - 2) for the scale's
-    own uncertainty (Student).
+    Each end has two components per star and three parameters of its attitude. The ratio is widened by
+    nu/(nu - 2) for its own uncertainty (Student).
     """
     freedom = 4 * count - 6
     squares = 2.0 * (both.start.loss + both.end.loss)

@@ -6,11 +6,21 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.corners.trajkovic import (
+from knightcube.reference.corner_streaks.detectors import (
+    cornerness,
     interpixel_response,
+    minimum_eigenvalue,
     simple_response,
     trajkovic_response,
 )
+from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.objects.streak_ends import (
+    chord_outward,
+    extend,
+    find_corners,
+    structure_tensor,
+)
+from tests.support.streak_frames import expose, star_camera, true_endpoints
 
 # Names of the ring around the centre c: rows are y, columns x.
 #   f b g        b is at (x, y - 1), a at (x + 1, y)
@@ -123,3 +133,102 @@ def test_a_threshold_hides_weak_corners_and_lets_strong_ones_through() -> None:
 def test_odd_sizes_keep_their_shape() -> None:
     image = np.random.default_rng(63).normal(size=(13, 8))
     assert trajkovic_response(image, 4, 0.1, 0.1).shape == (13, 8)
+
+
+def test_the_smaller_eigenvalue_is_numpys_of_the_summed_tensor() -> None:
+    image = np.random.default_rng(4).normal(size=(20, 20))
+    tensor = structure_tensor(image, 1.0, 1.5)
+    matrices = np.stack([np.stack([tensor.xx, tensor.xy], -1), np.stack([tensor.xy, tensor.yy], -1)], -2)
+    np.testing.assert_allclose(minimum_eigenvalue(tensor), np.linalg.eigvalsh(matrices)[..., 0], rtol=1e-9)
+
+
+def test_the_smaller_eigenvalue_vanishes_on_an_edge_and_in_the_flat() -> None:
+    image = np.zeros((40, 40))
+    image[20:] = 1.0
+    response = minimum_eigenvalue(structure_tensor(image, 1.0, 1.5))
+    np.testing.assert_allclose(response, 0.0, atol=1e-15)
+    image[:, :20] = 0.0
+    corner = minimum_eigenvalue(structure_tensor(image, 1.0, 1.5))
+    assert corner[20, 20] > 1e-3
+    assert corner[20, 20] > 10.0 * corner[20, 35]
+
+
+def _corners(image: FloatArray, settings: StreakSettings) -> FloatArray:
+    response = cornerness(image, settings)
+    intensity = response if settings.centre_of == "response" else image
+    return find_corners(
+        response, image > 1.0, settings.peak_relative, settings.intensity_half_width, intensity
+    )
+
+
+def _streak(roll: float, length: float = 40.0) -> tuple[FloatArray, FloatArray]:
+    """Return the noiseless image of one streak and its true ends (2, 2)."""
+    camera = star_camera(128)
+    rotation = length / camera.pinhole.focal_length * np.array([np.sin(roll), np.cos(roll), 0.0])
+    star = camera.pinhole.unit_vectors(np.array([[63.2, 64.6]]))
+    image = expose(camera, star, np.array([3.0]), rotation, 1.0)
+    return image, true_endpoints(camera, star, rotation)[0]
+
+
+# Trajkovic's neighbours see slanting streaks otherwise than straight ones: no constant takes that away.
+_TOLERANCE: dict[DetectorName, float] = {
+    "harris": 0.1,
+    "minimum-eigenvalue": 0.1,
+    "trajkovic-4": 0.7,
+    "trajkovic-8": 0.3,
+}
+
+
+_ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
+
+
+# Four neighbours take a streak near the diagonals for a row of corners, and it is refused.
+_TOO_SLANTED = [0.8, 2.5]
+
+
+@pytest.mark.parametrize(
+    ("detector", "roll"),
+    [
+        (detector, roll)
+        for detector in DETECTOR_NAMES
+        for roll in _ROLLS
+        if detector != "trajkovic-4" or roll not in _TOO_SLANTED
+    ],
+)
+def test_a_noiseless_streaks_ends_are_found_in_every_direction(detector: DetectorName, roll: float) -> None:
+    settings = StreakSettings.of(detector)
+    image, truth = _streak(roll)
+    ends = _corners(image, settings)
+    moved = extend(ends[None], chord_outward(ends[None]), settings.endpoint_bias)[0]
+    error = min(np.abs(moved - truth).max(), np.abs(moved[::-1] - truth).max())
+    assert error < _TOLERANCE[detector]
+
+
+@pytest.mark.parametrize("detector", DETECTOR_NAMES)
+def test_without_its_constant_each_detector_is_biased_inward_by_it(detector: DetectorName) -> None:
+    settings = StreakSettings.of(detector)
+    image, truth = _streak(0.0)
+    found = np.linalg.norm(np.diff(_corners(image, settings), axis=0))
+    shorter = float(np.linalg.norm(truth[1] - truth[0]) - found)
+    assert shorter == pytest.approx(2.0 * settings.endpoint_bias, abs=2.0 * _TOLERANCE[detector])
+    if detector != "harris":
+        assert shorter > 0.5
+
+
+@pytest.mark.parametrize("detector", DETECTOR_NAMES)
+def test_a_crossing_of_two_streaks_has_not_two_corners(detector: DetectorName) -> None:
+    """Four ends, or for Trajkovic-4, whose response grows with brightness, the crossing alone."""
+    crossing = _streak(0.0)[0] + _streak(0.5 * np.pi)[0]
+    assert len(_corners(crossing, StreakSettings.of(detector))) != 2
+
+
+@pytest.mark.parametrize("roll", _TOO_SLANTED)
+def test_trajkovic_4_refuses_a_streak_near_a_diagonal(roll: float) -> None:
+    assert len(_corners(_streak(roll)[0], StreakSettings.of("trajkovic-4"))) > 2
+
+
+def test_the_centre_of_intensity_of_the_image_lies_far_inside_the_streak() -> None:
+    """The thesis's own localisation: streaks.md has 2.2 px for 7 x 7 pixels."""
+    image, truth = _streak(0.0)
+    found = np.linalg.norm(np.diff(_corners(image, StreakSettings(centre_of="image")), axis=0))
+    assert 1.5 < 0.5 * (np.linalg.norm(truth[1] - truth[0]) - found) < 2.5

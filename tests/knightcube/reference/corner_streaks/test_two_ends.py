@@ -22,24 +22,24 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.errors import FlightError
+from knightcube.reference.corner_streaks.rate import estimate_rate
+from knightcube.reference.corner_streaks.settings import DetectorName, StreakResult, StreakSettings
+from knightcube.reference.corner_streaks.two_ends import attitudes_of_ends, solve_ends
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, SolveStatus
-from knightcube.vision.startracker.two_ends import attitudes_of_ends, solve_ends
-from knightcube.vision.streaks.corners.settings import DetectorName, StreakSettings
-from knightcube.vision.streaks.corners.streak_rate import estimate_rate
-from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from knightcube.vision.streaks.streak_result import StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
-from tests.knightcube.vision.streaks.frames import (
+from tests.support.attitude_errors import (
+    attitude_error,
+    error_in_pixels,
+    field_fraction,
+)
+from tests.support.streak_frames import (
     expose,
     random_stars,
     rate_at,
     read_out,
     star_camera,
     true_endpoints,
-)
-from tests.support.attitude_errors import (
-    attitude_error,
-    error_in_pixels,
-    field_fraction,
 )
 
 _EXPOSURE = 0.5

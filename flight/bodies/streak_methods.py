@@ -1,0 +1,19 @@
+"""The methods for streaks, other than maximum likelihood, that a configuration selects for comparison."""
+
+from __future__ import annotations
+
+from flight.schema.devices import Camera
+from knightcube.vision.frame_job import StreakEstimator
+
+
+def streak_estimator(camera: Camera | None) -> StreakEstimator | None:
+    """Return the configured estimator by corner detectors, None without one."""
+    if camera is None or camera.estimator == "likelihood":
+        return None
+    from knightcube.reference.corner_streaks.estimator import CornerEstimator  # noqa: PLC0415 - seldom needed
+    from knightcube.reference.corner_streaks.settings import StreakSettings  # noqa: PLC0415
+
+    saturation = camera.saturation or float(2**camera.bits - 1)
+    bias = {} if camera.endpoint_bias is None else {"endpoint_bias": camera.endpoint_bias}
+    settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain, **bias)
+    return CornerEstimator(settings)

@@ -1,0 +1,309 @@
+"""The mean rate over one exposure from the ends of its streaks: Sease chapters 3 and 4, corrected.
+
+The ends of the streaks come in no order. Every star rotates about one axis a, so that a.(v2 - v1) = 0 for
+each streak: the axis is the direction most nearly normal to all chords, up to its sign, and the sign of
+a.(v1 x v2) then orders each pair of ends (3.17-3.19 corrected). Unlike the projected centre of rotation, the
+vectors have no singular case. OLAE gives the rotation, and a median-based scale of its residuals rejects
+outliers (the thesis's "Combined Indicator" uses the standard deviation, which outliers widen). One frame does
+not distinguish omega from -omega; a prior decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.attitude.olae import OlaeSolution, gain, rotation_between
+from knightcube.astro.directions import cross_matrices
+from knightcube.reference.corner_streaks.detectors import cornerness
+from knightcube.reference.corner_streaks.settings import StreakResult, StreakSettings
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.frame import MAD_TO_SIGMA, saturation_level
+from knightcube.vision.objects.streak_ends import (
+    Regions,
+    Streaks,
+    chord_outward,
+    extend,
+    measure_streaks,
+    segment_frame,
+)
+from knightcube.vision.streaks.streak_result import StreakStatus, admit, in_time, validate
+
+# Number of the strongest streaks whose pairs propose axes.
+_MOST_PROPOSERS = 24
+_PARALLEL = 1e-12
+# Minimum fraction of the measured streaks that agree on one rotation.
+_LEAST_AGREEMENT = 0.5
+# Minimum robust scale of the residuals, relative to the expected errors.
+_LEAST_SCALE = 0.3
+_MOST_ROUNDS = 10
+
+
+def estimate_rate(
+    pixels: Image,
+    pinhole: Pinhole,
+    exposure: float,
+    settings: StreakSettings,
+    prior_rate: FloatArray | None = None,
+    prior_sigma: float = 0.0,
+    previous_checksum: int | None = None,
+) -> StreakResult:
+    """Return the mean rate over one exposure from the star streaks in `pixels`.
+
+    Args:
+        pixels: (rows, columns) raw counts, of an unsigned integer type.
+        pinhole: camera, of the same shape.
+        exposure: exposure time, s.
+        settings: thresholds, kernels, compensation.
+        prior_rate: (3,) rad/s, camera axes; determines only the sense of rotation. None: unknown.
+        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
+        previous_checksum: checksum of the previous frame; equal pixels indicate a frozen camera.
+
+    Raises FlightError for an invalid frame, exposure or prior. The status of the result tells why a frame has
+    no rate.
+    """
+    validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    saturation = saturation_level(pixels, settings.saturation)
+    checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
+    if unusable is not None:
+        return StreakResult(unusable, checksum, exposure)
+    segmented = segment_frame(pixels, settings)
+    seen = StreakResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=segmented.hot_pixels)
+    streaks = measure_streaks(segmented, settings, cornerness)
+    result = _rate(streaks, pinhole, exposure, settings, seen)
+    if result.rate is not None:
+        return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
+    typical = _typical_length(segmented.regions, settings)
+    if typical < settings.least_length:
+        # The stars are nearly at rest, and the apparent streaks are blends.
+        return replace(result, status=StreakStatus.TOO_SHORT, length=typical)
+    return result
+
+
+def _rate(
+    streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
+) -> StreakResult:
+    """Return `seen` with the rate of the streaks, up to its sign, or with the reason for its absence."""
+    seen = replace(
+        seen,
+        endpoints=streaks.endpoints,
+        sigma=streaks.sigma,
+        used=np.zeros(len(streaks), dtype=np.bool_),
+        length=float(np.median(streaks.lengths)) if len(streaks) else float("nan"),
+    )
+    if len(streaks) < settings.least_streaks:
+        return replace(seen, status=StreakStatus.TOO_FEW)
+    fit = fit_rotation(streaks.endpoints, streaks.sigma, pinhole, settings)
+    if fit is None or fit.residual * pinhole.focal_length > settings.worst_residual:
+        return seen
+    ends = fit.endpoints[fit.used]
+    length = float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)))
+    if length < settings.least_length:
+        return replace(seen, status=StreakStatus.TOO_SHORT, length=length)
+    return replace(
+        seen,
+        status=StreakStatus.AMBIGUOUS,
+        length=length,
+        endpoints=fit.endpoints,
+        used=fit.used,
+        rate=fit.rotation_vector / exposure,
+        covariance=fit.covariance / exposure**2,
+        residual=fit.residual,
+    )
+
+
+def _typical_length(regions: Regions, settings: StreakSettings) -> float:
+    """Return the median length (px) of the brightest regions, infinity for too few regions."""
+    if len(regions) < settings.least_streaks:
+        return float("inf")
+    brightest = np.argsort(-regions.flux, kind="stable")[: settings.most_streaks]
+    return float(np.median(regions.length[brightest]))
+
+
+def rotation_axis(
+    first: FloatArray, second: FloatArray, tolerance: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the axis (3,) of arbitrary sign that most streaks agree on, and which streaks (n,) agree.
+
+    Pairs of streaks propose axes, and least squares over the streaks that agree refines the best one. Fewer
+    than about half of the streaks may be outliers. The result is deterministic.
+
+    Args:
+        first: (n, 3) unit vectors of one end of each streak, strongest streaks first.
+        second: (n, 3) unit vectors of the other end.
+        tolerance: (n,) rad, error allowed in the direction of each chord.
+
+    Raises ValueError for fewer than two streaks.
+    """
+    if len(first) < 2:
+        raise ValueError(f"an axis needs two streaks or more, not {len(first)}")
+    chord = second - first
+    chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
+    i, j = np.triu_indices(min(len(chord), _MOST_PROPOSERS), k=1)
+    proposal = np.cross(chord[i], chord[j])
+    size = np.linalg.norm(proposal, axis=-1, keepdims=True)
+    proposal = proposal / np.maximum(size, _PARALLEL)
+    missed = np.minimum((proposal @ chord.T / tolerance) ** 2, 1.0).sum(axis=-1)
+    # The null vector of parallel chords would agree with everything.
+    missed[size[:, 0] < _PARALLEL] = np.inf
+    axis = proposal[np.argmin(missed)]
+    for _ in range(3):
+        agree = np.abs(chord @ axis) <= tolerance
+        if np.count_nonzero(agree) < 2:
+            break
+        axis = np.linalg.svd(chord[agree] / tolerance[agree, None])[2][-1]
+    return axis, np.asarray(np.abs(chord @ axis) <= tolerance)
+
+
+def rotation_angles(first: FloatArray, second: FloatArray, axis: FloatArray) -> FloatArray:
+    """Return the angles (n,) rad of the rotations about `axis` from `first` to `second`, both (n, 3).
+
+    The sign is that of axis.(v1 x v2), 3.19 corrected: streaks of one sign have the same order of ends.
+    """
+    sine = np.cross(first, second) @ axis
+    cosine = np.sum(first * second, axis=-1) - (first @ axis) * (second @ axis)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+@dataclass(frozen=True, slots=True)
+class RotationFit:
+    """The rotation of the camera over one exposure, up to the direction of time.
+
+    Attributes:
+        rotation_vector: (3,) rad, camera axes, from the first ends to the second ends.
+        covariance: (3, 3) rad^2.
+        endpoints: (n, 2, 2) px, compensated; all first ends are simultaneous, and all second ends.
+        used: (n,) which streaks determine the rotation.
+        residual: rad, rms error of one end according to the residuals (4.7) of the streaks used.
+    """
+
+    rotation_vector: FloatArray
+    covariance: FloatArray
+    endpoints: FloatArray
+    used: BoolArray
+    residual: float
+
+
+def fit_rotation(
+    raw: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
+) -> RotationFit | None:
+    """Return the rotation that most streaks share, None if fewer than half or `least_streaks` agree.
+
+    `raw` (n, 2, 2) px are endpoints without compensation, strongest streak first; `sigma` (n,) px are their
+    expected errors.
+    """
+    needed = max(settings.least_streaks, _LEAST_AGREEMENT * len(raw))
+    outward = chord_outward(raw)
+    swapped, used = _consensus(extend(raw, outward, settings.endpoint_bias), sigma, pinhole, settings)
+    raw = np.where(swapped[:, None, None], raw[:, ::-1], raw)
+    outward = chord_outward(raw)
+    errors = np.sqrt(2.0) * sigma / pinhole.focal_length
+    # The second pass moves the ends along the arcs of the first: streaks near the axis are curved.
+    for _ in range(2):
+        if np.count_nonzero(used) < needed:
+            return None
+        endpoints = extend(raw, outward, settings.endpoint_bias)
+        vectors = pinhole.unit_vectors(endpoints)
+        try:
+            solution, used = _reject_and_solve(vectors, errors, used, settings)
+        except np.linalg.LinAlgError:
+            return None
+        outward = _arc_outward(raw, solution.rotation_vector, pinhole)
+    if np.count_nonzero(used) < needed:
+        return None
+    covariance = _covariance(solution, vectors[used], errors[used], pinhole, settings)
+    residual = float(np.sqrt(0.5 * np.mean(np.sum(solution.residuals**2, axis=-1))))
+    return RotationFit(solution.rotation_vector, covariance, endpoints, used, residual)
+
+
+def _consensus(
+    endpoints: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
+) -> tuple[BoolArray, BoolArray]:
+    """Return which streaks (n,) have their ends in the opposite order, and which agree approximately."""
+    vectors = pinhole.unit_vectors(endpoints)
+    length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1)
+    allowed = np.maximum(settings.axis_tolerance, settings.outlier_sigmas * sigma)
+    axis, agree = rotation_axis(vectors[:, 0], vectors[:, 1], allowed / length)
+    angle = rotation_angles(vectors[:, 0], vectors[:, 1], axis)
+    size = np.abs(angle)
+    common = np.median(size[agree]) if agree.any() else np.nan
+    # Twice the tolerance, for two ends and for an axis that is poorly known when normal to the boresight.
+    agree &= np.abs(size - common) * length <= 2.0 * allowed * size
+    return np.asarray(angle < 0.0), np.asarray(agree)
+
+
+def _reject_and_solve(
+    vectors: FloatArray, errors: FloatArray, used: BoolArray, settings: StreakSettings
+) -> tuple[OlaeSolution, BoolArray]:
+    """Return the rotation and its streaks, rejected and re-admitted by residual until the set is stable.
+
+    Raises numpy.linalg.LinAlgError if the remaining streaks do not determine a rotation.
+    """
+    weights = 1.0 / errors**2
+    solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
+    for _ in range(_MOST_ROUNDS):
+        z = np.stack(_components(vectors, solution)) / errors
+        scale = np.maximum(MAD_TO_SIGMA * np.median(np.abs(z[:, used]), axis=1), _LEAST_SCALE)
+        kept = np.all(np.abs(z) <= settings.outlier_sigmas * scale[:, None], axis=0)
+        if np.array_equal(kept, used):
+            break
+        used = kept
+        solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
+    return solution, used
+
+
+def _components(vectors: FloatArray, solution: OlaeSolution) -> tuple[FloatArray, FloatArray]:
+    """Return the residuals [s x] g - d of streaks (n, 2, 3) along and across their motion, (n,) rad each."""
+    starts, ends = vectors[:, 0], vectors[:, 1]
+    residual = np.cross(starts + ends, solution.rodrigues) - (ends - starts)
+    along, across = _motion_axes(starts + ends, solution.rodrigues)
+    return np.sum(residual * along, axis=-1), np.sum(residual * across, axis=-1)
+
+
+def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors (n, 3) along the motion at mid-streak, v' = -omega x v, and across it."""
+    along = np.cross(sums, rodrigues)
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    across = np.cross(sums, along)
+    return along, across / np.linalg.norm(across, axis=-1, keepdims=True)
+
+
+def _arc_outward(endpoints: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return the pixel directions (n, 2, 2) out of each streak along its arc, backwards at the first end."""
+    v = pinhole.unit_vectors(endpoints)
+    velocity = -np.cross(rotation, v)
+    image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
+    return np.asarray(image * np.array([-1.0, 1.0])[:, None])
+
+
+def _covariance(
+    solution: OlaeSolution,
+    vectors: FloatArray,
+    errors: FloatArray,
+    pinhole: Pinhole,
+    settings: StreakSettings,
+) -> FloatArray:
+    """Return the covariance (3, 3) rad^2 of the rotation vector.
+
+    Errors along and across the streaks have separate scales, from the residuals over their degrees of
+    freedom, widened by nu/(nu - 2) for the uncertainty of the scale (Student). The bias of the detector does
+    not show in the residuals and is added from `endpoint_bias_sigma`.
+    """
+    weights = 1.0 / errors**2
+    cross = cross_matrices(solution.sums)
+    hat = np.einsum("nij,jk,nlk,n->nil", cross, np.linalg.inv(solution.normal), cross, weights)
+    moved = gain(solution, weights)
+    covariance = np.zeros((3, 3))
+    axes = _motion_axes(solution.sums, solution.rodrigues)
+    for direction, residual in zip(axes, _components(vectors, solution), strict=True):
+        leverage = float(np.einsum("ni,nij,nj->", direction, hat, direction))
+        freedom = max(len(errors) - leverage, 1.0)
+        scale = np.sum((residual / errors) ** 2) / freedom
+        scale *= freedom / (freedom - 2.0) if freedom > 3.0 else 3.0
+        column = np.einsum("nij,nj->ni", moved, direction) * errors[:, None]
+        covariance += scale * column.T @ column
+    shift = 2.0 * settings.endpoint_bias_sigma / pinhole.focal_length
+    common = shift * np.einsum("nij,nj->i", moved, axes[0])
+    return np.asarray(covariance + np.outer(common, common))

@@ -1,0 +1,375 @@
+"""Bright regions of a frame and the two ends of each streak among them (Sease 2013, chapter 3).
+
+A frame is thresholded at the local background plus k standard deviations of its 3 x 3 sum, which is nearly
+the matched filter of a star one pixel wide. Within the box of each connected region the Harris response of
+the structure tensor is computed; a streak has exactly two peaks, each located by its centre of intensity. The
+equations are those of the thesis as corrected in the errata (3.5, 3.15, 3.17-3.18). Images are (rows,
+columns), points are (x, y) px.
+
+The Gaussian kernels shift the peaks along the streak by a constant that depends on the point spread.
+`extend` compensates it; `python -m tests.studies.bench.endpoint_bias` measures it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
+from knightcube.vision.frame import (
+    Background,
+    box_sum,
+    estimate_background,
+    label_pixels,
+    moments,
+    positions,
+    repair_hot_pixels,
+    saturation_level,
+)
+from knightcube.vision.objects.settings import EndpointSettings
+
+# Margin (px) around a region's box, which covers the window and the derivative kernel.
+_PADDING = 8
+# Ratio of a region's measured length to the minimum length of a streak from which the region is a candidate.
+_LENGTH_MARGIN = 0.75
+# Fraction of a streak's counts per px of length that lies in its brightest row, for a point spread of 1 px.
+_PEAK_FRACTION = 0.28
+
+
+@dataclass(frozen=True, slots=True)
+class Regions:
+    """Connected regions of one frame.
+
+    Attributes:
+        labels: (rows, columns) int32, the region's number at each pixel, 0 outside all regions.
+        label: (n,) the region's number in `labels`.
+        boxes: (n, 4) first row, last row + 1, first column, last column + 1.
+        area: (n,) pixels.
+        flux: (n,) counts above the background.
+        length: (n,) px, length of a uniform line with the region's second moments.
+    """
+
+    labels: Image
+    label: IntArray
+    boxes: IntArray
+    area: IntArray
+    flux: FloatArray
+    length: FloatArray
+
+    def select(self, chosen: BoolArray | IntArray) -> Regions:
+        """Return the `chosen` regions, given by a mask (n,) or by indices."""
+        return select(self, chosen, "labels")
+
+    def __len__(self) -> int:
+        return self.label.size
+
+
+@dataclass(frozen=True, slots=True)
+class Segmented:
+    """A frame cut into regions.
+
+    Attributes:
+        signal: (rows, columns) float32 counts, background subtracted, hot pixels repaired.
+        background: level and noise.
+        regions: all regions above the threshold.
+        candidates: regions that may be streaks, strongest first.
+        hot_pixels: number of repaired pixels.
+    """
+
+    signal: Image
+    background: Background
+    regions: Regions
+    candidates: Regions
+    hot_pixels: int
+
+
+@dataclass(frozen=True, slots=True)
+class Streaks:
+    """Streaks of one frame, strongest first.
+
+    Attributes:
+        endpoints: (n, 2, 2) streak, end, (x, y) px, without compensation and in arbitrary order.
+        sigma: (n,) px, expected error of an endpoint.
+        flux: (n,) counts.
+        candidate: (n,) index of each streak's region among the candidates.
+        crowded: index and corners (k, 2) px of each candidate with more than two corners.
+    """
+
+    endpoints: FloatArray
+    sigma: FloatArray
+    flux: FloatArray
+    candidate: IntArray
+    crowded: tuple[tuple[int, FloatArray], ...]
+
+    @property
+    def lengths(self) -> FloatArray:
+        """The distances (n,) px between the two ends."""
+        return np.asarray(np.linalg.norm(self.endpoints[:, 1] - self.endpoints[:, 0], axis=-1))
+
+    def __len__(self) -> int:
+        return self.flux.size
+
+
+def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
+    """Return the regions of a frame (rows, columns), and the candidates for streaks among them."""
+    background = estimate_background(pixels)
+    noise = background.map(background.noise)
+    signal = pixels.astype(np.float32)
+    signal -= background.map(background.level)
+    hot = repair_hot_pixels(signal, noise)
+    local = settings.threshold_sigmas > 0.0
+    mask = threshold_local(signal, noise, settings.threshold_sigmas) if local else threshold_mean(pixels)
+    regions = find_regions(mask, signal, settings.least_area)
+    row, column = positions(pixels >= saturation_level(pixels, settings.saturation))
+    saturated = np.isin(regions.label, regions.labels[row, column])
+    long = regions.length >= _LENGTH_MARGIN * settings.least_length
+    candidates = regions.select(long & ~near_border(regions, pixels.shape, settings.border) & ~saturated)
+    strength = candidates.length / expected_sigma(candidates, background, settings)
+    strongest = np.argsort(-strength, kind="stable")[: settings.most_streaks]
+    return Segmented(signal, background, regions, candidates.select(strongest), hot)
+
+
+def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
+    """Return where the 3 x 3 sum of `signal` exceeds `sigmas` times the noise of that sum.
+
+    The background is subtracted from `signal`; `noise` is the standard deviation of each pixel in counts.
+    """
+    return np.asarray(box_sum(signal) > (3.0 * sigmas) * noise)
+
+
+def threshold_mean(pixels: Image) -> BoolArray:
+    """Return where `pixels` exceed the mean of the image: the thesis's threshold, for noiseless frames."""
+    return np.asarray(pixels > pixels.mean())
+
+
+def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
+    """Return the 8-connected regions of `mask` with at least `least_area` pixels, and their moments."""
+    pixel = np.flatnonzero(mask)
+    number, count = label_pixels(pixel, mask.shape[1])
+    labels = np.zeros(mask.shape, dtype=np.int32)
+    labels.reshape(-1)[pixel] = number + 1
+    row, column = np.divmod(pixel, mask.shape[1])
+    # A region above the image's mean may still lie below the background, where it has no moments.
+    light = np.maximum(signal[row, column], 0.0).astype(np.float64)
+    found = moments(number, column, row, light, count)
+    area = np.bincount(number, minlength=count)
+    slices = ndimage.find_objects(labels)
+    boxes = np.array([(s[0].start, s[0].stop, s[1].start, s[1].stop) for s in slices], dtype=np.int64)
+    kept = np.flatnonzero(area >= least_area)
+    return Regions(
+        labels, kept + 1, boxes.reshape(-1, 4)[kept], area[kept], found.flux[kept], found.length[kept]
+    )
+
+
+def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
+    """Return which regions (n,) come within `border` px of the frame's border, which may hide their ends."""
+    top, bottom, left, right = regions.boxes.T
+    return np.asarray(
+        (top < border) | (left < border) | (bottom > shape[0] - border) | (right > shape[1] - border)
+    )
+
+
+def expected_sigma(regions: Regions, background: Background, settings: EndpointSettings) -> FloatArray:
+    """Return the expected errors (n,) px of the endpoints, from each region's counts and the noise."""
+    density = regions.flux / (regions.length + 3.0)
+    variance = background.typical_noise**2 + _PEAK_FRACTION * density / settings.gain
+    return np.asarray(
+        np.hypot(settings.endpoint_floor, settings.endpoint_noise * np.sqrt(variance) / density)
+    )
+
+
+def measure_streaks(
+    segmented: Segmented,
+    settings: EndpointSettings,
+    cornerness: Callable[[FloatArray, EndpointSettings], FloatArray] | None = None,
+) -> Streaks:
+    """Return the candidates whose cornerness has exactly two peaks, as streaks.
+
+    `cornerness` is another corner detector than Harris's; it maps an image and the settings to a response.
+    """
+    respond = harris_cornerness if cornerness is None else cornerness
+    sigma = expected_sigma(segmented.candidates, segmented.background, settings)
+    found: list[int] = []
+    endpoints: list[FloatArray] = []
+    crowded: list[tuple[int, FloatArray]] = []
+    for index in range(len(segmented.candidates)):
+        image, mask, corner = cut_out(segmented, index)
+        response = respond(image, settings)
+        intensity = response if settings.centre_of == "response" else image
+        corners = find_corners(
+            response, mask, settings.peak_relative, settings.intensity_half_width, intensity
+        )
+        if len(corners) == 2:
+            found.append(index)
+            endpoints.append(corners + corner)
+        elif len(corners) > 2:
+            crowded.append((index, corners + corner))
+    stacked = np.array(endpoints).reshape(-1, 2, 2)
+    chosen = np.array(found, dtype=np.int64)
+    return Streaks(stacked, sigma[chosen], segmented.candidates.flux[chosen], chosen, tuple(crowded))
+
+
+def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Return image and mask of a candidate with a margin, and the (x, y) px of their first pixel.
+
+    Other regions are zero in the image.
+    """
+    rows, columns = segmented.signal.shape
+    top, bottom, left, right = segmented.candidates.boxes[index]
+    top, left = max(top - _PADDING, 0), max(left - _PADDING, 0)
+    bottom, right = min(bottom + _PADDING, rows), min(right + _PADDING, columns)
+    labels = segmented.candidates.labels[top:bottom, left:right]
+    mask = labels == segmented.candidates.label[index]
+    image = np.where(mask | (labels == 0), segmented.signal[top:bottom, left:right], 0.0).astype(np.float64)
+    return image, mask, np.array([left, top], dtype=float)
+
+
+class StructureTensor(NamedTuple):
+    """The three distinct elements of the windowed structure tensor at every pixel, each (rows, columns)."""
+
+    xx: FloatArray
+    xy: FloatArray
+    yy: FloatArray
+
+
+def harris_cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
+    """Return the Harris response of an image (rows, columns), smoothed as the settings say."""
+    return harris_response(tensor_of(image, settings), settings.harris_k)
+
+
+def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
+    """Return the structure tensor of an image, smoothed as the settings say."""
+    image = smoothed(image, settings.smoothing_sigma)
+    return structure_tensor(image, settings.derivative_sigma, settings.window_sigma)
+
+
+def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float) -> StructureTensor:
+    """Return the products of the gradient, summed under a Gaussian window of `window_sigma` px (3.5).
+
+    Without the window, which the printed equation lacks, the tensor has rank 1 and one eigenvalue is zero.
+    """
+    gx, gy = gradient(image, derivative_sigma)
+    window = gaussian_kernel(window_sigma, kernel_radius(window_sigma))
+    return StructureTensor(*(_separable(product, window, window) for product in (gx * gx, gx * gy, gy * gy)))
+
+
+def harris_response(tensor: StructureTensor, k: float = 0.15) -> FloatArray:
+    """Return det(A) - k trace(A)^2, positive where both eigenvalues are large (3.7, 3.8)."""
+    trace = tensor.xx + tensor.yy
+    return np.asarray(tensor.xx * tensor.yy - tensor.xy**2 - k * trace**2)
+
+
+def gradient(image: Image, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Return the Gaussian derivatives along x and y, counts per px; pixels at the border are repeated."""
+    radius = kernel_radius(sigma)
+    smooth, slope = gaussian_kernel(sigma, radius), gaussian_derivative_kernel(sigma, radius)
+    return _separable(image, smooth, slope), _separable(image, slope, smooth)
+
+
+def smoothed(image: Image, sigma: float) -> FloatArray:
+    """Return the image smoothed by a Gaussian of `sigma` px (3.3), unchanged if `sigma` is zero."""
+    if sigma <= 0.0:
+        return np.asarray(image, dtype=np.float64)
+    kernel = gaussian_kernel(sigma, kernel_radius(sigma))
+    return _separable(image, kernel / kernel.sum(), kernel / kernel.sum())
+
+
+def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
+    """Return the sampled normal density (2 radius + 1,), one factor of 3.3."""
+    x = np.arange(-radius, radius + 1)
+    return np.asarray(np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma))
+
+
+def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
+    """Return the kernel (2 radius + 1,) whose correlation is d/dx of the image smoothed by `sigma` px.
+
+    Its outer product with `gaussian_kernel` is the mirrored kernel of 3.4, which is written for convolution.
+    """
+    x = np.arange(-radius, radius + 1)
+    return np.asarray(x / sigma**2 * gaussian_kernel(sigma, radius))
+
+
+def kernel_radius(sigma: float) -> int:
+    """Return the half width (px) of a kernel of `sigma` px: three sigma, at least one."""
+    return max(1, int(np.ceil(3.0 * sigma)))
+
+
+def _separable(image: Image, down: FloatArray, across: FloatArray) -> FloatArray:
+    """Return the correlation of `image` with the outer product of `down` (rows) and `across` (columns)."""
+    half = ndimage.correlate1d(image, down, axis=0, mode="nearest", output=np.float64)
+    return np.asarray(ndimage.correlate1d(half, across, axis=1, mode="nearest"))
+
+
+def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntArray:
+    """Return the pixels (n, 2) of `mask`, as (x, y), that exceed all eight neighbours.
+
+    Pixels at the border of the image, and pixels below `relative` times the largest response in the mask, are
+    excluded.
+    """
+    inner = response[1:-1, 1:-1]
+    rows, columns = inner.shape
+    allowed = mask[1:-1, 1:-1]
+    top = float(inner[allowed].max(initial=0.0))
+    if top <= 0.0:
+        return np.empty((0, 2), dtype=np.int64)
+    y, x = np.nonzero(allowed & (inner >= relative * top))
+    steps = [(dy, dx) for dy in (0, 1, 2) for dx in (0, 1, 2) if (dy, dx) != (1, 1)]
+    neighbours = np.stack([response[dy : dy + rows, dx : dx + columns][y, x] for dy, dx in steps])
+    peak = inner[y, x] > neighbours.max(axis=0)
+    return np.stack([x[peak] + 1, y[peak] + 1], axis=-1)
+
+
+def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> FloatArray:
+    """Return the intensity-weighted centre (x, y) px of the (2 half_width + 1)^2 pixels around `pixel`.
+
+    Equation 3.15, whose printed sums lack the coordinate, and 3.16. Negative pixels have no weight. A window
+    that the border cuts is narrowed on both sides, so that it stays centred on `pixel` (x, y).
+    """
+    x, y = int(pixel[0]), int(pixel[1])
+    rows, columns = image.shape
+    n = min(half_width, x, y, columns - 1 - x, rows - 1 - y)
+    window = np.maximum(image[y - n : y + n + 1, x - n : x + n + 1], 0.0)
+    total = window.sum()
+    if total <= 0.0:
+        return np.array([x, y], dtype=float)
+    i = np.arange(-n, n + 1)
+    return np.array([x + window.sum(axis=0) @ i / total, y + window.sum(axis=1) @ i / total])
+
+
+def find_corners(
+    response: FloatArray, mask: BoolArray, relative: float, half_width: int, intensity: FloatArray
+) -> FloatArray:
+    """Return the corners (n, 2) px of a region: its peaks of cornerness, at the centres of `intensity`.
+
+    `intensity` is the response itself, or the image as in the thesis, whose centres lie up to 2 px inside the
+    streak. A streak has two corners; other numbers indicate noise, crossing streaks or another object.
+    """
+    peaks = local_maxima(response, mask, relative)
+    return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)
+
+
+def extend(endpoints: FloatArray, outward: FloatArray, bias: float) -> FloatArray:
+    """Return `endpoints` (..., 2) moved by `bias` px along the directions `outward` (..., 2)."""
+    return np.asarray(endpoints + bias * outward / np.linalg.norm(outward, axis=-1, keepdims=True))
+
+
+def chord_outward(endpoints: FloatArray) -> FloatArray:
+    """Return the directions (n, 2, 2) out of each streak (n, 2, 2) at its two ends, along the chord."""
+    chord = endpoints[:, 1] - endpoints[:, 0]
+    return np.stack([-chord, chord], axis=1)
+
+
+def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
+    """Return the pixel (2,) nearest to the bisectors of streaks (n, 2, 2) px (3.17, 3.18 corrected).
+
+    The centre recedes to infinity as the axis becomes normal to the boresight; it is NaN for parallel chords.
+    """
+    chord = endpoints[:, 1] - endpoints[:, 0]
+    chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
+    midpoint = endpoints.mean(axis=1)
+    centre, _, rank, _ = np.linalg.lstsq(chord, np.sum(chord * midpoint, axis=-1), rcond=1e-9)
+    return np.asarray(centre) if rank == 2 else np.full(2, np.nan)

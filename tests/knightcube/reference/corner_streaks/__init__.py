@@ -1,0 +1,1 @@
+"""Mirrors `knightcube.reference.corner_streaks`."""

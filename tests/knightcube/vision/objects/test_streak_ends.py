@@ -1,0 +1,239 @@
+"""Regions, corners and ends of streaks, and the centre of rotation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.frame import box_sum, less_boxes, repair_hot_pixels
+from knightcube.vision.objects.streak_ends import (
+    centre_of_intensity,
+    centre_of_rotation,
+    chord_outward,
+    extend,
+    find_regions,
+    gaussian_derivative_kernel,
+    gaussian_kernel,
+    gradient,
+    harris_response,
+    kernel_radius,
+    local_maxima,
+    smoothed,
+    structure_tensor,
+    threshold_local,
+    threshold_mean,
+)
+from tests.support.streak_frames import rate_at, rotate, star_camera, star_frame
+
+
+def test_the_box_sum_is_nine_times_the_uniform_filter() -> None:
+    image = np.random.default_rng(1).normal(size=(20, 31))
+    np.testing.assert_allclose(box_sum(image)[1:-1, 1:-1], 9.0 * ndimage.uniform_filter(image, 3)[1:-1, 1:-1])
+
+
+def test_diagonal_neighbours_are_one_region_and_small_regions_are_dropped() -> None:
+    mask = np.zeros((30, 40), dtype=np.bool_)
+    mask[np.arange(5, 25), np.arange(10, 30)] = True
+    mask[2, 35] = True
+    regions = find_regions(mask, mask.astype(np.float32), least_area=2)
+    assert len(regions) == 1
+    np.testing.assert_array_equal(regions.boxes, [[5, 25, 10, 30]])
+    assert regions.area[0] == 20
+
+
+def test_a_lines_length_comes_from_its_moments_whatever_its_width() -> None:
+    signal = np.zeros((60, 120), dtype=np.float32)
+    signal[20:25, 10:91] = 3.0
+    regions = find_regions(signal > 0, signal, least_area=2)
+    # Rows and columns of whole pixels: (81^2 - 1 - (5^2 - 1))/12 is the difference of the moments.
+    assert regions.length[0] == pytest.approx(np.sqrt(81.0**2 - 5.0**2))
+    assert regions.flux[0] == pytest.approx(3.0 * 5 * 81)
+
+
+def test_an_empty_mask_has_no_regions() -> None:
+    empty = np.zeros((16, 16), dtype=np.bool_)
+    assert len(find_regions(empty, empty.astype(np.float32), 1)) == 0
+
+
+def test_the_local_threshold_passes_normal_noise_at_its_own_rate() -> None:
+    signal = np.random.default_rng(4).normal(0.0, 5.0, (700, 700)).astype(np.float32)
+    passed = threshold_local(signal, np.full_like(signal, 5.0), 2.0).mean()
+    # 2.275 % of a normal variable; neighbouring sums are correlated, so about 54,000 are independent.
+    assert passed == pytest.approx(0.02275, abs=5.0 * np.sqrt(0.02275 / 54_000))
+
+
+def test_the_thesiss_threshold_passes_half_of_a_noise_frame() -> None:
+    noise = np.random.default_rng(5).normal(100.0, 10.0, (200, 200))
+    assert threshold_mean(noise).mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_hot_pixels_are_repaired_and_stars_are_left() -> None:
+    camera = star_camera(512, psf_sigma=0.7)
+    pixels = star_frame(camera, rate_at(0.5 * np.pi, 0.0), 1.0, seed=6)
+    signal = pixels.astype(np.float32) - 150.0
+    noise = np.full_like(signal, np.sqrt(150.0))
+    clean = signal.copy()
+    assert repair_hot_pixels(clean, noise) == 0
+    np.testing.assert_array_equal(clean, signal)
+    places = np.random.default_rng(7).integers(1, 511, (40, 2))
+    places = places[clean[places[:, 0], places[:, 1]] < 60.0]
+    for row, column in places:
+        signal[row, column] = 3000.0
+    assert repair_hot_pixels(signal, noise) == len(np.unique(places, axis=0))
+    assert signal[places[:, 0], places[:, 1]].max() < 300.0
+
+
+def test_light_taken_from_some_pixels_leaves_the_sums_of_what_is_left() -> None:
+    """At the frame's corners and edges too."""
+    generator = np.random.default_rng(9)
+    image = generator.integers(0, 1000, (40, 50)).astype(np.float32)
+    pixels = np.unique(np.append(generator.integers(0, image.size, 300), [0, 49, 50, image.size - 1]))
+    taken = generator.integers(0, 500, len(pixels)).astype(np.float32)
+    left = image.copy().reshape(-1)
+    left[pixels] -= taken
+    found = less_boxes(box_sum(image).reshape(-1), (40, 50), pixels, taken)
+    np.testing.assert_array_equal(found.reshape(40, 50), box_sum(left.reshape(40, 50)))
+
+
+def test_the_derivative_kernel_is_the_published_one_of_3_4() -> None:
+    printed = np.array([[0.0466, 0, -0.0466], [0.3446, 0, -0.3446], [0.0466, 0, -0.0466]])
+    kernel = np.outer(gaussian_kernel(0.5, 1), gaussian_derivative_kernel(0.5, 1))
+    # 3.4 is written for convolution, which mirrors it.
+    np.testing.assert_allclose(kernel[:, ::-1], printed, atol=5.5e-5)
+
+
+def test_the_gradient_of_a_ramp_is_its_slope() -> None:
+    y, x = np.mgrid[0:40, 0:50]
+    gx, gy = gradient(3.0 * x - 2.0 * y, sigma=1.0)
+    # The kernels are cut at three sigma: 3 % of the derivative's weight lies beyond.
+    np.testing.assert_allclose(gx[8:-8, 8:-8], 3.0, rtol=0.03)
+    np.testing.assert_allclose(gy[8:-8, 8:-8], -2.0, rtol=0.03)
+
+
+def _by_hand(image: FloatArray, row: int, column: int, sigma: float, window: float) -> FloatArray:
+    """Return the structure tensor (2, 2) at one pixel by plain double sums."""
+    r, w = kernel_radius(sigma), kernel_radius(window)
+    tensor = np.zeros((2, 2))
+    for j in range(-w, w + 1):
+        for i in range(-w, w + 1):
+            g = np.zeros(2)
+            for n in range(-r, r + 1):
+                for m in range(-r, r + 1):
+                    value = image[row + j + n, column + i + m]
+                    bell = np.exp(-(m * m + n * n) / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+                    g += value * bell * np.array([m, n]) / sigma**2
+            weight = np.exp(-(i * i + j * j) / (2 * window**2)) / (2 * np.pi * window**2)
+            tensor += weight * np.outer(g, g)
+    return tensor
+
+
+def test_the_structure_tensor_equals_a_hand_computation() -> None:
+    image = np.random.default_rng(1).normal(size=(25, 25))
+    tensor = structure_tensor(image, 1.0, 1.5)
+    expected = _by_hand(image, 12, 11, 1.0, 1.5)
+    found = [[tensor.xx[12, 11], tensor.xy[12, 11]], [tensor.xy[12, 11], tensor.yy[12, 11]]]
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+def test_without_the_window_the_tensor_would_have_rank_one() -> None:
+    image = np.random.default_rng(2).normal(size=(25, 25))
+    gx, gy = gradient(image, 1.0)
+    np.testing.assert_allclose(gx * gx * gy * gy - (gx * gy) ** 2, 0.0, atol=1e-12)
+    tensor = structure_tensor(image, 1.0, 1.5)
+    determinant = tensor.xx * tensor.yy - tensor.xy**2
+    assert determinant.min() > 0.0
+
+
+def test_the_harris_response_is_that_of_the_eigenvalues() -> None:
+    image = np.random.default_rng(3).normal(size=(20, 20))
+    tensor = structure_tensor(image, 1.0, 1.5)
+    matrices = np.stack([np.stack([tensor.xx, tensor.xy], -1), np.stack([tensor.xy, tensor.yy], -1)], -2)
+    low, high = np.moveaxis(np.linalg.eigvalsh(matrices), -1, 0)
+    expected = low * high - 0.15 * (low + high) ** 2
+    np.testing.assert_allclose(harris_response(tensor, 0.15), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_an_edge_answers_negative_and_a_corner_positive() -> None:
+    image = np.zeros((40, 40))
+    image[20:, 20:] = 1.0
+    response = harris_response(structure_tensor(image, 1.0, 1.5))
+    assert response[20, 35] < 0.0
+    assert response[20, 20] > 0.0
+
+
+def test_smoothing_keeps_the_light_and_none_keeps_the_image() -> None:
+    image = np.zeros((31, 31))
+    image[15, 15] = 7.0
+    blurred = smoothed(image, 1.3)
+    np.testing.assert_allclose(blurred.sum(), 7.0, rtol=1e-12)
+    assert blurred[15, 15] < 1.0
+    np.testing.assert_array_equal(smoothed(image, 0.0), image)
+
+
+def test_only_pixels_above_all_eight_neighbours_are_peaks() -> None:
+    response = np.zeros((7, 9))
+    response[2, 3], response[2, 4], response[5, 7] = 5.0, 4.0, 2.0
+    everywhere = np.ones(response.shape, dtype=np.bool_)
+    np.testing.assert_array_equal(local_maxima(response, everywhere, 0.1), [[3, 2], [7, 5]])
+    np.testing.assert_array_equal(local_maxima(response, everywhere, 0.5), [[3, 2]])
+    masked = everywhere.copy()
+    masked[2, 3] = False
+    np.testing.assert_array_equal(local_maxima(response, masked, 0.1), [[7, 5]])
+
+
+def test_a_response_without_corners_has_no_peaks() -> None:
+    assert len(local_maxima(np.full((6, 6), -1.0), np.ones((6, 6), dtype=np.bool_), 0.1)) == 0
+
+
+def test_the_centre_of_intensity_carries_the_coordinate() -> None:
+    image = np.zeros((9, 9))
+    image[4, 4], image[4, 5], image[3, 4] = 2.0, 1.0, 1.0
+    np.testing.assert_allclose(centre_of_intensity(image, np.array([4, 4]), 3), [4.25, 3.75])
+
+
+def test_a_window_cut_by_the_border_stays_centred() -> None:
+    np.testing.assert_allclose(centre_of_intensity(np.ones((9, 9)), np.array([1, 4]), 3), [1.0, 4.0])
+
+
+def test_extension_moves_both_ends_outward() -> None:
+    ends = np.array([[[10.0, 10.0], [13.0, 14.0]]])
+    moved = extend(ends, chord_outward(ends), 5.0)
+    np.testing.assert_allclose(moved, [[[7.0, 6.0], [16.0, 18.0]]])
+
+
+_ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
+
+
+# Four neighbours take a streak near the diagonals for a row of corners, and it is refused.
+_TOO_SLANTED = [0.8, 2.5]
+
+
+_PINHOLE = star_camera().pinhole
+
+
+def _streaks(theta: float, angle: float, n: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return starts, ends (n, 3) with 0.1 px of error, and the unit axis."""
+    rng = np.random.default_rng(seed)
+    axis = rate_at(theta, 1.0, rng.uniform(0.0, 2.0 * np.pi))
+    starts = _PINHOLE.unit_vectors(rng.uniform(50.0, 970.0, (n, 2)))
+    ends = rotate(starts, angle * axis)
+    noisy = [
+        _PINHOLE.unit_vectors(_PINHOLE.project(v) + rng.normal(0.0, 0.1, (n, 2))) for v in (starts, ends)
+    ]
+    return noisy[0], noisy[1], axis
+
+
+def test_the_centre_of_rotation_is_the_axis_projected() -> None:
+    centre = np.array([700.0, 200.0])
+    angle = np.array([0.1, 1.0, 2.3, 4.0])
+    radius = np.array([[100.0], [200.0], [300.0], [50.0]])
+    first = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+    second = centre + radius * np.stack([np.cos(angle + 0.4), np.sin(angle + 0.4)], -1)
+    np.testing.assert_allclose(centre_of_rotation(np.stack([first, second], axis=1)), centre)
+
+
+def test_parallel_streaks_have_no_centre_of_rotation() -> None:
+    streaks = np.array([[[0.0, 0.0], [10.0, 0.0]], [[50.0, 40.0], [70.0, 40.0]]])
+    assert np.isnan(centre_of_rotation(streaks)).all()
