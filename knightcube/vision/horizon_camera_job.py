@@ -1,9 +1,9 @@
-"""From the frames of the wide cameras to Sun and nadir in body axes: the job of the worker `wide`.
+"""Sun and nadir in body axes from the images of the horizon cameras: the job of the worker process `wide`.
 
-The solar strings choose the camera to read first, and stand in where no camera has the Sun; nadir is fitted
-to the limbs of all frames at once. Where no frame shows a limb, the light in all of them may still leave a
-coarse nadir: the Earth fills one camera and the others are dark. The searches are imported where the work is
-done, as the control process does not need them.
+The solar strings choose the camera to read first, and give the Sun if no camera finds it. Nadir is fitted to
+the limbs of all images at once. If no image shows a limb, the Earth may fill one camera while the others are
+dark: the brightness of all images then gives a coarse nadir. The methods are imported when they are used,
+because the control process does not need them.
 """
 
 from __future__ import annotations
@@ -20,24 +20,25 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResp
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Of a pixel that the sunlit Earth lights, beyond what its scattered light gives beside it."""
+"""Counts of a pixel that the sunlit Earth exceeds and its stray light beside it does not."""
 LIT_SIGMA = 0.3
-"""rad: a rough attitude that is worse does not tell where the Sun is from the body."""
+"""Largest standard deviation (rad) of a rough attitude that gives the direction of the Sun."""
 EARTHLIGHT_SIGMA = 0.1
-"""rad: a rough attitude that is worse does not say which strings the Earth lights."""
+"""Largest standard deviation (rad) of a rough attitude that predicts which strings the Earth lights."""
 JUDGING_SIGMA = 0.005
-"""rad: an attitude that is worse does not say what a camera must see."""
+"""Largest standard deviation (rad) of an attitude that predicts the content of the images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonCameraJob:
-    """Frames of one instant, by their cameras' numbers, and what is known besides.
+    """Images of one instant and prior knowledge.
 
     Attributes:
-        frames: (rows, columns) each.
-        knowledge: with its directions and its attitude in body axes.
-        strings: the solar strings and their currents (n,) A; None without a fresh reading.
-        response: of the cameras to light; None: linear.
+        frames: images (rows, columns), by the numbers of their cameras.
+        cameras: all cameras.
+        knowledge: prior knowledge, with directions and attitude in body axes.
+        strings: the solar strings and their currents (n,), A; None without a recent reading.
+        response: response of the cameras to light; None: linear.
     """
 
     frames: Mapping[int, Image]
@@ -49,9 +50,9 @@ class HorizonCameraJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredDirection:
-    """A direction (3,) in body axes with its covariance (3, 3) rad^2, and the cameras that gave it.
+    """A direction (3,) in body axes, its covariance (3, 3), rad^2, and the cameras that measured it.
 
-    Without a camera it is the Sun of the strings, or a nadir by the light in all frames.
+    Without a camera it is the Sun of the strings, or a nadir from the brightness of all images.
     """
 
     direction: FloatArray
@@ -66,75 +67,47 @@ class MeasuredDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonCameraResult:
-    """Sun and nadir, None where there is none, and why.
+    """The result of a job.
 
     Attributes:
-        false: why pictures are not of what their cameras must see, of those that a fine attitude denies; None
-            where no attitude judged.
+        sun, nadir: the measured directions; None if there is none.
+        false: reasons why images contradict an accurate attitude, by the numbers of their cameras; None
+            without such an attitude.
     """
 
     sun: MeasuredDirection | None
     nadir: MeasuredDirection | None
-    sun_reason: str = ""
-    nadir_reason: str = ""
     false: Mapping[int, str] | None = None
 
 
 def run(job: HorizonCameraJob) -> HorizonCameraResult:
-    """Return Sun and nadir; at the top level of a module for the worker process to import."""
-    sun, sun_reason = _sun(job)
+    """Return Sun and nadir. The worker process imports this function by its name."""
+    sun = _sun(job)
     knowledge = job.knowledge
     if sun is not None and knowledge.sun is not None:
         known = SensedDirection(sun.direction, knowledge.sun, sun.sigma)
         knowledge = replace(knowledge, sensed=(*knowledge.sensed, known))
-    nadir, nadir_reason = _nadir(job, knowledge, sun)
-    return HorizonCameraResult(sun, nadir, sun_reason, nadir_reason, _false(job))
+    return HorizonCameraResult(sun, _nadir(job, knowledge, sun), _false_images(job))
 
 
-def _sun(job: HorizonCameraJob) -> tuple[MeasuredDirection | None, str]:
+def _sun(job: HorizonCameraJob) -> MeasuredDirection | None:
     from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, coarse_sun  # noqa: PLC0415
-    from knightcube.vision.sun import (  # noqa: PLC0415 - see the top
-        LINEAR,
-        SunSettings,
-        sun_of_cameras,
-    )
+    from knightcube.vision.sun import LINEAR, SunSettings, sun_of_cameras  # noqa: PLC0415 - see the top
 
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
         coarse = coarse_sun(job.strings[1], job.strings[0], _expected_nadir(job.knowledge))
     found = sun_of_cameras(job.frames, job.cameras, coarse, LINEAR if job.response is None else SunSettings())
     if found.direction is None or found.covariance is None:
-        return None, found.reason
-    cameras = () if found.camera is None else (found.camera,)
-    return MeasuredDirection(found.direction, found.covariance, cameras), found.reason
-
-
-def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return nadir (3,) in body axes by a rough attitude, from where the Earth shines on the strings."""
-    rough, position = knowledge.attitude, knowledge.position
-    if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None
-    return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
-
-
-def _false(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return why pictures are not of what a fine attitude puts before their cameras; None without one."""
-    from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
-    from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
-
-    rough, position = job.knowledge.attitude, job.knowledge.position
-    nadir, sun = _expected_nadir(job.knowledge), _lit_from(job.knowledge, None)
-    if rough is None or rough.sigma > JUDGING_SIGMA or position is None or nadir is None or sun is None:
-        return None
-    altitude = float(np.linalg.norm(position)) - MEAN_RADIUS
-    looks = {n: image_brightness(frame, job.cameras[n], SUNLIT_COUNTS) for n, frame in job.frames.items()}
-    reasons = {n: why_false(look, nadir, altitude, sun) for n, look in looks.items()}
-    return {n: reason for n, reason in reasons.items() if reason}
+    return MeasuredDirection(
+        found.direction, found.covariance, () if found.camera is None else (found.camera,)
+    )
 
 
 def _nadir(
     job: HorizonCameraJob, knowledge: HorizonKnowledge, sun: MeasuredDirection | None
-) -> tuple[MeasuredDirection | None, str]:
+) -> MeasuredDirection | None:
     from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness  # noqa: PLC0415
     from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
     from knightcube.vision.horizon.nadir import HorizonStatus, nadir_of_cameras  # noqa: PLC0415
@@ -143,23 +116,41 @@ def _nadir(
     settings = HorizonSettings(edges=EdgeSettings(response=job.response))
     found = nadir_of_cameras(job.frames, job.cameras, knowledge, settings)
     if found.nadir is not None:
-        return MeasuredDirection(found.nadir.direction, found.nadir.covariance, found.cameras), ""
+        return MeasuredDirection(found.nadir.direction, found.nadir.covariance, found.cameras)
     if found.status is not HorizonStatus.NO_HORIZON or knowledge.position is None:
-        return None, found.reason
-    looks = [
-        image_brightness(frame, job.cameras[number], SUNLIT_COUNTS) for number, frame in job.frames.items()
-    ]
+        return None
+    looks = [image_brightness(image, job.cameras[n], SUNLIT_COUNTS) for n, image in job.frames.items()]
     altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS
-    coarse = coarse_nadir(looks, altitude, _lit_from(knowledge, sun))
-    if coarse is None:
-        return None, found.reason
-    return MeasuredDirection(coarse.direction, coarse.covariance, ()), found.reason
+    sunward = _expected_sun(knowledge) if sun is None else sun.direction
+    coarse = coarse_nadir(looks, altitude, sunward)
+    return None if coarse is None else MeasuredDirection(coarse.direction, coarse.covariance, ())
 
 
-def _lit_from(knowledge: HorizonKnowledge, sun: MeasuredDirection | None) -> FloatArray | None:
-    """Return the Sun's direction (3,) in body axes, by sight or by a rough attitude; None where unknown."""
-    if sun is not None:
-        return sun.direction
+def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
+    """Return why images contradict an accurate attitude; None without such an attitude."""
+    from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
+    from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
+
+    rough, position = job.knowledge.attitude, job.knowledge.position
+    nadir, sun = _expected_nadir(job.knowledge), _expected_sun(job.knowledge)
+    if rough is None or rough.sigma > JUDGING_SIGMA or position is None or nadir is None or sun is None:
+        return None
+    altitude = float(np.linalg.norm(position)) - MEAN_RADIUS
+    looks = {n: image_brightness(image, job.cameras[n], SUNLIT_COUNTS) for n, image in job.frames.items()}
+    reasons = {n: why_false(look, nadir, altitude, sun) for n, look in looks.items()}
+    return {n: reason for n, reason in reasons.items() if reason}
+
+
+def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
+    """Return the nadir (3,), body axes, that a rough attitude predicts; None if it is too uncertain."""
+    rough, position = knowledge.attitude, knowledge.position
+    if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
+        return None
+    return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
+
+
+def _expected_sun(knowledge: HorizonKnowledge) -> FloatArray | None:
+    """Return the Sun's direction (3,), body axes, that a rough attitude predicts; None if too uncertain."""
     rough = knowledge.attitude
     if rough is None or rough.sigma > LIT_SIGMA or knowledge.sun is None:
         return None

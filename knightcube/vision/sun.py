@@ -1,24 +1,16 @@
-"""The disc of the Sun in a frame: bright patches, the rim of a patch, and the circle through the rim.
+"""The Sun's direction from an image, or from the images of several cameras and the solar strings.
 
-A few rows are read by random access, and bright patches on them are candidates. The rim of a candidate is
-traced along spokes. The circle starts from a consensus among triples of rim points and is refined by
-geometric least squares (Gauss-Newton). Tukey's biweight of each point's distance from the circle (Huber 1981,
-Robust Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on its rim.
+    solution = find_sun(image, camera)
 
-The Sun's direction from a camera's frame.
+A few rows are read, and bright patches on them are candidates. The rim of a candidate is traced along spokes,
+and a circle on the sphere is fitted to it. The centre of the circle is the Sun's centre, even if the disc is
+saturated, has glare, or is partly cut off by the edge of the image. The circle starts from a consensus among
+triples of rim points and is refined by geometric least squares (Gauss-Newton). Tukey's biweight of each
+point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc
+or a hot pixel on its rim.
 
-    solution = find_sun(ArrayPixels(frame), camera, SunSettings())
-
-A few rows are read. The rim of each patch that is brighter than the level and not too large is traced, and a
-circle on the sphere is fitted to it. The circle's centre is the Sun's, even if the disc is saturated, has
-glare, or is partly cut off by the frame's edge.
-
-The Sun from several cameras and the solar strings (Meller et al., chapter 2).
-
-    found = sun_of_cameras(frames, cameras, coarse_sun(currents, strings), settings)
-
-The strings say which camera to read first; where no camera finds the Sun, their own direction stands in, with
-its own covariance.
+`sun_of_cameras` reads the cameras in the order that the coarse Sun of the solar strings gives (Meller et al.,
+chapter 2). If no camera finds the Sun, the coarse direction is returned with its own covariance.
 """
 
 from __future__ import annotations
@@ -31,263 +23,36 @@ from enum import Enum
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.directions import tangent_basis
+from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
-from knightcube.vision.camera.lens import CameraModel, MountedCamera
-from knightcube.vision.frame import ArrayPixels, PixelAccess
-from knightcube.vision.solar_cells import CoarseSun
-
-MOST_PATCHES = 4
-"""Largest number of patches that are examined, the largest first."""
-LEAST_PATCH = 3
-"""Least number of pixels of a patch on the rows that are read: a chord of the Sun's disc, not a hot pixel."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BrightPatch:
-    """A bright patch: its `middle` (2,) px, and `half` px of its greater extent."""
-
-    middle: FloatArray
-    half: float
-
-
-def bright_patches(
-    pixels: PixelAccess, level: float, stride: int, narrowest: float, widest: float
-) -> tuple[list[BrightPatch], bool]:
-    """Return the patches above `level` counts on every `stride`th row, largest first.
-
-    Patches narrower than `narrowest` px or wider than `widest` are excluded; the second value is whether
-    any wide one was.
-    """
-    rows = np.arange(stride // 2, pixels.rows, stride)
-    bright = pixels.read_rows(rows) >= level
-    if not bright.any():
-        return [], False
-    # Labelling costs per pixel: only the box about all bright pixels is labelled.
-    down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
-    top, left = int(down[0]), int(across[0])
-    labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-    boxes = find_objects(labels)
-    patches: list[BrightPatch] = []
-    wide = False
-    for patch in np.argsort(-sizes, kind="stable").tolist():
-        if sizes[patch] < LEAST_PATCH or len(patches) == MOST_PATCHES:
-            break
-        box = boxes[patch]
-        extent = max((box[0].stop - box[0].start) * stride, box[1].stop - box[1].start)
-        wide = wide or extent > widest
-        if not narrowest <= extent <= widest:
-            continue
-        y, x = np.nonzero(labels[box] == patch + 1)
-        y, x = y + box[0].start + top, x + box[1].start + left
-        middle = np.array([x.mean(), rows[0] + stride * y.mean()])
-        patches.append(BrightPatch(middle, 0.5 * extent))
-    return patches, wide
-
-
-def window(pixels: PixelAccess, middle: FloatArray, reach: float) -> tuple[Image, int]:
-    """Return the rows within `reach` px of the point `middle` (2,), and the first one's number."""
-    first = max(int(np.floor(middle[1] - reach)), 0)
-    last = min(int(np.ceil(middle[1] + reach)), pixels.rows - 1)
-    return pixels.read_rows(np.arange(first, last + 1)), first
-
-
-SPOKES = 48
-_STEP = 0.5
-"""Distance between samples along a spoke (px)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Rim:
-    """Rim points about a direction, in its tangent plane.
-
-    Attributes:
-        axis: (3,) unit vector in camera axes, where the spokes start.
-        basis: (2, 3) axes of the plane.
-        points: (n, 2) rad, of arc length from the axis: azimuthal equidistant.
-        cut: number of `SPOKES` that left the frame before the rim.
-        endless: number that met no rim within reach.
-    """
-
-    axis: FloatArray
-    basis: FloatArray
-    points: FloatArray
-    cut: int
-    endless: int
-
-    def direction(self, point: FloatArray) -> FloatArray:
-        """Return the unit vector (3,) in camera axes of a `point` (2,) rad in the tangent plane."""
-        arc = float(np.hypot(*point))
-        return np.asarray(np.cos(arc) * self.axis + np.sinc(arc / np.pi) * (point @ self.basis))
-
-
-def trace(
-    strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
-) -> Rim:
-    """Return the rim about `axis` (3,) within `reach` rad, in `strip`, rows from `first_row` on."""
-    basis = tangent_basis(axis)
-    angle = np.arange(SPOKES) * (2.0 * np.pi / SPOKES)
-    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    step = _STEP / camera.focal_length
-    arcs = np.arange(int(reach / step) + 1) * step
-    rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
-    counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(SPOKES, -1)
-    inner, outer = counts[:, :-1], counts[:, 1:]
-    # Outside the frame the counts are NaN, and no comparison holds.
-    falls = (inner >= level) & (outer < level)
-    crosses = falls.any(axis=1)
-    at = falls.argmax(axis=1)[crosses]
-    inside, outside = inner[crosses, at], outer[crosses, at]
-    arc = step * (at + (inside - level) / (inside - outside))
-    leaves = np.isnan(counts).any(axis=1)
-    cut, endless = np.count_nonzero(leaves & ~crosses), np.count_nonzero(~leaves & ~crosses)
-    return Rim(axis, basis, arc[:, None] * ways[crosses], int(cut), int(endless))
-
-
-def sample(strip: Image, first_row: int, points: FloatArray) -> FloatArray:
-    """Return the counts (n,) at `points` (n, 2), bilinear between pixels; NaN outside the strip."""
-    rows, columns = strip.shape
-    x, y = points[:, 0], points[:, 1] - first_row
-    inside = (x >= 0.0) & (x <= columns - 1.0) & (y >= 0.0) & (y <= rows - 1.0)
-    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
-    column = np.minimum(x.astype(int), max(columns - 2, 0))
-    row = np.minimum(y.astype(int), max(rows - 2, 0))
-    x, y = x - column, y - row
-    flat = strip.reshape(-1)
-    corner = row * columns + column
-    right, down = (1 if columns > 1 else 0), (columns if rows > 1 else 0)
-    top = flat[corner] * (1.0 - x) + flat[corner + right] * x
-    bottom = flat[corner + down] * (1.0 - x) + flat[corner + down + right] * x
-    return np.where(inside, top * (1.0 - y) + bottom * y, np.nan)
-
-
-LEAST_POINTS = 6
-
-_STEPS = 10
-_LAST_STEP = 1e-2
-"""Step that ends the iteration, as a fraction of a point's error."""
-_MOST_ALIKE = 0.9
-"""Largest correlation between neighbours' errors that is assumed."""
-_TUKEY = 4.685
-"""Cut-off of the biweight, in scales: 95 % efficient for Gaussian errors."""
-_NEARLY_AS_MANY = 0.75
-"""Share of the best consensus with which a smaller circle is preferred: stray light enlarges the disc."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Circle:
-    """A circle in a plane; lengths in the unit of the points.
-
-    Attributes:
-        centre: (2,).
-        radius: greater than 0.
-        used: which of the points (n,) it was fitted to.
-        residual: rms of their distances from it.
-        shape: (2, 2), the centre's covariance for unit variance of each point; with the
-            measured correlation of neighbours' errors.
-    """
-
-    centre: FloatArray
-    radius: float
-    used: BoolArray
-    residual: float
-    shape: FloatArray
-
-
-def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle of `points` (n, 2), in order round it, or None without one.
-
-    `scale` is the error of a good point.
-    """
-    start = _consensus(points, 2.5 * scale) if len(points) >= LEAST_POINTS else None
-    if start is None:
-        return None
-    solution = start
-    gate = _TUKEY * scale
-    for _ in range(_STEPS):
-        distance, slopes = _distances(points, solution)
-        weight = np.maximum(1.0 - (distance / gate) ** 2, 0.0) ** 2
-        used = weight > 0.0
-        if np.count_nonzero(used) < LEAST_POINTS:
-            return None
-        weighted = slopes * weight[:, None]
-        try:
-            step = np.linalg.solve(weighted.T @ slopes, weighted.T @ distance)
-        except np.linalg.LinAlgError:
-            return None
-        solution = solution - step
-        if np.abs(step).max() < _LAST_STEP * scale:
-            break
-    distance, slopes = _distances(points, solution)
-    left, slopes = distance[used], slopes[used]
-    square = float(np.mean(left**2))
-    if not (solution[2] > 0.0 and 0.0 < square < np.inf):
-        return None
-    # Correlated errors average out less: by (1 + r)/(1 - r) for a first-order process.
-    alike = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_ALIKE)
-    shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + alike) / (1.0 - alike))
-    return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))
-
-
-def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return how far (n,) the points lie outside the circle (x, y, radius), and the slopes (n, 3) of that."""
-    offset = points - solution[:2]
-    length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-12)
-    slopes = np.concatenate([-offset / length[:, None], np.full((len(points), 1), -1.0)], axis=1)
-    return length - solution[2], slopes
-
-
-def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) through three of the points that most others lie on, within `gate`.
-
-    Triples are evenly spaced along the rim, as wide as a third of it and as narrow as an eighth.
-    """
-    count = len(points)
-    place = np.arange(0, count, 3)
-    triples = [
-        np.stack([place, (place + apart) % count, (place + 2 * apart) % count], axis=1)
-        for apart in sorted({max(count // part, 1) for part in (3, 4, 6, 8)})
-    ]
-    first, second, third = np.moveaxis(points[np.concatenate(triples)], 1, 0)
-    # Twice the circumcentre from the first point: of the bisectors of two chords.
-    b, c = second - first, third - first
-    cross = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
-    sound = np.abs(cross) > 1e-9 * np.sum(b * b + c * c, axis=1)
-    if not sound.any():
-        return None
-    first, b, c, cross = first[sound], b[sound], c[sound], cross[sound]
-    bb, cc = np.sum(b * b, axis=1), np.sum(c * c, axis=1)
-    aside = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / cross[:, None]
-    centre, radius = first + aside, np.hypot(aside[:, 0], aside[:, 1])
-    away = np.hypot(points[:, 0] - centre[:, :1], points[:, 1] - centre[:, 1:])
-    agreeing = np.count_nonzero(np.abs(away - radius[:, None]) < gate, axis=1)
-    good = np.flatnonzero(agreeing >= _NEARLY_AS_MANY * agreeing.max())
-    best = good[np.argmin(radius[good])]
-    return np.array([*centre[best], radius[best]])
+from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
+from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SunSettings:
-    """How the Sun is distinguished from other bright objects, and its assumed errors.
+    """Settings that distinguish the Sun from other bright objects, and its assumed errors.
 
-    At one exposure the Sun's bright disc, glare included, has one radius: give that within about a fifth;
-    within wide bounds a cloud may pass for the Sun. The defaults are for a logarithmic camera like the Fuga
-    15d; `LINEAR` is for a linear one whose white clouds come near to saturation.
+    At one exposure the Sun's bright disc, glare included, has one radius. Give that radius within about a
+    fifth: within wide bounds a cloud may be mistaken for the Sun. The defaults are for a logarithmic camera
+    like the Fuga 15d; `LINEAR` is for a linear one whose white clouds come near to saturation.
 
     Attributes:
-        level: counts, exceeded by the Sun's image. For a logarithmic camera well above the brightest cloud,
+        level: counts that the Sun's image exceeds. For a logarithmic camera well above the brightest cloud,
             so that only the disc remains; for a linear one a little below saturation.
-        stride: px between the rows that are read first.
-        least_radius: rad; smaller patches are hot pixels. The disc itself has 0.0047.
-        greatest_radius: rad; larger patches are clouds, or the Earth.
-        tolerance: px rms by which the rim may be off a circle.
-        least_agreement: share of the rim within the frame that must lie on the circle.
-        least_arc: rad of the rim that must be seen.
-        rim_sigma: px, a rim point's error that the fit's residuals may not show.
-        floor_sigma: px an axis, least error of the centre, from the pixels' pattern.
+        stride: distance between the rows that are read first, px.
+        least_radius: radius below which a patch is a hot pixel, rad. The disc itself has 0.0047 rad.
+        greatest_radius: radius above which a patch is a cloud or the Earth, rad.
+        tolerance: largest rms distance of the rim from a circle, px.
+        least_agreement: least fraction of the rim within the image that must lie on the circle.
+        least_arc: least arc of the rim that must be visible, rad.
+        rim_sigma: least error of a rim point, px, whatever the residuals of the fit.
+        floor_sigma: least error of the centre per axis, px, due to the pattern of the pixels.
+
+    Raises:
+        UsageError: if a value is out of range.
     """
 
     level: float = 200.0
@@ -327,7 +92,7 @@ class SunStatus(Enum):
 
     FOUND = "found"
     PARTIAL = "partial"
-    """Found, but cut by the frame's edge: see the covariance."""
+    """Found, but cut off by the edge of the image: see the covariance."""
     NO_SUN = "no-sun"
     """Nothing is bright enough."""
     NOT_THE_SUN = "not-the-sun"
@@ -336,18 +101,18 @@ class SunStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunMeasurement:
-    """The direction to the Sun's centre from one frame.
+    """The direction to the Sun's centre from one image.
 
     Attributes:
-        direction: (3,) unit vector in camera axes.
-        basis: (2, 3), two unit vectors normal to it and to one another.
-        tangent_covariance: (2, 2) rad^2, of the direction's error along `basis`; without the lens's
-            calibration.
-        point: (2,) px, of the centre; NaN outside the lens's image.
-        radius: rad, of the bright disc, glare included.
-        residual: px rms, of the rim points that were used.
-        arc: rad of the rim that was used.
-        cut: whether the frame's edge cuts the bright disc.
+        direction: unit vector (3,) in camera axes.
+        basis: two unit vectors (2, 3) normal to the direction and to each other.
+        tangent_covariance: covariance (2, 2) of the direction's error along `basis`, rad^2, without the error
+            of the lens calibration.
+        point: position of the centre (2,), px; NaN if the lens does not image it.
+        radius: radius of the bright disc, glare included, rad.
+        residual: rms distance of the used rim points from the circle, px.
+        arc: used arc of the rim, rad.
+        cut: whether the edge of the image cuts the bright disc.
     """
 
     direction: FloatArray
@@ -361,7 +126,7 @@ class SunMeasurement:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (3, 3) rad^2 of the direction's error: of rank 2, nothing along the direction."""
+        """The covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction."""
         return np.asarray(self.basis.T @ self.tangent_covariance @ self.basis)
 
     @property
@@ -372,10 +137,12 @@ class SunMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunSolution:
-    """The outcome of one frame.
+    """The outcome of one image. It is true (`if solution:`) if the Sun was found.
 
     Attributes:
-        sun: the measurement, when the status is FOUND or PARTIAL.
+        status: the outcome.
+        reason: why there is no Sun, in a few words; empty with a Sun.
+        sun: the measurement; None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels read.
     """
 
@@ -384,87 +151,158 @@ class SunSolution:
     sun: SunMeasurement | None = None
     pixels_read: int = 0
 
+    def __bool__(self) -> bool:
+        """Return whether the Sun was found."""
+        return self.sun is not None
 
+
+_MOST_PATCHES = 4
+"""Largest number of patches that are examined, the largest first."""
+_LEAST_PATCH = 3
+"""Least number of pixels of a patch on the rows that are read: a chord of the Sun's disc, not a hot pixel."""
+_SPOKES = 48
+"""Number of spokes along which a rim is traced."""
+_STEP = 0.5
+"""Distance between samples along a spoke (px)."""
 _ROUNDS = 3
 """Largest number of tracings of the rim, each from the centre of the previous circle."""
 _NEAR = 0.5
 """Distance (px) of the fitted centre from the origin of the spokes that ends the tracing."""
 
 
+def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = None) -> SunSolution:
+    """Return the Sun's direction in camera axes from an image, or the reason why there is none.
+
+    Args:
+        image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
+        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size.
+        settings: settings of the search; None: `LINEAR`, for a linear camera of 8 bits.
+
+    Raises:
+        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+    """
+    settings = LINEAR if settings is None else settings
+    check_image(image, camera)
+    # Towards its corners a pinhole camera stretches a disc by the squared secant of the angle.
+    stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
+    reach = settings.greatest_radius * camera.focal_length * stretch
+    # A disc cut by the edge of the image shows at least half its width, or too little of its rim.
+    narrowest = settings.least_radius * camera.focal_length - settings.stride
+    patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
+    read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
+    reasons = ["a patch larger than the Sun and its glare"] if wide else []
+    found: list[SunMeasurement] = []
+    for middle, half in patches:
+        # Twice the radius and a margin, for a centre outside of the image.
+        near = min(2.5 * half + 6.0, 2.0 * reach)
+        first = max(int(np.floor(middle[1] - near)), 0)
+        strip = image[first : min(int(np.ceil(middle[1] + near)), camera.rows - 1) + 1]
+        read += strip.size
+        disc = _disc(strip, first, middle, near / camera.focal_length, camera, settings)
+        reason = "no round rim" if disc is None else _flaw(disc, settings)
+        if disc is None or reason:
+            reasons.append(f"{reason} about pixel ({middle[0]:.0f}, {middle[1]:.0f})")
+        else:
+            found.append(_measurement(disc, camera, settings))
+    if not found:
+        if reasons:
+            return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
+        return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
+    # There is one Sun: the largest of several round patches.
+    sun = max(found, key=lambda one: one.radius)
+    return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
+
+
+def _bright_patches(
+    image: Image, settings: SunSettings, narrowest: float, widest: float
+) -> tuple[list[tuple[FloatArray, float]], bool]:
+    """Return the bright patches on every `stride`th row, the largest first: middle (2,), px, half extent, px.
+
+    Patches narrower than `narrowest` px or wider than `widest` px are excluded. The second value is whether
+    any wide one was.
+    """
+    stride = settings.stride
+    bright = image[stride // 2 :: stride] >= settings.level
+    if not bright.any():
+        return [], False
+    # Labelling takes time per pixel: only the box around all bright pixels is labelled.
+    down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
+    top, left = int(down[0]), int(across[0])
+    labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
+    sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    boxes = find_objects(labels)
+    patches: list[tuple[FloatArray, float]] = []
+    wide = False
+    for patch in np.argsort(-sizes, kind="stable").tolist():
+        if sizes[patch] < _LEAST_PATCH or len(patches) == _MOST_PATCHES:
+            break
+        box = boxes[patch]
+        extent = max((box[0].stop - box[0].start) * stride, box[1].stop - box[1].start)
+        wide = wide or extent > widest
+        if not narrowest <= extent <= widest:
+            continue
+        y, x = np.nonzero(labels[box] == patch + 1)
+        y, x = y + box[0].start + top, x + box[1].start + left
+        patches.append((np.array([x.mean(), stride // 2 + stride * y.mean()]), 0.5 * extent))
+    return patches, wide
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rim:
+    """Rim points around a direction, in its tangent plane.
+
+    Attributes:
+        axis: unit vector (3,) in camera axes, at which the spokes start.
+        basis: axes of the plane (2, 3).
+        points: positions (n, 2), rad, in the azimuthal equidistant projection about the axis.
+        cut: number of spokes that left the image before the rim.
+        endless: number of spokes without a rim within reach.
+    """
+
+    axis: FloatArray
+    basis: FloatArray
+    points: FloatArray
+    cut: int
+    endless: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Disc:
     """A bright disc: its rim, the circle through it, and px per rad (2, 2) along the rim's basis."""
 
-    rim: Rim
+    rim: _Rim
     circle: Circle
     scale: FloatArray
 
     @property
     def axis(self) -> FloatArray:
-        """The circle's middle as a unit vector (3,)."""
-        return self.rim.direction(self.circle.centre)
-
-    @property
-    def stretch(self) -> float:
-        """The root of by how much the lens draws a disc out there: its blur, which is round, as much less."""
-        widest, narrowest = np.linalg.svd(self.scale, compute_uv=False)
-        return math.sqrt(float(widest / narrowest))
+        """The centre of the circle as a unit vector (3,)."""
+        point, rim = self.circle.centre, self.rim
+        arc = float(np.hypot(*point))
+        return np.asarray(np.cos(arc) * rim.axis + np.sinc(arc / np.pi) * (point @ rim.basis))
 
     @property
     def pixels_per_radian(self) -> float:
-        """The mean over all directions."""
+        """The mean scale over all directions."""
         return float(np.sqrt(abs(np.linalg.det(self.scale))))
-
-
-def find_sun(pixels: PixelAccess, camera: CameraModel, settings: SunSettings) -> SunSolution:
-    """Return the Sun's direction in camera axes, or why there is none.
-
-    Raises ValueError when the picture is not of the camera's size.
-    """
-    if (pixels.rows, pixels.columns) != (camera.rows, camera.columns):
-        raise ValueError(
-            f"a picture of {pixels.rows} x {pixels.columns} pixels: "
-            f"the camera has {camera.rows} x {camera.columns}"
-        )
-    # Towards the corners a pinhole draws a disc out by the square of the angle's secant.
-    stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
-    reach = settings.greatest_radius * camera.focal_length * stretch
-    # A disc cut by the frame's edge shows at least half its width, or too little of its rim.
-    narrowest = settings.least_radius * camera.focal_length - settings.stride
-    patches, wide = bright_patches(pixels, settings.level, settings.stride, narrowest, 2.0 * reach)
-    read = pixels.columns * len(range(settings.stride // 2, pixels.rows, settings.stride))
-    reasons = ["a patch larger than the Sun and its glare"] if wide else []
-    found: list[SunMeasurement] = []
-    for patch in patches:
-        # Twice the radius and a margin, for a centre outside the frame.
-        near = min(2.5 * patch.half + 6.0, 2.0 * reach)
-        strip, first = window(pixels, patch.middle, near)
-        read += strip.size
-        disc = _disc(strip, first, patch.middle, near / camera.focal_length, camera, settings)
-        reason = "no round rim" if disc is None else _flaw(disc, settings)
-        if disc is None or reason:
-            reasons.append(f"{reason} about pixel ({patch.middle[0]:.0f}, {patch.middle[1]:.0f})")
-        else:
-            found.append(_measurement(disc, camera, settings))
-    if not found:
-        status = SunStatus.NOT_THE_SUN if reasons else SunStatus.NO_SUN
-        return SunSolution(
-            status, reasons[0] if reasons else f"nothing reaches {settings.level:g} counts", None, read
-        )
-    # There is one Sun: of several round patches the largest.
-    sun = max(found, key=lambda one: one.radius)
-    return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
 
 def _disc(
     strip: Image, first: int, middle: FloatArray, reach: float, camera: CameraModel, settings: SunSettings
 ) -> _Disc | None:
-    """Return the disc whose bright patch has its `middle` (2,) px there and its rim within `reach` rad."""
+    """Return the disc of a bright patch around `middle` (2,), px, with its rim within `reach` rad.
+
+    `strip` are the rows of the image from number `first`.
+    """
     axis = camera.unit_vectors(middle[None, :])[0]
     disc = None
+    step = 1e-4
     for _ in range(_ROUNDS):
-        rim = trace(strip, first, camera, axis, settings.level, reach)
-        scale = _scale(camera, rim)
+        rim = _trace(strip, first, camera, axis, settings.level, reach)
+        # The scale is that of the boresight if the lens does not image the surroundings of the axis.
+        ends = camera.project(np.concatenate([axis + step * rim.basis, axis - step * rim.basis]))
+        scale = (ends[:2] - ends[2:]).T / (2.0 * step)
+        scale = scale if np.all(np.isfinite(scale)) else camera.focal_length * np.eye(2)
         circle = fit_circle(rim.points, settings.tolerance / float(np.sqrt(abs(np.linalg.det(scale)))))
         if circle is None:
             return None
@@ -472,12 +310,52 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # Another tracing does not turn a wrong radius into the Sun's.
-        alien = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
-        if alien or aside * disc.pixels_per_radian < _NEAR:
+        # Another tracing does not change a wrong radius into the Sun's.
+        wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
+        if wrong or aside * disc.pixels_per_radian < _NEAR:
             break
         axis = disc.axis
     return disc
+
+
+def _trace(
+    strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
+) -> _Rim:
+    """Return the rim around `axis` (3,) within `reach` rad, in `strip`, the rows from `first_row`."""
+    basis = tangent_basis(axis)
+    angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
+    ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    step = _STEP / camera.focal_length
+    arcs = np.arange(int(reach / step) + 1) * step
+    rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
+    counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(_SPOKES, -1)
+    inner, outer = counts[:, :-1], counts[:, 1:]
+    # Outside of the image the counts are NaN, for which both comparisons are false.
+    falls = (inner >= level) & (outer < level)
+    crosses = falls.any(axis=1)
+    at = falls.argmax(axis=1)[crosses]
+    inside, outside = inner[crosses, at], outer[crosses, at]
+    arc = step * (at + (inside - level) / (inside - outside))
+    leaves = np.isnan(counts).any(axis=1)
+    cut, endless = np.count_nonzero(leaves & ~crosses), np.count_nonzero(~leaves & ~crosses)
+    return _Rim(axis, basis, arc[:, None] * ways[crosses], int(cut), int(endless))
+
+
+def sample(strip: Image, first_row: int, points: FloatArray) -> FloatArray:
+    """Return the counts (n,) at `points` (n, 2), px, bilinear between pixels; NaN outside of the strip."""
+    rows, columns = strip.shape
+    x, y = points[:, 0], points[:, 1] - first_row
+    inside = (x >= 0.0) & (x <= columns - 1.0) & (y >= 0.0) & (y <= rows - 1.0)
+    x, y = np.where(inside, x, 0.0), np.where(inside, y, 0.0)
+    column = np.minimum(x.astype(int), max(columns - 2, 0))
+    row = np.minimum(y.astype(int), max(rows - 2, 0))
+    x, y = x - column, y - row
+    flat = strip.reshape(-1)
+    corner = row * columns + column
+    right, down = (1 if columns > 1 else 0), (columns if rows > 1 else 0)
+    top = flat[corner] * (1.0 - x) + flat[corner + right] * x
+    bottom = flat[corner + down] * (1.0 - x) + flat[corner + down + right] * x
+    return np.where(inside, top * (1.0 - y) + bottom * y, np.nan)
 
 
 def _flaw(disc: _Disc, settings: SunSettings) -> str:
@@ -491,22 +369,24 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
         return f"a patch of {radius:.2f} deg radius, too large,"
     if used < settings.least_agreement * (len(rim.points) + rim.endless):
         return f"a rim that is round in {used} of {len(rim.points) + rim.endless} places only"
-    if used * 2.0 * np.pi / SPOKES < settings.least_arc:
-        return f"too short an arc of a rim, {used * 360 // SPOKES} deg,"
+    if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
+        return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
-    if residual > settings.tolerance * disc.stretch:
+    # Where the lens stretches a disc, the round blur is anisotropic on the sphere.
+    widest, narrowest = np.linalg.svd(disc.scale, compute_uv=False)
+    if residual > settings.tolerance * math.sqrt(float(widest / narrowest)):
         return f"a rim {residual:.2f} px rms off a circle"
     return ""
 
 
 def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> SunMeasurement:
+    """Return the measurement of an accepted disc."""
     circle, scale = disc.circle, disc.pixels_per_radian
-    used = int(np.count_nonzero(circle.used))
     rim_sigma = max(circle.residual, settings.rim_sigma / scale)
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The rim's basis, tilted to the centre found.
+    # The basis of the rim, tilted to the fitted centre.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(
@@ -516,32 +396,134 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
         point=camera.project(axis[None, :])[0],
         radius=circle.radius,
         residual=circle.residual * scale,
-        arc=used * 2.0 * np.pi / SPOKES,
+        arc=int(np.count_nonzero(circle.used)) * 2.0 * np.pi / _SPOKES,
         cut=disc.rim.cut > 0,
     )
 
 
-def _scale(camera: CameraModel, rim: Rim) -> FloatArray:
-    """Return px per rad (2, 2) about the rim's axis along its basis; the boresight's beyond the lens."""
-    step = 1e-4
-    ends = camera.project(np.concatenate([rim.axis + step * rim.basis, rim.axis - step * rim.basis]))
-    scale = (ends[:2] - ends[2:]).T / (2.0 * step)
-    return scale if np.all(np.isfinite(scale)) else camera.focal_length * np.eye(2)
+_LEAST_POINTS = 6
+"""Least number of points of a circle."""
+_CIRCLE_STEPS = 10
+_LAST_STEP = 1e-2
+"""Step that ends the iteration, as a fraction of a point's error."""
+_MOST_CORRELATED = 0.9
+"""Largest assumed correlation between the errors of neighbouring points."""
+_TUKEY = 4.685
+"""Cut-off of the biweight, in scales: 95 % efficient for Gaussian errors."""
+_NEARLY_AS_MANY = 0.75
+"""Share of the best consensus with which a smaller circle is preferred: stray light enlarges the disc."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circle:
+    """A circle in a plane; lengths have the unit of the points.
+
+    Attributes:
+        centre: centre (2,).
+        radius: radius, positive.
+        used: which of the points it was fitted to (n,).
+        residual: rms distance of these points from it.
+        shape: covariance (2, 2) of the centre for unit variance of each point, with the measured correlation
+            of neighbouring errors.
+    """
+
+    centre: FloatArray
+    radius: float
+    used: BoolArray
+    residual: float
+    shape: FloatArray
+
+
+def fit_circle(points: FloatArray, scale: float) -> Circle | None:
+    """Return the circle through `points` (n, 2), in their order around it; None if there is none.
+
+    `scale` is the error of a good point, in the unit of the points.
+    """
+    solution = _consensus(points, 2.5 * scale) if len(points) >= _LEAST_POINTS else None
+    if solution is None:
+        return None
+    gate = _TUKEY * scale
+    for _ in range(_CIRCLE_STEPS):
+        distance, slopes = _distances(points, solution)
+        weight = np.maximum(1.0 - (distance / gate) ** 2, 0.0) ** 2
+        used = weight > 0.0
+        if np.count_nonzero(used) < _LEAST_POINTS:
+            return None
+        weighted = slopes * weight[:, None]
+        try:
+            step = np.linalg.solve(weighted.T @ slopes, weighted.T @ distance)
+        except np.linalg.LinAlgError:
+            return None
+        solution = solution - step
+        if np.abs(step).max() < _LAST_STEP * scale:
+            break
+    distance, slopes = _distances(points, solution)
+    left, slopes = distance[used], slopes[used]
+    square = float(np.mean(left**2))
+    if not (solution[2] > 0.0 and 0.0 < square < np.inf):
+        return None
+    # Correlated errors average out less: by (1 + r)/(1 - r) for a first-order process.
+    correlation = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_CORRELATED)
+    shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + correlation) / (1.0 - correlation))
+    return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))
+
+
+def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the distances (n,) of the points outside of a circle (x, y, radius), and their slopes (n, 3)."""
+    offset = points - solution[:2]
+    length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-12)
+    slopes = np.concatenate([-offset / length[:, None], np.full((len(points), 1), -1.0)], axis=1)
+    return length - solution[2], slopes
+
+
+def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
+    """Return the circle (x, y, radius) through three points with the most other points within `gate` of it.
+
+    The triples are evenly spaced along the rim, between an eighth and a third of it apart.
+    """
+    count = len(points)
+    place = np.arange(0, count, 3)
+    triples = [
+        np.stack([place, (place + apart) % count, (place + 2 * apart) % count], axis=1)
+        for apart in sorted({max(count // part, 1) for part in (3, 4, 6, 8)})
+    ]
+    first, second, third = np.moveaxis(points[np.concatenate(triples)], 1, 0)
+    # The circumcentre relative to the first point is where the bisectors of two chords meet.
+    b, c = second - first, third - first
+    cross = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
+    sound = np.abs(cross) > 1e-9 * np.sum(b * b + c * c, axis=1)
+    if not sound.any():
+        return None
+    first, b, c, cross = first[sound], b[sound], c[sound], cross[sound]
+    bb, cc = np.sum(b * b, axis=1), np.sum(c * c, axis=1)
+    aside = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / cross[:, None]
+    centre, radius = first + aside, np.hypot(aside[:, 0], aside[:, 1])
+    away = np.hypot(points[:, 0] - centre[:, :1], points[:, 1] - centre[:, 1:])
+    agreeing = np.count_nonzero(np.abs(away - radius[:, None]) < gate, axis=1)
+    good = np.flatnonzero(agreeing >= _NEARLY_AS_MANY * agreeing.max())
+    best = good[np.argmin(radius[good])]
+    return np.array([*centre[best], radius[best]])
 
 
 _SIGMAS = 3.0
+"""Standard deviations of the coarse Sun within which a camera may have the Sun in its field."""
 _RING = 12
+"""Number of directions that are tested at each distance from the coarse Sun."""
+_CONTRADICTED = 5.0
+"""Largest distance between a camera's Sun and the coarse Sun, in standard deviations of the coarse Sun."""
+_CUT = np.radians(0.05)
+"""Systematic error per axis (rad) of a disc that the edge of the image cuts."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraChoice:
-    """A camera and whether it may see the Sun.
+    """A camera and whether it may have the Sun in its field.
 
     Attributes:
-        index: of the camera.
+        index: number of the camera.
         likely: whether the coarse Sun itself is in its field.
-        possible: whether the Sun is within three standard deviations.
-        angle: rad from its boresight to the coarse Sun.
+        possible: whether the Sun is in its field within three standard deviations.
+        angle: angle between its boresight and the coarse Sun, rad.
     """
 
     index: int
@@ -550,19 +532,15 @@ class CameraChoice:
     angle: float
 
 
-def cameras_by_sun(
-    sun: CoarseSun, cameras: Sequence[CameraModel], mountings: Sequence[FloatArray]
-) -> list[CameraChoice]:
-    """Return the cameras in the order in which they are to be read for the Sun; none when it is dark.
+def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[CameraChoice]:
+    """Return the cameras in the order in which they are to be read for the Sun; none if it is dark.
 
-    `mountings` are quaternions (4,), body into camera. With a coarse Sun those that have it in their field
-    come first, then those that may have; by the angle from the boresight in each. With uncertain
-    strings all cameras are possible, in the given order. Raises ValueError for unlike numbers of both.
+    Cameras with the coarse Sun in their field come first, then those that may have it, each group in the
+    order of the angle from the boresight. If the coarse Sun is uncertain, all cameras are possible, in their
+    given order.
     """
-    if len(cameras) != len(mountings):
-        raise ValueError(f"{len(cameras)} cameras with {len(mountings)} mountings: give one for each")
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
-        if sun.status is sun.status.DARK:
+        if sun.status is CoarseSunStatus.DARK:
             return []
         return [CameraChoice(index, False, True, float("nan")) for index in range(len(cameras))]
     angle = np.arange(_RING) * (2.0 * np.pi / _RING)
@@ -572,31 +550,24 @@ def cameras_by_sun(
         [sun.direction[None, :], *(sun.direction + k * ring for k in (1.0, 2.0, _SIGMAS))]
     )
     choices = []
-    for index, (camera, mounting) in enumerate(zip(cameras, mountings, strict=True)):
-        seen = around @ quaternion.attitude_matrix(mounting).T
-        inside = camera.contains(camera.project(seen))
+    for index, camera in enumerate(cameras):
+        seen = around @ attitude_matrix(camera.mounting).T
+        inside = camera.lens.contains(camera.lens.project(seen))
         away = float(np.arccos(np.clip(seen[0, 2], -1.0, 1.0)))
         choices.append(CameraChoice(index, bool(inside[0]), bool(inside.any()), away))
     return sorted(choices, key=lambda choice: (not choice.likely, not choice.possible, choice.angle))
 
 
-_CONTRADICTED = 5.0
-"""Largest distance between a camera's Sun and the coarse Sun, in standard deviations of the coarse Sun."""
-
-_CUT = np.radians(0.05)
-"""Systematic error per axis (rad) of a disc that the frame's edge cuts."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SunOfCameras:
-    """The Sun in body axes, and where it is from.
+    """The Sun in body axes.
 
     Attributes:
-        direction: (3,) unit vector; None when neither a camera nor the strings have it.
-        covariance: (3, 3) rad^2 of its error, nothing along it.
-        camera: the number of the camera that found it; None where it is the strings'.
-        each: what the cameras gave, in the order in which they were read.
-        reason: why no camera has it; empty where one has.
+        direction: unit vector (3,); None if neither a camera nor the strings have found the Sun.
+        covariance: covariance (3, 3) of its error, rad^2, zero along the direction.
+        camera: number of the camera that found it; None if the direction is that of the strings.
+        each: solutions of the cameras, in the order in which they were read.
+        reason: why no camera has found it; empty if one has.
     """
 
     direction: FloatArray | None
@@ -607,32 +578,44 @@ class SunOfCameras:
 
 
 def sun_of_cameras(
-    frames: Mapping[int, Image | PixelAccess],
+    images: Mapping[int, Image],
     cameras: Sequence[MountedCamera],
     strings: CoarseSun,
     settings: SunSettings,
 ) -> SunOfCameras:
-    """Return the Sun that the first of some cameras' frames, by number, shows, or else the strings' own.
+    """Return the Sun in body axes from the first camera that finds it, or else from the solar strings.
 
-    A camera that cannot have the Sun in view by the strings is not read; a Sun that contradicts theirs is
-    not taken.
+    A camera that cannot have the Sun in its field, by the strings, is not read. A Sun that contradicts the
+    strings is rejected.
+
+    Args:
+        images: images (rows, columns) of one instant, by the numbers of their cameras.
+        cameras: all cameras of the body.
+        strings: the coarse Sun of the solar strings.
+        settings: settings of the search.
+
+    Raises:
+        ValueError: as `find_sun`.
     """
-    order = cameras_by_sun(strings, [one.lens for one in cameras], [one.mounting for one in cameras])
+    order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}
     reason = "" if order else "no light: " + strings.reason
     for choice in order:
-        frame = frames.get(choice.index)
-        if frame is None or not choice.possible:
+        image = images.get(choice.index)
+        if image is None or not choice.possible:
             continue
         camera = cameras[choice.index]
-        access = ArrayPixels(frame) if isinstance(frame, np.ndarray) else frame
-        solution = each[choice.index] = find_sun(access, camera.lens, settings)
-        if solution.sun is None:
+        solution = each[choice.index] = find_sun(image, camera.lens, settings)
+        sun = solution.sun
+        if sun is None:
             reason = f"camera {choice.index}: {solution.reason}"
             continue
-        direction = camera.in_body(solution.sun.direction)
+        direction = camera.in_body(sun.direction)
         if not _contradicts(direction, strings):
-            return SunOfCameras(direction, _in_body(solution.sun, camera), choice.index, each)
+            across = np.eye(3) - np.outer(sun.direction, sun.direction)
+            covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
+            covariance = np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
+            return SunOfCameras(direction, covariance, choice.index, each)
         reason = f"camera {choice.index}: a Sun where the strings have none"
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return SunOfCameras(None, None, None, each, reason or strings.reason)
@@ -642,14 +625,8 @@ def sun_of_cameras(
     )
 
 
-def _in_body(sun: SunMeasurement, camera: MountedCamera) -> FloatArray:
-    across = np.eye(3) - np.outer(sun.direction, sun.direction)
-    covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
-    return np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
-
-
 def _contradicts(direction: FloatArray, strings: CoarseSun) -> bool:
-    """Return whether a direction lies farther off the strings' Sun than their errors explain."""
+    """Return whether a direction is farther from the strings' Sun than their errors explain."""
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return False
     if float(direction @ strings.direction) <= 0.0:

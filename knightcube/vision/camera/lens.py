@@ -18,7 +18,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import FlightError
 
@@ -262,6 +262,18 @@ def _reach(k1: float, k2: float) -> float:
     # The smaller positive root, without cancellation: for k2 = 0 it is -1/(3 k1).
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
+
+
+def check_image(image: Image, camera: CameraModel) -> None:
+    """Raise ValueError unless an image has the size (rows, columns) of a camera and finite pixels."""
+    if image.shape != (camera.rows, camera.columns):
+        size = " x ".join(str(number) for number in reversed(image.shape))
+        raise ValueError(
+            f"an image of {size} pixels, but the camera has {camera.columns} x {camera.rows}: "
+            "give (rows, columns) of its size"
+        )
+    if image.dtype.kind == "f" and not np.all(np.isfinite(image)):
+        raise ValueError("an image with pixels that are not finite")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,21 +1,21 @@
-"""Edges along scan lines to a fraction of a pixel, and the same edges as directions.
+"""Edges along scan lines to a fraction of a pixel, in pixels and as directions.
 
-Lines are read, normalised, made binary and filtered as in Meller 3.1, in both directions. Every change is
-then refined: the signal's slope, smoothed by a Gaussian, has its peak where the limb's brightness falls
-fastest. The scale is doubled as long as the edge is wider (Lindeberg 1998, Int. J. Comput. Vision 30, 117),
-so that a limb of one pixel and a limb of a hundred pixels are both located at their steepest point.
+Columns and rows are read, normalised, made binary and filtered as in Meller 3.1. Every change of the binary
+line is then refined: the slope of the signal, smoothed by a Gaussian, has its peak where the brightness of
+the limb falls fastest. The scale is doubled as long as the edge is wider (Lindeberg 1998, Int. J.
+Comput. Vision 30, 117), so that a limb of one pixel and a limb of a hundred pixels are both located at their
+steepest point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, select
 from knightcube.vision.camera.lens import CameraModel, Lens
-from knightcube.vision.frame import PixelAccess
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
@@ -23,15 +23,13 @@ RUN = 5
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
-    """Return binary lines (n, m) with runs shorter than half of `run` px, odd, filtered out (step 2 of 3.1).
+    """Return binary lines (n, m) after a majority filter over an odd number of `run` px (Meller 3.1, step 2).
 
-    A pixel becomes what most of the `run` pixels about it are; beyond a line's ends stands its last pixel.
+    Beyond its ends a line is continued with its last pixel.
     """
     half = run // 2
     size = binary.shape[1]
-    padded = np.empty((len(binary), size + 2 * half), dtype=np.int16)
-    padded[:, half : half + size] = binary
-    padded[:, :half], padded[:, half + size :] = binary[:, :1], binary[:, -1:]
+    padded = np.pad(binary.astype(np.int16), ((0, 0), (half, half)), mode="edge")
     total = padded[:, :size].copy()
     for place in range(1, run):
         total += padded[:, place : place + size]
@@ -51,6 +49,7 @@ _MARGIN = 4.0
 _FLOOR, _SHARE = 0.1, 0.05
 """Prior error of an edge position: a constant (px) and a share of the scale."""
 _SAMPLES = 2048
+"""Number of pixels from which the brightness levels are estimated."""
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
 """Ratio of the standard deviation of one pixel to the median absolute difference of two, normal noise."""
 _STANDS_OUT = 6.0
@@ -61,15 +60,24 @@ _PROFILE: IntArray = np.arange(-9, 6)
 """Positions of the samples that are kept, px from the edge towards the bright side."""
 
 
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Average brightness of dark and of bright pixels, and the noise of dark pixels."""
+
+    dark: float
+    bright: float
+    noise: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanLines:
-    """The lines that were read: light along columns and rows.
+    """The columns and rows that were read.
 
     Attributes:
         columns, rows: the indices of the lines.
-        column_bright, row_bright: (n, m) the lines made binary and filtered.
-        space: px between them.
-        levels: average light of the dark and of the bright, and the dark's noise.
+        column_bright, row_bright: the lines made binary and filtered (n, m).
+        space: distance between the lines, px.
+        levels: brightness of dark and bright pixels.
     """
 
     columns: IntArray
@@ -77,7 +85,7 @@ class ScanLines:
     column_bright: BoolArray
     row_bright: BoolArray
     space: float
-    levels: tuple[float, float, float]
+    levels: Levels
 
     @property
     def pixels(self) -> int:
@@ -86,14 +94,11 @@ class ScanLines:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nearby:
-    """A part of the picture to be read more closely: its `box` (2, 2) px, least and greatest x, y.
-
-    `levels` are those of the whole picture, see `ScanLines`.
-    """
+class ImagePart:
+    """A part of an image for a closer search: lowest and highest x, y (2, 2), px, and the image's levels."""
 
     box: FloatArray
-    levels: tuple[float, float, float]
+    levels: Levels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,120 +106,100 @@ class ScanEdges:
     """Places where a scan line changes from dark to bright.
 
     Attributes:
-        points: (n, 2) px.
-        towards: (n, 2) unit steps along the line to the bright side.
-        scale: (n,) px, the Gaussian's that found it.
-        contrast: (n,) the step's height over high - low.
-        sigma: (n,) px along the line, before a fit.
-        background: (n,) light on the dark side: next to the limb and the terminator there is none, next to a
-            coast or a cloud there is.
-        profile: (n, m) light along the line from dark to bright, about the pixel nearest to the point; NaN
-            beyond the picture.
+        points: positions (n, 2), px.
+        towards: unit steps along the line to the bright side (n, 2).
+        scale: scale of the Gaussian that found the edge (n,), px.
+        sigma: standard deviation of the position along the line before a fit (n,), px.
+        background: brightness of the dark side (n,); it is low next to the limb and the terminator, and
+            higher next to a coast or a cloud.
+        profile: brightness along the line from dark to bright around the edge (n, m); NaN outside the image.
     """
 
     points: FloatArray
     towards: FloatArray
     scale: FloatArray
-    contrast: FloatArray
     sigma: FloatArray
     background: FloatArray
     profile: FloatArray
 
     @property
     def profile_steps(self) -> FloatArray:
-        """Where the profile's samples lie (n, m), px from the point towards the bright side."""
-        # A line's place times the direction: its rounding is the pixel nearest to the edge.
+        """The positions of the profile's samples (n, m), px from the edge towards the bright side."""
+        # The profile is centred on the pixel nearest to the edge.
         place = np.sum(self.points * self.towards, axis=1)
         return np.asarray((np.rint(place) - place)[:, None] + _PROFILE)
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def chosen(self, which: BoolArray | IntArray) -> ScanEdges:
-        """Return the edges `which`, flags (n,) or indices."""
-        return ScanEdges(*(getattr(self, each.name)[which] for each in fields(self)))
-
 
 def find_edges(
-    access: PixelAccess, settings: EdgeSettings, near: Nearby | None = None
+    image: Image, settings: EdgeSettings, part: ImagePart | None = None
 ) -> tuple[ScanEdges, ScanLines]:
-    """Return the edges on evenly spaced columns and rows, and these lines; no other pixel is read.
+    """Return the edges on evenly spaced columns and rows of an image (rows, columns), and these lines.
 
-    `near` restricts the lines to those that cross a part of the picture.
+    With `part`, only the lines that cross that part of the image are read.
     """
-    columns, rows = _places(access.columns, settings.lines), _places(access.rows, settings.lines)
-    if near is not None:
-        columns, rows = (_within(x, near.box[:, axis]) for axis, x in enumerate((columns, rows)))
-    space = max(1.0, max(access.columns, access.rows) / settings.lines)
-    light = [
-        light_of(access.read_columns(columns), settings.response),
-        light_of(access.read_rows(rows), settings.response),
-    ]
-    low, high, noise = near.levels if near is not None else _levels(light)
-    level = low + max(settings.threshold * (high - low), _STANDS_OUT * noise)
-    bright = [run_filtered(lines > level, settings.run) for lines in light]
-    lines = ScanLines(columns, rows, bright[0], bright[1], space, (low, high, noise))
-    if not high > low or not len(columns) + len(rows):
-        return _NOTHING, lines
-    edges = _line_edges(light, bright, (columns, rows), high - low, settings.contrast)
+    places = []
+    for axis, size in enumerate((image.shape[1], image.shape[0])):
+        lines = min(settings.lines, size)
+        place = np.asarray((np.arange(lines) + 0.5) * size / lines, dtype=int)
+        if part is not None:
+            place = place[(place >= part.box[0, axis]) & (place <= part.box[1, axis])]
+        places.append(place)
+    columns, rows = places
+    space = max(1.0, max(image.shape) / settings.lines)
+    light = [light_of(each, settings.response) for each in (image[:, columns].T, image[rows])]
+    levels = part.levels if part is not None else _levels(light)
+    span = levels.bright - levels.dark
+    threshold = levels.dark + max(settings.threshold * span, _STANDS_OUT * levels.noise)
+    bright = [run_filtered(each > threshold, settings.run) for each in light]
+    read = ScanLines(columns, rows, bright[0], bright[1], space, levels)
+    if not levels.bright > levels.dark or not len(columns) + len(rows):
+        none = np.zeros(0)
+        empty = np.zeros((0, 2))
+        return ScanEdges(empty, empty, none, none, none, np.zeros((0, len(_PROFILE)))), read
+    edges = _line_edges(light, bright, (columns, rows), settings.contrast * span)
     most = settings.most * settings.lines
     if len(edges) > most:
-        edges = edges.chosen(np.argsort(edges.background, kind="stable")[:most])
-    return edges, lines
+        edges = select(edges, np.argsort(edges.background, kind="stable")[:most])
+    return edges, read
 
 
-def _within(places: IntArray, ends: FloatArray) -> IntArray:
-    return np.asarray(places[(places >= ends[0]) & (places <= ends[1])])
+def _levels(light: list[FloatArray]) -> Levels:
+    """Return the brightness levels of lines; both levels are equal if no pixel is lit.
 
-
-def _places(size: int, lines: int) -> IntArray:
-    """Return the indices of `lines` evenly spaced lines of `size`, half a space from the border."""
-    lines = min(lines, size)
-    return np.asarray((np.arange(lines) + 0.5) * size / lines, dtype=int)
-
-
-def _levels(light: list[FloatArray]) -> tuple[float, float, float]:
-    """Return the average light of the dark and of the bright, and the dark's noise; equal where all is dark.
-
-    Pixels above the dark's noise are bright; their median excludes the Sun's disc and hot pixels.
+    The median of the pixels above the noise of the dark pixels excludes the Sun's disc and hot pixels.
     """
-    samples, steps = (np.concatenate(each) for each in zip(*map(_samples, light), strict=True))
-    order = np.sort(samples)
+    samples, steps = [], []
+    for lines in light:
+        pace = max(1, lines.size // _SAMPLES)
+        samples.append(lines[:, :-1].ravel()[::pace])
+        steps.append(lines[:, 1:].ravel()[::pace] - samples[-1])
+    values = np.concatenate(samples)
+    order = np.sort(values)
     least, most = float(order[len(order) // 50]), float(order[-1 - len(order) // 200])
-    dark = np.abs(steps[samples <= least + 0.1 * (most - least)])
+    dark = np.abs(np.concatenate(steps)[values <= least + 0.1 * (most - least)])
     middle = len(dark) // 2
     noise = float(np.partition(dark, middle)[middle]) * _STEP_TO_SIGMA
-    # The least of fifty lies two deviations low.
+    # The second percentile lies two standard deviations below the mean.
     low = least + 2.0 * noise
     lit = order[np.searchsorted(order, low + max(_STANDS_OUT * noise, 0.05 * (most - low)), "right") :]
     if len(lit) < _LEAST_LIT or most <= low:
-        return low, low, noise
-    return low, float(lit[len(lit) // 2]), noise
-
-
-def _samples(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return some of the lines' pixels, and their differences from the next pixel on the line."""
-    pace = max(1, lines.size // _SAMPLES)
-    here = lines[:, :-1].ravel()[::pace]
-    return here, lines[:, 1:].ravel()[::pace] - here
-
-
-_NONE: FloatArray = np.zeros(0)
-_NOTHING = ScanEdges(
-    np.zeros((0, 2)), np.zeros((0, 2)), _NONE, _NONE, _NONE, _NONE, np.zeros((0, len(_PROFILE)))
-)
+        return Levels(low, low, noise)
+    return Levels(low, float(lit[len(lit) // 2]), noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BinaryChanges:
-    """Where binary lines change, columns and rows as one row of pixels after another.
+    """Changes of the binary lines, whose pixels stand one line after another in a flat array.
 
     Attributes:
-        light: (s,) of all lines.
-        first: (k,) index of the pixel with which the change's line begins.
-        length: (k,) px of that line.
-        start: (k,) px along it, the change's pixel on the bright side.
-        step: (k,) 1 or -1, to the bright side.
+        light: brightness of all lines (s,).
+        first: index of the first pixel of the line of each change (k,).
+        length: length of that line (k,), px.
+        start: position of the bright pixel of the change along the line (k,), px.
+        step: 1 or -1, the direction to the bright side (k,).
     """
 
     light: FloatArray
@@ -223,20 +208,16 @@ class _BinaryChanges:
     start: IntArray
     step: IntArray
 
-    def along(self, which: IntArray | slice, index: IntArray) -> FloatArray:
-        """Return the light (k, m) of the lines of those changes at places (k, m) along them."""
+    def along(self, which: IntArray, index: IntArray) -> FloatArray:
+        """Return the brightness (k, m) at positions `index` (k, m) on the lines of the changes `which`."""
         last = self.length[which, None] - 1
         return np.asarray(self.light[self.first[which, None] + np.minimum(np.maximum(index, 0), last)])
 
 
 def _line_edges(
-    light: list[FloatArray],
-    bright: list[BoolArray],
-    places: tuple[IntArray, IntArray],
-    span: float,
-    least: float,
+    light: list[FloatArray], bright: list[BoolArray], places: tuple[IntArray, IntArray], contrast: float
 ) -> ScanEdges:
-    """Return the edges of columns and rows (n, m) each, that lie at `places` (n,)."""
+    """Return the edges of columns and of rows (n, m) at `places` (n,), of a height above `contrast`."""
     parts, read = [], 0
     for direction, binary in enumerate(bright):
         line, before = np.nonzero(binary[:, 1:] != binary[:, :-1])
@@ -246,35 +227,33 @@ def _line_edges(
         read += binary.size
     begin, length, at, rising, other, axis = (np.concatenate(each) for each in zip(*parts, strict=True))
     step = np.where(rising, 1, -1)
-    changes = _BinaryChanges(
-        np.concatenate([each.ravel() for each in light]), begin, length, at + rising, step
-    )
-    offset, scale, height = _refined(changes, least * span)
+    flat = np.concatenate([each.ravel() for each in light])
+    changes = _BinaryChanges(flat, begin, length, at + rising, step)
+    offset, scale, height = _steepest_points(changes, contrast)
     place = changes.start + step * offset
     margin = np.maximum(_MARGIN, 0.5 * scale)
-    kept = np.flatnonzero((height > least * span) & (place > margin) & (place < length - 1 - margin))
-    place, scale, height = place[kept], scale[kept], height[kept] / span
+    kept = np.flatnonzero((height > contrast) & (place > margin) & (place < length - 1 - margin))
+    place, scale = place[kept], scale[kept]
     step, other, axis, last = step[kept], other[kept], axis[kept], length[kept] - 1
     count = np.arange(len(kept))
     points, towards = np.empty((len(kept), 2)), np.zeros((len(kept), 2))
-    # On a column, axis 0, the place is y.
+    # On a column (axis 0) the place is y.
     points[count, axis], points[count, 1 - axis], towards[count, 1 - axis] = other, place, step
     index = np.rint(place).astype(int)[:, None] + step[:, None] * _PROFILE
     profile = changes.along(kept, index)
     profile[(index < 0) | (index > last[:, None])] = np.nan
     behind: IntArray = np.rint(place - step * (_REACH * scale + 4.0)).astype(int)
     background = changes.along(kept, behind[:, None])[:, 0]
-    return ScanEdges(points, towards, scale, height, _FLOOR + _SHARE * scale, background, profile)
+    return ScanEdges(points, towards, scale, _FLOOR + _SHARE * scale, background, profile)
 
 
-def _refined(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return offsets (k,) px from each start towards the bright, scales (k,), heights of the steps (k,).
+def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the steepest points of lines: offset from the start, px, scale, px, and step height, (k,) each.
 
-    A step lower than `weak` is not an edge.
+    The height is that of a sharp step with the same slope. A step lower than `weak` is not an edge.
     """
     count = len(changes.start)
-    offset, height = np.zeros(count), np.zeros(count)
-    scale = np.ones(count)
+    offset, height, scale = np.zeros(count), np.zeros(count), np.ones(count)
     open_ = np.arange(count)
     largest = changes.length / (4.0 * (_REACH + _TAIL))
     for size in _SCALES:
@@ -282,8 +261,15 @@ def _refined(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArr
             open_ = open_[largest[open_] >= size]
         if not len(open_):
             break
-        place, peak = _steepest(changes, open_, size)
-        # Noise steeper than a wide edge is at a small scale must not end the search there.
+        window, slope, reach = _slope_matrix(size)
+        index = changes.start[open_, None] + changes.step[open_, None] * window
+        slopes = changes.along(open_, index) @ slope
+        best = np.minimum(np.maximum(np.argmax(slopes, axis=1), 1), slopes.shape[1] - 2)
+        k = np.arange(len(open_))
+        left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
+        bend = np.minimum(left - 2.0 * peak + right, -1e-300)
+        place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
+        # Noise can be steeper at a small scale than a wide edge: it must not end the search there.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]
@@ -291,29 +277,17 @@ def _refined(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArr
     return offset, scale, height
 
 
-def _steepest(changes: _BinaryChanges, which: IntArray, size: float) -> tuple[FloatArray, FloatArray]:
-    """Return where (k,) each line is steepest near its start, and the height of a sharp step as steep."""
-    window, slope, reach = _slope(size)
-    index = changes.start[which, None] + changes.step[which, None] * window
-    slopes = changes.along(which, index) @ slope
-    best = np.minimum(np.maximum(np.argmax(slopes, axis=1), 1), slopes.shape[1] - 2)
-    k = np.arange(len(which))
-    left, middle, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
-    bend = np.minimum(left - 2.0 * middle + right, -1e-300)
-    shift = np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-    return best - reach + shift, middle
-
-
 @lru_cache(maxsize=16)
-def _slope(size: float) -> tuple[IntArray, FloatArray, int]:
-    """Return offsets (w,) px, the matrix (w, p) from light there to slopes at places about 0, their reach.
+def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
+    """Return offsets (w,), px, and the matrix (w, p) from the brightness there to slopes at p places near 0.
 
-    A sharp unit step has the slope 1 at every scale.
+    The third value is the distance of the outermost of these places, px. A sharp unit step has the slope 1 at
+    every scale `size`, px.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
     kernel = x * np.exp(-0.5 * (x / size) ** 2)
-    # A step between two pixels: the sum over one side.
+    # The response to a step between two pixels is the sum over one side.
     kernel = kernel / np.sum(kernel[x > 0])
     window = np.arange(-reach - half, reach + half + 1)
     matrix = np.zeros((len(window), 2 * reach + 1))
@@ -322,8 +296,6 @@ def _slope(size: float) -> tuple[IntArray, FloatArray, int]:
     return window, matrix, reach
 
 
-_RIGHT: FloatArray = np.array([1.0, 0.0])
-_DOWN: FloatArray = np.array([0.0, 1.0])
 _SAMPLE = 32
 """Distance between samples along a line (px)."""
 
@@ -333,9 +305,9 @@ class EdgeRays:
     """Edges as directions.
 
     Attributes:
-        rays: (n, 3) unit, camera axes.
-        brighter: (n, 3) the ray's change over one pixel towards the bright side along the scan line.
-        pixel: (n,) rad, the size of a pixel there.
+        rays: unit vectors (n, 3), camera axes.
+        brighter: change of the ray per pixel towards the bright side along the scan line (n, 3).
+        pixel: size of a pixel there (n,), rad.
     """
 
     rays: FloatArray
@@ -345,14 +317,10 @@ class EdgeRays:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def chosen(self, which: BoolArray | IntArray) -> EdgeRays:
-        """Return the edges `which`, flags (n,) or indices."""
-        return EdgeRays(self.rays[which], self.brighter[which], self.pixel[which])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Pixels on the lines that were read: directions (m, 3), and whether they are bright (m,)."""
+    """Pixels on the scan lines: directions (m, 3), and whether they are bright (m,)."""
 
     rays: FloatArray
     bright: BoolArray
@@ -360,14 +328,14 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Edges and samples as seen from the camera.
+    """Edges and samples as directions from the camera.
 
     Attributes:
-        space: px between the lines that were read.
-        edges: in pixels.
-        rays: the same as directions.
-        across, down: (n, 3) the ray's change over a pixel to the right, and downwards.
-        samples: where it is bright.
+        space: distance between the scan lines, px.
+        edges: the edges in pixels.
+        rays: the edges as directions.
+        across, down: change of the ray per pixel to the right and downwards (n, 3).
+        samples: samples along the scan lines.
     """
 
     space: float
@@ -381,38 +349,32 @@ class Observation:
 def observe(
     edges: ScanEdges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
 ) -> Observation:
-    """Return edges and samples as directions; edges outside the lens's image are excluded.
+    """Return edges and samples as directions, without edges that the lens does not image.
 
-    `samples` replace those of the lines.
+    `samples` replace those of the lines, if they are given.
     """
     count = len(edges)
-    rays = camera.unit_vectors(np.concatenate([edges.points, edges.points + _RIGHT, edges.points + _DOWN]))
+    right, below = edges.points + np.array([1.0, 0.0]), edges.points + np.array([0.0, 1.0])
+    rays = camera.unit_vectors(np.concatenate([edges.points, right, below]))
     here = rays[:count]
     across, down = rays[count : 2 * count] - here, rays[2 * count :] - here
     seen = np.isfinite(here[:, 0]) & np.isfinite(across[:, 0]) & np.isfinite(down[:, 0])
     if not seen.all():
-        edges, here, across, down = edges.chosen(seen), here[seen], across[seen], down[seen]
+        edges, here, across, down = select(edges, seen), here[seen], across[seen], down[seen]
     brighter = edges.towards[:, :1] * across + edges.towards[:, 1:] * down
-    return Observation(
-        lines.space,
-        edges,
-        EdgeRays(here, brighter, np.sqrt(np.einsum("ij,ij->i", brighter, brighter))),
-        across,
-        down,
-        _samples_of_lines(lines, camera) if samples is None else samples,
-    )
+    if samples is None:
+        sampled, imaged = _sample_rays(
+            Lens.of(camera), tuple(lines.columns.tolist()), tuple(lines.rows.tolist())
+        )
+        binary = (lines.column_bright, lines.row_bright)
+        bright = np.concatenate([each[:, _sample_places(each.shape[1])].ravel() for each in binary])
+        samples = Samples(sampled, bright[imaged])
+    pixel = np.sqrt(np.einsum("ij,ij->i", brighter, brighter))
+    return Observation(lines.space, edges, EdgeRays(here, brighter, pixel), across, down, samples)
 
 
-def _samples_of_lines(lines: ScanLines, camera: CameraModel) -> Samples:
-    bright = []
-    for binary in (lines.column_bright, lines.row_bright):
-        bright.append(binary[:, _along(binary.shape[1])].ravel())
-    rays, imaged = _sample_rays(Lens.of(camera), tuple(lines.columns.tolist()), tuple(lines.rows.tolist()))
-    return Samples(rays, np.concatenate(bright)[imaged])
-
-
-def _along(size: int) -> IntArray:
-    """Return the places of the samples along a line of `size` px."""
+def _sample_places(size: int) -> IntArray:
+    """Return the positions of the samples along a line of `size` px."""
     return np.arange(_SAMPLE // 2, size, _SAMPLE * max(1, size // 512))
 
 
@@ -420,14 +382,14 @@ def _along(size: int) -> IntArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return directions (m, 3) of the samples on those lines, and which of all of them the lens images.
+    """Return the directions (m, 3) of the samples on the given lines, and which samples the lens images.
 
-    They are the same in frame after frame.
+    The result is cached, because it is the same in successive frames.
     """
-    x, y = np.meshgrid(columns, _along(camera.rows), indexing="ij")
-    other_y, other_x = np.meshgrid(rows, _along(camera.columns), indexing="ij")
-    points = np.concatenate(
-        [np.stack([x.ravel(), y.ravel()], axis=1), np.stack([other_x.ravel(), other_y.ravel()], axis=1)]
+    x, y = np.meshgrid(columns, _sample_places(camera.rows), indexing="ij")
+    other_y, other_x = np.meshgrid(rows, _sample_places(camera.columns), indexing="ij")
+    points = np.stack(
+        [np.concatenate([x.ravel(), other_x.ravel()]), np.concatenate([y.ravel(), other_y.ravel()])], axis=1
     )
     rays = camera.unit_vectors(points.astype(float))
     imaged = np.isfinite(rays[:, 0])

@@ -10,11 +10,11 @@ that pieces are counted instead of scan lines.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.horizon.edges import Observation
 from knightcube.vision.horizon.illumination import (
@@ -25,12 +25,7 @@ from knightcube.vision.horizon.illumination import (
     limb_rays,
     sun_elevation,
 )
-from knightcube.vision.horizon.initial_guess import (
-    SPHERE_ALTITUDE_SIGMA,
-    InitialGuess,
-    Place,
-    sun_from,
-)
+from knightcube.vision.horizon.initial_guess import SPHERE_ALTITUDE_SIGMA, InitialGuess, sun_from
 from knightcube.vision.horizon.limb import (
     SCALE_HEIGHT,
     UNIT_DEPTH_HEIGHT,
@@ -38,7 +33,6 @@ from knightcube.vision.horizon.limb import (
     FittedLimb,
     LimbView,
     Prior,
-    crossed,
     fit_limb,
     fit_profiles,
     limb_gradients,
@@ -49,11 +43,11 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
 """Least cosine between a scan line and the normal of the limb: a more oblique line is inaccurate."""
-LOWEST_SUN = np.radians(1.0)
+_LOWEST_SUN = np.radians(1.0)
 """Least elevation of the Sun at a limb point (rad): with a lower Sun the limb appears higher."""
 _FINE = SCALE_HEIGHT / 6.0
 """Pixel size (m) below which the steepest point is used: the profile exceeds the samples that are kept."""
-_ALIKE = 10.0
+_CORRELATED = 10.0
 """Correlation length (px) of the brightness behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of the blur by a square pixel (px)."""
@@ -68,12 +62,12 @@ class LimbPoints:
     """The edges assigned to the limb.
 
     Attributes:
-        index: (n,) which of the picture's edges they are.
-        rays: (n, 3).
-        sigma: (n,) rad, their spreads normal to the limb.
-        pixel: (n,) rad, a pixel's size there normal to the limb.
-        inward: (n,) cosine of the angle between scan line and the way across the limb.
-        residuals, gradients: (n,) and (n, 5), of the edges, see `limb_gradients`.
+        index: numbers of the edges of the image (n,).
+        rays: directions (n, 3).
+        sigma: standard deviations normal to the limb (n,), rad.
+        pixel: size of a pixel normal to the limb (n,), rad.
+        inward: cosine of the angle between the scan line and the normal of the limb (n,).
+        residuals, gradients: residuals (n,) and their gradients (n, 5), see `limb_gradients`.
     """
 
     index: IntArray
@@ -84,63 +78,52 @@ class LimbPoints:
     residuals: FloatArray
     gradients: FloatArray
 
-    def chosen(self, which: BoolArray) -> LimbPoints:
-        """Return the points `which` (n,)."""
-        return LimbPoints(*(getattr(self, each.name)[which] for each in fields(self)))
-
 
 def near_limb(view: LimbView, observation: Observation, tolerance: float) -> BoolArray:
-    """Return which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
+    """Return which edges (n,) lie within `tolerance` px of the limb, with their bright side towards nadir."""
     near = np.abs(limb_residuals(view, observation.rays.rays)) < tolerance * observation.rays.pixel
     return np.asarray(near & (observation.rays.brighter @ view.nadir > 0.0))
 
 
-def limb_points(
+def _limb_points(
     view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
     """Return the members in daylight whose scan line is not too oblique to the limb."""
     chosen = np.flatnonzero(members)
     rays = observation.rays.rays[chosen]
     if sun is not None:
-        day = sun_elevation(view, rays, sun) > LOWEST_SUN
+        day = sun_elevation(view, rays, sun) > _LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
-    slopes = _slopes(observation, chosen, rays, gradients)
+    # A step s of the ray u changes the residual as the rotation d = u x s does. The slopes (n, 2) are per
+    # pixel to the right and downwards.
+    turns = np.cross(gradients[:, :3], rays)
+    steps = observation.across[chosen], observation.down[chosen]
+    slopes = -np.stack([np.einsum("ij,ij->i", turns, step) for step in steps], axis=1)
     size = np.sqrt(np.einsum("ij,ij->i", slopes, slopes))
     inward = -np.einsum("ij,ij->i", slopes, observation.edges.towards[chosen]) / size
     sigma = observation.edges.sigma[chosen] * inward * size
     points = LimbPoints(chosen, rays, sigma, size, inward, residuals, gradients)
-    return points.chosen(inward > _GRAZING)
+    return select(points, inward > _GRAZING)
 
 
-def placed_by_profile(
+def _placed_by_profile(
     view: LimbView, observation: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
-    """Return the points placed by the limb's profile if pixels are coarse enough for it."""
-    reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
-    metres = limb.pixel * reach
+    """Return the points at the positions that a fit of their profiles gives, if pixels are coarse enough."""
+    metres = limb.pixel * view.limb_distance
     if not len(metres) or float(np.median(metres)) < _FINE:
         return limb
     blur = np.hypot(settings.edges.psf_sigma, _PIXEL_SIGMA) * metres
-    edges = observation.edges.chosen(limb.index)
+    edges = select(observation.edges, limb.index)
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
     rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
-    # Lines closer together than the ground's features are not independent.
-    alike = np.sqrt(max(1.0, _ALIKE / observation.space))
+    # Lines closer together than the features of the ground are not independent.
+    correlated = np.sqrt(max(1.0, _CORRELATED / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
-    sigma = alike * np.hypot(spread, least) * limb.inward * limb.pixel
-    return replace(limb, rays=rays, sigma=sigma).chosen(sound)
-
-
-def _slopes(
-    observation: Observation, chosen: IntArray, rays: FloatArray, gradients: FloatArray
-) -> FloatArray:
-    """Return the residuals' change (n, 2) rad a pixel to the right and downwards, from gradients (n, 5)."""
-    # The effect of a turn d on a residual, g (d x u), a step s of the ray u does with d = u x s.
-    turns = crossed(gradients[:, :3], rays)
-    across, down = observation.across[chosen], observation.down[chosen]
-    return -np.stack([np.einsum("ij,ij->i", turns, step) for step in (across, down)], axis=1)
+    sigma = correlated * np.hypot(spread, least) * limb.inward * limb.pixel
+    return select(replace(limb, rays=rays, sigma=sigma), sound)
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
@@ -153,12 +136,12 @@ _BESIDE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class LimbInView:
-    """The limb in a picture.
+    """The limb in an image.
 
     Attributes:
-        length: px, of the part that should show edges.
-        crossings: of that part and the scan lines.
-        all_crossings: of all that is in the picture, and the scan lines.
+        length: length of the part that should show edges, px.
+        crossings: number of crossings of that part with the scan lines.
+        all_crossings: number of crossings of the whole limb in the image with the scan lines.
     """
 
     length: float
@@ -169,15 +152,19 @@ class LimbInView:
 def limb_in_view(
     points: FloatArray, inside: BoolArray, due: BoolArray, space: tuple[float, float]
 ) -> LimbInView:
-    """Return a closed limb `points` (n, 2) px where they are `inside` the picture (n,), and `due` (n,) there.
+    """Return the limb in an image.
 
-    `space` is px between the columns that are read, and between the rows.
+    Args:
+        points: a closed limb (n, 2), px.
+        inside: which of its points are inside of the image (n,).
+        due: which of them should show an edge (n,).
+        space: distance between the columns that are read, and between the rows, px.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)
     both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
     size = np.hypot(step[:, 0], step[:, 1])
-    # A column is crossed where the limb goes along x.
+    # A step along x crosses columns, and a step along y crosses rows.
     crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
     return LimbInView(
         *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
@@ -187,33 +174,34 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the bound on chance cones as good as a limb.
+    """Return log10 of the bound of the number of chance cones that fit as well as a limb.
 
-    `residuals` (k,) px are those of its edges, `others` (m,) px the distances of all other edges from the
-    limb; `unknowns` is 2 for nadir, 3 with the altitude.
+    Args:
+        limb: the limb in the image.
+        residuals: residuals of its edges (k,), px.
+        others: distances of all other edges from the limb (m,), px.
+        camera: the camera.
+        unknowns: number of fitted parameters: 2 for nadir, 3 with the altitude.
     """
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge is added: without an edge beside the limb the density is still not zero.
+    # One edge is added, so that the density is not zero if no edge lies beside the limb.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
     for gate in _GATES:
-        hits = np.count_nonzero(np.abs(residuals) <= gate) / lines
+        share = np.count_nonzero(np.abs(residuals) <= gate) / lines
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        best = min(best, cones + _log10_tail(pieces, hits, chance))
+        # The probability that this share of the pieces or more is hit by chance (Chernoff's bound).
+        tail = 0.0
+        if share > chance:
+            rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
+            tail = -pieces * (share * math.log(share / chance) + rest) / math.log(10.0)
+        best = min(best, cones + tail)
     return best
-
-
-def _log10_tail(number: float, share: float, chance: float) -> float:
-    """Return log10 of the probability that a `share` of `number` or more happens (Chernoff's bound)."""
-    if share <= chance:
-        return 0.0
-    rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
-    return -number * (share * math.log(share / chance) + rest) / math.log(10.0)
 
 
 _UNKNOWN_TURN = 1.0
@@ -221,6 +209,7 @@ _UNKNOWN_TURN = 1.0
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun (rad) below which an edge is not the limb."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
+"""Numbers of points along the limb for its coverage and for its significance."""
 _BORDER = 8.0
 """Distance from the image border (px) within which the limb needs no edges."""
 _NEAR = 0.0375
@@ -232,20 +221,20 @@ class Hypothesis:
     """A fitted horizon and the evidence for and against it.
 
     Attributes:
-        fit: the limb.
-        members: (n,) the picture's edges that lie on it.
-        limb: those edges, where the fit places them.
-        residual: px rms normal to the limb, of the members.
+        fit: the fitted limb.
+        members: which edges of the image lie on it (n,).
+        limb: these edges at their fitted positions.
+        residual: rms distance of the members from the limb, px.
         guess: start of the fit.
-        lighting: how the picture agrees with it.
-        coverage: the share of the lit limb that runs through the picture near a member; 1 where there is
-            none.
-        night: the share of members where the Sun is well below the horizon.
-        allowance: rad an axis, added to the covariance for unmodelled effects.
-        chance: log10 of the expected number of cones as good among chance edges, see `log10_chance`.
-        breadth: of the members' edges over the air's, medians.
-        altitude_off: sigmas by which a fitted altitude lies beyond `HorizonSettings.altitudes`; 0 for a
-            known one.
+        lighting: agreement with the brightness of the image.
+        coverage: fraction of the sunlit limb in the image that has a member nearby; 1 if no such limb is in
+            the image.
+        night: fraction of the members at which the Sun is well below the horizon.
+        allowance: standard deviation per axis of unmodelled effects, rad.
+        chance: log10 of the expected number of chance cones that fit as well, see `log10_chance`.
+        breadth: median breadth of the members' edges, relative to that of the air.
+        altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in its standard
+            deviations; 0 for a known altitude.
     """
 
     fit: FittedLimb
@@ -263,7 +252,7 @@ class Hypothesis:
 
     @property
     def covariance(self) -> FloatArray:
-        """The nadir's covariance (3, 3) rad^2, allowances included."""
+        """The covariance (3, 3) of the nadir, rad^2, including the allowance."""
         nadir = self.fit.view.nadir
         across = np.eye(3) - np.outer(nadir, nadir)
         return np.asarray(self.fit.nadir_covariance + self.allowance**2 * across)
@@ -276,94 +265,71 @@ def examine(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> Hypothesis | None:
-    """Return the horizon fitted from a guess and tested; None if no limb can be fitted."""
+    """Return the horizon fitted from a guess, with the evidence; None if no limb can be fitted."""
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
-    fitted = _fitted(guess.view, observation, guess.members, sun, settings, prior)
+    fitted = _fitted(guess, observation, sun, settings, prior)
     if fitted is None:
         return None
     fit, limb = fitted
-    members = near_limb(fit.view, observation, settings.tolerance)
+    view, altitude_known = fit.view, place.altitude_sigma < UNKNOWN
+    members = near_limb(view, observation, settings.tolerance)
     used = np.zeros(len(observation.edges), dtype=bool)
     used[limb.index[fit.used]] = True
     night = 0.0
     if sun is not None and np.any(members):
-        night = float(np.mean(sun_elevation(fit.view, observation.rays.rays[members], sun) < _NIGHT))
+        night = float(np.mean(sun_elevation(view, observation.rays.rays[members], sun) < _NIGHT))
+    air = UNIT_DEPTH_HEIGHT / (view.limb_distance * float(np.median(observation.rays.pixel[used])))
+    altitude_off = 0.0
+    if not altitude_known:
+        (low, high), altitude = settings.altitudes, view.surface.height_of(view.position)
+        altitude_off = max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
+    # The part of the limb that is known to lie in the night needs no edges.
+    rays = limb_rays(view, _FINE_RAYS)
+    points = camera.project(rays)
+    inside = camera.contains(points, -_BORDER)
+    due: BoolArray = inside if sun is None else sun_elevation(view, rays, sun) > _LOWEST_SUN
+    columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
+    others = (limb_residuals(view, observation.rays.rays) / observation.rays.pixel)[~used]
+    residuals = (fit.residuals / limb.pixel)[fit.used]
+    in_view = limb_in_view(points, inside, due, (columns, rows))
+    chance = log10_chance(in_view, residuals, others, camera, 2 if altitude_known else 3)
     return Hypothesis(
         fit,
         used,
-        limb.chosen(fit.used),
-        float(np.sqrt(np.mean((fit.residuals / limb.pixel)[fit.used] ** 2))),
+        select(limb, fit.used),
+        float(np.sqrt(np.mean(residuals**2))),
         guess,
-        agreement(fit.view, sun, observation.samples),
-        _coverage(fit.view, observation, used, sun, camera),
+        agreement(view, sun, observation.samples),
+        _coverage(view, observation, used, sun, camera),
         night,
         settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
-        _chance(guess, fit, limb, observation, used, sun, camera, settings),
-        _breadth(fit.view, observation, used, settings),
-        _altitude_off(fit, place, settings),
+        chance + math.log10(stand.share),
+        float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma),
+        altitude_off,
     )
 
 
-def _altitude_off(fit: FittedLimb, place: Place, settings: HorizonSettings) -> float:
-    if place.altitude_sigma < UNKNOWN:
-        return 0.0
-    (low, high), altitude = settings.altitudes, fit.view.surface.height_of(fit.view.position)
-    return max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
-
-
-def _chance(
-    guess: InitialGuess,
-    fit: FittedLimb,
-    limb: LimbPoints,
-    observation: Observation,
-    used: BoolArray,
-    sun: FloatArray | None,
-    camera: CameraModel,
-    settings: HorizonSettings,
-) -> float:
-    """Return log10 of the number of chance cones; limb that is known to lie in the night needs no edges."""
-    rays = limb_rays(fit.view, _FINE_RAYS)
-    points = camera.project(rays)
-    inside = camera.contains(points, -_BORDER)
-    due: BoolArray = inside if sun is None else sun_elevation(fit.view, rays, sun) > LOWEST_SUN
-    columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
-    others = (limb_residuals(fit.view, observation.rays.rays) / observation.rays.pixel)[~used]
-    residuals = (fit.residuals / limb.pixel)[fit.used]
-    in_view = limb_in_view(points, inside, due, (columns, rows))
-    unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
-    chance = log10_chance(in_view, residuals, others, camera, unknowns)
-    return chance + math.log10(guess.orientation.share)
-
-
-def _breadth(view: LimbView, observation: Observation, used: BoolArray, settings: HorizonSettings) -> float:
-    """Return the breadth of the used edges over that of the air and the blur."""
-    reach = math.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
-    air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(observation.rays.pixel[used])))
-    return float(np.median(observation.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma)
-
-
 def _fitted(
-    view: LimbView,
+    guess: InitialGuess,
     observation: Observation,
-    members: BoolArray,
     sun: FloatArray | None,
     settings: HorizonSettings,
     prior: Prior,
 ) -> tuple[FittedLimb, LimbPoints] | None:
-    """Return the limb through the members, and the places it was fitted to; None if the fit fails.
+    """Return the limb fitted to the members of a guess, and the fitted points; None if the fit fails.
 
-    One step towards the steepest places of the edges, and from there the fit to their profiles.
+    One step uses the steepest points of the edges; the fit that follows uses their profiles.
     """
-    limb = limb_points(view, observation, members, sun)
+    limb = _limb_points(guess.view, observation, guess.members, sun)
     if len(limb.index) < settings.least_edges:
         return None
-    start = stepped(view, limb.residuals, limb.gradients, limb.sigma, prior)
+    start = stepped(guess.view, limb.residuals, limb.gradients, limb.sigma, prior)
     if start is None:
         return None
-    limb = limb_points(start, observation, near_limb(start, observation, settings.tolerance), sun)
-    limb = placed_by_profile(start, observation, limb, settings)
+    limb = _limb_points(start, observation, near_limb(start, observation, settings.tolerance), sun)
+    limb = _placed_by_profile(start, observation, limb, settings)
     if len(limb.index) < settings.least_edges:
         return None
     fit = fit_limb(start, limb.rays, limb.sigma, prior)
@@ -373,13 +339,9 @@ def _fitted(
 
 
 def _coverage(
-    view: LimbView,
-    observation: Observation,
-    used: BoolArray,
-    sun: FloatArray | None,
-    camera: CameraModel,
+    view: LimbView, observation: Observation, used: BoolArray, sun: FloatArray | None, camera: CameraModel
 ) -> float:
-    """Return the share of the limb in view, of the lit one where the Sun is known, near a used edge."""
+    """Return the fraction of the limb in view, of the sunlit limb if the Sun is known, near a used edge."""
     rays = limb_rays(view, _LIMB_RAYS)
     if sun is not None:
         plain = (sun_elevation(view, rays, sun) > DAYLIGHT) & (rays @ (view.rotation @ sun) < np.cos(GLARE))
@@ -388,10 +350,7 @@ def _coverage(
     points = points[camera.contains(points, -_BORDER)]
     if not len(points):
         return 1.0
-    space = _NEAR * max(camera.columns, camera.rows)
     edges = observation.edges.points[used]
-    apart = np.maximum(
-        np.abs(points[:, :1] - edges[:, 0]),
-        np.abs(points[:, 1:] - edges[:, 1]),
-    )
+    apart = np.maximum(np.abs(points[:, :1] - edges[:, 0]), np.abs(points[:, 1:] - edges[:, 1]))
+    space = _NEAR * max(camera.columns, camera.rows)
     return float(np.mean(apart.min(axis=1, initial=np.inf) < space))

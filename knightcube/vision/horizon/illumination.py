@@ -1,8 +1,8 @@
-"""Checks an image's brightness against a prediction: sky, sunlit ground, night and the lit limb.
+"""The brightness that a view of the Earth predicts, compared with an image; a coarse nadir from brightness.
 
-The paper leaves open how to distinguish a horizon from the terminator (Meller 3.3). A correct view predicts
-the whole image: nothing bright in the sky or on the night side, and an edge all along the lit limb. A view
-fitted to the terminator does not.
+A correct view predicts the whole image: nothing bright in the sky or on the night side, and an edge all along
+the sunlit limb. A view fitted to the terminator does not. The paper leaves open how to distinguish the two
+(Meller 3.3).
 
 If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller 4.1).
 `coarse_nadir` then tries directions all over the sphere. For each direction it predicts which samples of all
@@ -12,7 +12,7 @@ known, distinguishes night from sky; without it any sample on the disc may be da
 
 `why_false` compares an image with a known attitude. An image that is mostly dark where sunlit ground must be,
 or mostly bright where there can be none, comes from a broken camera: black, blinded, random or upside down.
-Limb, twilight and the Sun's surroundings are excluded.
+Limb, twilight and the surroundings of the Sun are excluded.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.vision.camera.lens import Lens, MountedCamera
-from knightcube.vision.frame import ArrayPixels, PixelAccess
 from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
-TWILIGHT = np.radians(12.0)
+_TWILIGHT = np.radians(12.0)
 """Depression of the Sun (rad) beyond which ground and air count as night."""
 DAYLIGHT = np.radians(8.0)
 """Elevation of the Sun (rad) beyond which ground and limb count as lit."""
@@ -43,12 +42,12 @@ _ATMOSPHERE = 60e3
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a view explains the picture's light.
+    """How well a view explains the brightness of an image.
 
     Attributes:
-        stray: the share of sky and night that is bright.
-        missing: the share of sunlit ground that is dark.
-        dark_samples, lit_samples: number of samples of each share.
+        stray: fraction of the samples of sky and night that are bright.
+        missing: fraction of the samples of sunlit ground that are dark.
+        dark_samples, lit_samples: numbers of samples of sky and night, and of sunlit ground.
     """
 
     stray: float
@@ -58,7 +57,7 @@ class Agreement:
 
 
 def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the Sun's elevation (n,) rad where rays (n, 3) meet the surface, or pass it nearest.
+    """Return the elevation of the Sun (n,), rad, where rays (n, 3) meet the surface or pass it nearest.
 
     `sun` (3,) is a unit vector in inertial axes.
     """
@@ -75,43 +74,33 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 
 
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
-    """Return how a view agrees with samples; without a Sun only the sky counts."""
+    """Return how well a view agrees with samples; without the Sun, only samples of the sky are compared."""
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
-    distance = float(np.linalg.norm(view.position))
-    reach = np.sqrt(max(distance**2 - view.surface.equatorial**2, 1.0))
-    dark = outside > np.arctan(_ATMOSPHERE / reach)
+    dark = outside > np.arctan(_ATMOSPHERE / view.limb_distance)
     lit = np.zeros(len(rays), dtype=bool)
     if sun is not None:
         elevation = sun_elevation(view, rays, sun)
         away = rays @ (view.rotation @ sun) < np.cos(GLARE)
-        dark = away & (dark | ((outside < 0.0) & (elevation < -TWILIGHT)))
+        dark = away & (dark | ((outside < 0.0) & (elevation < -_TWILIGHT)))
         lit = (outside < -0.01) & (elevation > DAYLIGHT)
     darks, lits = int(np.count_nonzero(dark)), int(np.count_nonzero(lit))
-    return Agreement(
-        float(np.count_nonzero(bright & dark)) / max(darks, 1),
-        float(np.count_nonzero(lit & ~bright)) / max(lits, 1),
-        darks,
-        lits,
-    )
+    stray = float(np.count_nonzero(bright & dark)) / max(darks, 1)
+    return Agreement(stray, float(np.count_nonzero(lit & ~bright)) / max(lits, 1), darks, lits)
 
 
 def limb_rays(view: LimbView, count: int) -> FloatArray:
-    """Return `count` rays (count, 3) in camera axes evenly round the limb."""
+    """Return `count` rays (count, 3) in camera axes, evenly spaced around the limb."""
     stretching = view.surface.stretching(view.limb_height)
     centre = -(stretching @ view.position)
     size = float(np.linalg.norm(centre))
     axis = centre / size
-    stretched = np.sqrt(1.0 - size**-2) * axis + _circle(count) @ (tangent_basis(axis) / size)
-    # Back from the stretched space, where the Earth is the unit sphere, then into the camera.
+    angle = np.arange(count) * (2.0 * np.pi / count)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    stretched = np.sqrt(1.0 - size**-2) * axis + circle @ (tangent_basis(axis) / size)
+    # From the stretched space, in which the Earth is the unit sphere, into camera axes.
     rays = stretched @ (view.rotation @ view.surface.shape(view.limb_height)).T
     return np.asarray(rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None])
-
-
-@lru_cache(maxsize=8)
-def _circle(count: int) -> FloatArray:
-    angle = np.arange(count) * (2.0 * np.pi / count)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 _SAMPLES = 8
@@ -125,29 +114,30 @@ _WEIGHT = 0.2
 _WIDEST = math.radians(30.0)
 """Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
+"""Distance between neighbouring directions (rad)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageBrightness:
-    """Samples of one picture: directions (n, 3) in body axes, and which of them are bright (n,)."""
+    """Samples of one image: directions (n, 3) in body axes, and which of them are bright (n,)."""
 
     rays: FloatArray
     bright: BoolArray
 
     @property
     def share(self) -> float:
-        """The share of the picture that is bright."""
+        """The fraction of the image that is bright."""
         return float(np.mean(self.bright))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseNadir:
-    """A nadir of some degrees.
+    """A nadir with an uncertainty of some degrees.
 
     Attributes:
-        direction: (3,) unit vector in body axes.
-        covariance: (3, 3) rad^2 of its error, nothing along it.
-        explained: the share of all samples that it explains.
+        direction: unit vector (3,) in body axes.
+        covariance: covariance (3, 3) of its error, rad^2, zero along the direction.
+        explained: mean probability of the samples, for the direction that explains them best.
     """
 
     direction: FloatArray
@@ -160,24 +150,27 @@ class CoarseNadir:
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
-def image_brightness(frame: Image | PixelAccess, camera: MountedCamera, bright: float) -> ImageBrightness:
-    """Return where a picture is bright, by 8 of its columns; `bright` counts are the sunlit Earth.
+def image_brightness(image: Image, camera: MountedCamera, bright: float) -> ImageBrightness:
+    """Return which of 8 x 8 samples of an image (rows, columns) are bright.
 
-    A dark sea under a low Sun must reach them, the scattered light of the Earth beside it must not.
+    `bright` counts is the threshold: a dark sea under a low Sun must reach it, and the stray light of the
+    Earth beside it must not.
     """
-    access = ArrayPixels(frame) if isinstance(frame, np.ndarray) else frame
-    columns, rows = _sample_indices(access.columns), _sample_indices(access.rows)
-    lit = access.read_columns(columns)[:, rows] > bright
-    rays, imaged = _rays(Lens.of(camera.lens))
+    rows, columns = (_sample_indices(size) for size in image.shape)
+    lit = bright < image[np.ix_(rows, columns)].T
+    rays, imaged = _sample_rays(Lens.of(camera.lens))
     return ImageBrightness(camera.in_body(rays), lit.ravel()[imaged])
 
 
 def coarse_nadir(
     looks: Sequence[ImageBrightness], altitude: float, sun: FloatArray | None = None
 ) -> CoarseNadir | None:
-    """Return the nadir that the light in all pictures leaves; None where it leaves too much open.
+    """Return the nadir that explains the brightness of all images; None if it is too uncertain.
 
-    `altitude` m is above the mean Earth; `sun` (3,) a unit vector in body axes, to ten degrees.
+    Args:
+        looks: brightness of each image.
+        altitude: height above the mean Earth, m.
+        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees.
     """
     rays = np.concatenate([look.rays for look in looks])
     bright = np.concatenate([look.bright for look in looks])
@@ -187,7 +180,7 @@ def coarse_nadir(
     if not bright.any():
         return None
     tried = _sphere(_DIRECTIONS)
-    expected = _expected(tried, rays, altitude, sun)
+    expected = _bright_probability(tried, rays, altitude, sun)
     chance = np.where(bright, expected, 1.0 - expected)
     score = _WEIGHT * np.log(chance).sum(axis=1)
     weights = np.exp(score - score.max())
@@ -204,25 +197,30 @@ def coarse_nadir(
     return found if found.sigma < _WIDEST else None
 
 
-def _expected(tried: FloatArray, rays: FloatArray, altitude: float, sun: FloatArray | None) -> FloatArray:
-    """Return the chances (directions, samples) that a sample is bright if a direction is nadir."""
+def _bright_probability(
+    tried: FloatArray, rays: FloatArray, altitude: float, sun: FloatArray | None
+) -> FloatArray:
+    """Return the probability (d, n) that each ray (n, 3) is bright if nadir is each of `tried` (d, 3)."""
     radius = MEAN_RADIUS + UNIT_DEPTH_HEIGHT
     distance = (MEAN_RADIUS + altitude) / radius
     cosine = tried @ rays.T
     inside = cosine > math.sqrt(1.0 - distance**-2)
     if sun is None:
         return np.where(inside, 0.5, _STRAY)
-    sine = sun_over_ground(cosine, rays @ sun, (tried @ sun)[:, None], distance)
-    low, high = math.sin(-TWILIGHT), math.sin(DAYLIGHT)
+    sine = _sun_over_ground(cosine, rays @ sun, (tried @ sun)[:, None], distance)
+    low, high = math.sin(-_TWILIGHT), math.sin(DAYLIGHT)
     day = np.clip((sine - low) / (high - low), 0.0, 1.0)
     return np.where(inside, _STRAY + (1.0 - 2.0 * _STRAY) * day, _STRAY)
 
 
-def sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
-    """Return the sine of the Sun's height where rays meet the ground: the place in radii times the Sun.
+def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
+    """Return the sine of the Sun's elevation where rays meet the ground of a sphere.
 
-    `cosine` is of a ray's angle from nadir, `ahead` of the Sun's from the ray, `below` of the Sun's from
-    nadir, of any shapes that fit together; `distance` from the Earth's centre is in its radii.
+    Args:
+        cosine: cosine of the angle between the ray and nadir.
+        ahead: cosine of the angle between the ray and the Sun.
+        below: cosine of the angle between nadir and the Sun.
+        distance: distance of the camera from the centre of the sphere, in its radii.
     """
     depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
     return np.asarray((distance * cosine - depth) * ahead - distance * below)
@@ -233,8 +231,8 @@ def _sample_indices(size: int) -> IntArray:
 
 
 @lru_cache(maxsize=8)
-def _rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return directions (m, 3), camera axes, of the samples that the lens images, and which they are."""
+def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
+    """Return the directions (m, 3), camera axes, of the samples that the lens images, and which these are."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])
@@ -254,6 +252,7 @@ def _sphere(count: int) -> FloatArray:
 _MARGIN = math.radians(5.0)
 """Angle beside the limb (rad) that is excluded: the air, and one degree of attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
+"""Elevation of the Sun (rad) beyond which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
 """Angle of a sample from the Sun (rad) within which stray light may cover the whole image."""
 _LEAST = 8
@@ -263,29 +262,27 @@ _MOST = 0.6
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
-    """Return why a picture is not of what its camera must see, empty where it may be.
+    """Return why an image contradicts a known attitude; empty if it does not.
 
-    `nadir` and `sun` (3,) are unit vectors in body axes, to a degree; `altitude` m is above the mean Earth.
+    Args:
+        look: brightness of the image.
+        nadir: unit vector (3,) in body axes, accurate to a degree.
+        altitude: height above the mean Earth, m.
+        sun: unit vector (3,) in body axes, accurate to a degree.
     """
-    lit, dark = _sure(look.rays, nadir, altitude, sun)
-    if _mostly(~look.bright[lit]):
-        return "it is dark where the sunlit Earth is"
-    if float((look.rays @ sun).max()) < math.cos(_STRAY_LIGHT) and _mostly(look.bright[dark]):
-        return "it is bright where there is only sky or night"
-    return ""
 
+    def mostly(against: BoolArray) -> bool:
+        return len(against) >= _LEAST and float(np.mean(against)) > _MOST
 
-def _sure(
-    rays: FloatArray, nadir: FloatArray, altitude: float, sun: FloatArray
-) -> tuple[BoolArray, BoolArray]:
-    """Return which rays (n, 3) surely meet sunlit ground, and which surely no ground that the Sun lights."""
     distance = 1.0 + altitude / MEAN_RADIUS
     limb = math.asin(1.0 / distance)
-    cosine = rays @ nadir
-    sine = sun_over_ground(cosine, rays @ sun, np.asarray(nadir @ sun), distance)
+    cosine = look.rays @ nadir
+    sine = _sun_over_ground(cosine, look.rays @ sun, np.asarray(nadir @ sun), distance)
     within, beyond = cosine > math.cos(limb - _MARGIN), cosine < math.cos(limb + _MARGIN)
-    return within & (sine > math.sin(_DAY)), beyond | (within & (sine < -math.sin(TWILIGHT + _MARGIN)))
-
-
-def _mostly(against: BoolArray) -> bool:
-    return len(against) >= _LEAST and float(np.mean(against)) > _MOST
+    lit = within & (sine > math.sin(_DAY))
+    dark = beyond | (within & (sine < -math.sin(_TWILIGHT + _MARGIN)))
+    if mostly(~look.bright[lit]):
+        return "it is dark where the sunlit Earth is"
+    if float((look.rays @ sun).max()) < math.cos(_STRAY_LIGHT) and mostly(look.bright[dark]):
+        return "it is bright where there is only sky or night"
+    return ""

@@ -22,7 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.horizon.edges import EdgeRays, Observation
@@ -33,7 +33,6 @@ from knightcube.vision.horizon.limb import (
     UNKNOWN,
     Ellipsoid,
     LimbView,
-    crossed,
     earth,
     mean_sphere,
     turn,
@@ -41,15 +40,16 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _PARALLEL = 1e-12
+"""Squared sine below which two rays count as parallel."""
 
 
 def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> FloatArray:
     """Return both directions (2, n, 3) that make the angle of `cosine` with two rays (n, 3) each.
 
-    NaN where the rays are too far apart for it, or one and the same.
+    They are NaN if the rays are too far apart for that angle, or parallel.
     """
     dot = np.einsum("ij,ij->i", first, second)
-    normal = crossed(first, second)
+    normal = np.cross(first, second)
     square = np.einsum("ij,ij->i", normal, normal)
     share = cosine / (1.0 + np.maximum(dot, -1.0 + _PARALLEL))
     inside = 1.0 - 2.0 * cosine * share
@@ -63,22 +63,22 @@ def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> Flo
 def nadirs_of_triples(
     first: FloatArray, second: FloatArray, third: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the directions (n, 3) and cosines (n,) of the cones through three rays (n, 3) each.
+    """Return the axes (n, 3) of the cones through three rays (n, 3) each, and the half-angles' cosines (n,).
 
-    NaN where three rays lie in one plane with the camera.
+    They are NaN if the three rays lie in one plane with the camera.
     """
-    normal = crossed(second - first, third - first)
+    normal = np.cross(second - first, third - first)
     size = np.linalg.norm(normal, axis=1)
     directions = normal / np.where(size > _PARALLEL, size, np.nan)[:, None]
     cosines = np.einsum("ij,ij->i", directions, first)
-    # Of a direction and its opposite the nadir is within 90 deg of its limb.
+    # Nadir is within 90 deg of its limb; the opposite direction is not.
     sign = np.where(cosines < 0.0, -1.0, 1.0)
     return directions * sign[:, None], cosines * sign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConeCandidate:
-    """A circular cone and the edges (n,) that agree with it."""
+    """A circular cone: its axis (3,), the cosine of its half-angle, and the edges that agree with it (n,)."""
 
     direction: FloatArray
     cosine: float
@@ -86,39 +86,21 @@ class ConeCandidate:
 
 
 def best_cone(
-    edges: EdgeRays,
-    free: BoolArray,
-    cosines: tuple[float, float] | None,
-    tolerance: float,
-    tries: int,
+    edges: EdgeRays, free: BoolArray, cosines: tuple[float, float], tolerance: float, tries: int
 ) -> ConeCandidate | None:
-    """Return the cone through `free` edges (n,) with which most of these agree, or None.
+    """Return the cone with which most of the `free` edges agree; None if no cone can be formed.
 
-    `cosines` is the half-angle's cosine (where known, a range of no width) or its least and greatest;
-    `tolerance` is in pixels, `tries` the number of pairs or triples tried.
+    Args:
+        edges: the edges.
+        free: which edges may be used (n,).
+        cosines: range of the cosine of the half-angle, of zero width if the half-angle is known.
+        tolerance: largest distance of an edge from its cone, px.
+        tries: number of pairs or triples of edges that are tried.
     """
     chosen = np.flatnonzero(free)
-    directions, half_angles = _cones(edges, chosen, cosines, tries)
-    if not len(directions):
-        return None
-    counts = np.count_nonzero(_agreeing(edges.chosen(chosen), directions, half_angles, tolerance), axis=1)
-    best = slice(place := int(np.argmax(counts)), place + 1)
-    members = _agreeing(edges, directions[best], half_angles[best], tolerance)[0]
-    return ConeCandidate(directions[place], float(half_angles[place]), members)
-
-
-def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: float) -> BoolArray:
-    """Return which of the `free` edges (n,) lie on no cone yet, `cone` being the last; see `best_cone`."""
-    near = _agreeing(edges, cone.direction[None], np.array([cone.cosine]), 2.0 * tolerance)[0]
-    return np.asarray(free & ~near & ~cone.members)
-
-
-def _cones(
-    edges: EdgeRays, free: IntArray, cosines: tuple[float, float] | None, tries: int
-) -> tuple[FloatArray, FloatArray]:
-    if cosines is not None and cosines[0] == cosines[1]:
-        first, second = _pairs(len(free), tries)
-        one, other = free[first], free[second]
+    if cosines[0] == cosines[1]:
+        first, second = _pairs(len(chosen), tries)
+        one, other = chosen[first], chosen[second]
         directions = nadirs_of_pairs(edges.rays[one], edges.rays[other], cosines[0])
         # A pair that does not agree with its own cone need not be compared with others.
         sides = edges.brighter[one], edges.brighter[other]
@@ -126,19 +108,28 @@ def _cones(
         directions = directions[agrees[0] & agrees[1]]
         half_angles = np.full(len(directions), cosines[0])
     else:
-        directions, half_angles = nadirs_of_triples(
-            *(edges.rays[free[i]] for i in _triples(len(free), tries))
-        )
-        if cosines is not None:
-            outside = (half_angles < cosines[0]) | (half_angles > cosines[1])
-            directions[outside] = np.nan
+        triples = _triples(len(chosen), tries)
+        directions, half_angles = nadirs_of_triples(*(edges.rays[chosen[i]] for i in triples))
+        directions[(half_angles < cosines[0]) | (half_angles > cosines[1])] = np.nan
     sound = np.isfinite(directions[:, 0])
-    return directions[sound], half_angles[sound]
+    directions, half_angles = directions[sound], half_angles[sound]
+    if not len(directions):
+        return None
+    counts = np.count_nonzero(_agreeing(select(edges, chosen), directions, half_angles, tolerance), axis=1)
+    best = slice(place := int(np.argmax(counts)), place + 1)
+    members = _agreeing(edges, directions[best], half_angles[best], tolerance)[0]
+    return ConeCandidate(directions[place], float(half_angles[place]), members)
+
+
+def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: float) -> BoolArray:
+    """Return which of the `free` edges (n,) do not lie near `cone`, within twice the `tolerance`, px."""
+    near = _agreeing(edges, cone.direction[None], np.array([cone.cosine]), 2.0 * tolerance)[0]
+    return np.asarray(free & ~near & ~cone.members)
 
 
 @lru_cache(maxsize=64)
 def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
-    """Return two lists of indices below `count`: all pairs, or `tries` of them evenly chosen."""
+    """Return two lists of indices below `count`: all pairs, or `tries` of them, evenly chosen."""
     first, second = np.triu_indices(count, 1)
     if len(first) > tries:
         chosen = np.linspace(0, len(first) - 1, tries).astype(int)
@@ -147,10 +138,10 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return three lists of indices below `count`: strides of all sizes, from every place."""
+    """Return three lists of indices below `count`, with strides of all sizes from every index."""
     number = np.arange(tries)
     first = number % count
-    # Two strides that wander through all pairs: multiples of the golden section and of the root of two.
+    # Multiples of the golden section and of the root of two give strides that cover all pairs evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -158,9 +149,13 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tolerance: float) -> BoolArray:
-    """Return (k, n) which edges lie within `tolerance` px of cones (k, 3), (k,), their bright side inside."""
+    """Return which of n edges agree with k cones (k, n).
+
+    An edge agrees if it lies within `tolerance` px of the cone with its bright side inside. The cones have
+    axes `directions` (k, 3) and half-angles of `cosines` (k,).
+    """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # cos(angle) - cos(rho) is sin(rho) times the distance, near the cone.
+    # Near the cone, cos(angle) - cos(rho) is sin(rho) times the distance.
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)
@@ -170,21 +165,21 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 
 MOST_MISMATCH = 4.0
 """Largest disagreement with a coarse sensor, in standard deviations."""
-GUESS_SIGMA = math.radians(0.2)
+_GUESS_SIGMA = math.radians(0.2)
 """Error (rad) of a nadir by the cone through the edges, before the fit of a limb: 0.07 to 0.3 deg in frames
 of flights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
-    """A camera's orientation about an assumed nadir.
+    """The orientation of a camera about an assumed nadir.
 
     Attributes:
-        rotation: (3, 3), inertial into camera axes; nadir exactly as assumed.
-        sigma: rad, of the turn about nadir; infinite if unknown.
-        mismatch: the worst disagreement of a known direction with this nadir, in standard deviations of the
+        rotation: rotation matrix (3, 3), inertial into camera axes; its nadir is the assumed one.
+        sigma: standard deviation of the rotation about nadir, rad; infinite if unknown.
+        mismatch: largest disagreement of a known direction with this nadir, in standard deviations of the
             direction and of a guessed nadir.
-        share: of all nadirs, those that the known directions leave.
+        share: fraction of all nadirs that agree with the known directions.
     """
 
     rotation: FloatArray
@@ -196,18 +191,23 @@ class Orientation:
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
     """Return the orientation about `nadir` (3,), camera axes, which is `inertial_nadir` (3,)."""
     base = shortest_turn(inertial_nadir, nadir)
+    # Pairs of directions, camera and inertial, with their standard deviations. Of a rough attitude, nadir
+    # itself tests the tilt, and a direction normal to it gives the rotation.
+    known = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
+    if knowledge.attitude is not None:
+        matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
+        known += [(matrix @ axis, axis, sigma) for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0])]
+    # Each direction leaves a ring of nadirs; two rings cross, and a third adds little.
+    narrowest = sorted(math.hypot(sigma, _GUESS_SIGMA) for _, _, sigma in known)[:2]
+    share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     down = _unit(nadir)
     vote, weight, mismatch = 0.0 + 0.0j, 0.0, 0.0
-    known = _known(knowledge, inertial_nadir)
-    # Each leaves a ring of the sphere; two rings cross, a third adds little.
-    narrowest = sorted(math.hypot(sigma, GUESS_SIGMA) for _, _, sigma in known)[:2]
-    share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     for camera, inertial, sigma in known:
         seen, expected = _unit(camera), _unit(base @ inertial)
         below, assumed = _dot(down, seen), _dot(down, expected)
         across = _length(_cross(down, expected))
         apart = math.atan2(_length(_cross(down, seen)), below) - math.atan2(across, assumed)
-        mismatch = max(mismatch, abs(apart) / math.hypot(sigma, GUESS_SIGMA))
+        mismatch = max(mismatch, abs(apart) / math.hypot(sigma, _GUESS_SIGMA))
         if across > 0.05:
             angle = math.atan2(_dot(down, _cross(expected, seen)), _dot(seen, expected) - below * assumed)
             precision = (across / sigma) ** 2
@@ -218,25 +218,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch, share)
 
 
-def turned(rotation: FloatArray, nadir: FloatArray, angle: float) -> FloatArray:
-    """Return a camera's rotation (3, 3) after a turn by `angle` rad about `nadir` (3,), camera axes."""
-    return np.asarray(turn(angle * nadir) @ rotation)
-
-
-def _known(
-    knowledge: HorizonKnowledge, inertial_nadir: FloatArray
-) -> list[tuple[FloatArray, FloatArray, float]]:
-    """Return pairs of directions, camera and inertial, with their spreads: an attitude is two of them."""
-    pairs = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
-    if knowledge.attitude is not None:
-        matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
-        # Nadir itself tests the tilt, a direction normal to it gives the turn.
-        for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0]):
-            pairs.append((matrix @ axis, axis, sigma))
-    return pairs
-
-
-# Plain floats: for one vector numpy costs ten times as much.
+# Vectors of plain floats: for one vector numpy takes ten times as long.
 Vector = tuple[float, float, float]
 
 
@@ -260,32 +242,33 @@ def _length(vector: Vector) -> float:
 
 
 def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) that takes a unit vector to another; opposite ones, by any half turn."""
+    """Return the shortest rotation (3, 3) of a unit vector to another; any half turn for opposite vectors."""
+
+    def half_turn(axis: FloatArray, square: float) -> FloatArray:
+        return np.asarray(2.0 / square * np.outer(axis, axis) - np.eye(3))
+
     middle = source + target
     square = float(middle @ middle)
     if square < 1e-12:
-        return _half_turn(tangent_basis(source)[0], 1.0)
-    # A half turn about the source leaves it, a half turn about the middle takes it to the target.
-    return np.asarray(_half_turn(middle, square) @ _half_turn(source, 1.0))
-
-
-def _half_turn(axis: FloatArray, square: float) -> FloatArray:
-    return np.asarray(2.0 / square * np.outer(axis, axis) - np.eye(3))
+        return half_turn(tangent_basis(source)[0], 1.0)
+    # A half turn about the source keeps it, and a half turn about the middle maps it to the target.
+    return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
 """Error (m) of an altitude above the mean sphere, caused by the flattening of the Earth."""
 _TURNS = 24
+"""Number of rotations about nadir that are tried if it is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """The camera's position, as far as known.
+    """The position of the camera, as far as it is known.
 
     Attributes:
-        position: (3,) m, inertial axes where the real one is known.
-        surface: ellipsoid or sphere.
-        altitude_sigma: m, infinite where the altitude is unknown.
+        position: position (3,), m; in inertial axes if it is the real one.
+        surface: ellipsoid, or a sphere if only the altitude is known.
+        altitude_sigma: standard deviation of the altitude, m; infinite if the altitude is unknown.
         located: whether the position is the real one.
     """
 
@@ -296,32 +279,15 @@ class Place:
 
     @property
     def cosine(self) -> float:
-        """The cosine of the half-angle of the limb's cone, taken for circular with the radius below."""
+        """The cosine of the half-angle of the limb's cone, for a sphere of the radius below the camera."""
         distance = float(np.linalg.norm(self.position))
         radius = distance - self.surface.height_of(self.position) + UNIT_DEPTH_HEIGHT
         return float(np.sqrt(1.0 - min(1.0, radius / distance) ** 2))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InitialGuess:
-    """The start of a horizon's fit.
-
-    Attributes:
-        place: assumed place of the camera.
-        view: start of the fit.
-        orientation: of the camera about nadir.
-        members: (n,) the picture's edges that may lie on it.
-    """
-
-    place: Place
-    view: LimbView
-    orientation: Orientation
-    members: BoolArray
-
-
-def cosine_at(altitude: float) -> float:
-    """Return the cosine of the half-angle of the limb's cone from `altitude` m above the mean sphere."""
-    return _above_sphere(altitude, 0.0).cosine
+def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
+    """Return an arbitrary place at `altitude` m above the mean sphere, known to `sigma` m."""
+    return Place(np.array([0.0, 0.0, MEAN_RADIUS + altitude]), mean_sphere(), sigma, False)
 
 
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
@@ -330,27 +296,8 @@ def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | 
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
     if knowledge.altitude is not None:
-        return _above_sphere(knowledge.altitude, SPHERE_ALTITUDE_SIGMA)
+        return above_sphere(knowledge.altitude, SPHERE_ALTITUDE_SIGMA)
     return None
-
-
-def _above_sphere(altitude: float, sigma: float) -> Place:
-    return Place(np.array([0.0, 0.0, MEAN_RADIUS + altitude]), mean_sphere(), sigma, False)
-
-
-def initial_guess(
-    candidate: ConeCandidate,
-    observation: Observation,
-    place: Place | None,
-    knowledge: HorizonKnowledge,
-    settings: HorizonSettings,
-) -> InitialGuess:
-    """Return the guess that a cone gives; `place` is None if the altitude is unknown."""
-    if place is None:
-        sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))
-        place = _above_sphere((MEAN_RADIUS + UNIT_DEPTH_HEIGHT) / sine - MEAN_RADIUS, UNKNOWN)
-    view, stand = _first_view(candidate, observation, place, knowledge)
-    return InitialGuess(place, view, stand, candidate.members)
 
 
 def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
@@ -360,32 +307,50 @@ def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
     return np.asarray(knowledge.sun / np.linalg.norm(knowledge.sun))
 
 
-def _first_view(
-    candidate: ConeCandidate,
-    observation: Observation,
-    place: Place,
-    knowledge: HorizonKnowledge,
-) -> tuple[LimbView, Orientation]:
-    """Return the first view and its orientation; on a sphere if the turn about nadir is unknown."""
-    down = -place.position / np.linalg.norm(place.position)
-    nothing = HorizonKnowledge()
-    stand = orientation(candidate.direction, down, knowledge if place.located else nothing)
-    height = UNIT_DEPTH_HEIGHT
-    view = LimbView(stand.rotation, place.position, place.surface, height)
-    if np.isfinite(stand.sigma):
-        return view, stand
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialGuess:
+    """The start of the fit of a horizon.
+
+    Attributes:
+        place: assumed place of the camera.
+        view: initial view.
+        orientation: orientation of the camera about nadir.
+        members: which edges of the image may lie on the horizon (n,).
+    """
+
+    place: Place
+    view: LimbView
+    orientation: Orientation
+    members: BoolArray
+
+
+def initial_guess(
+    candidate: ConeCandidate, observation: Observation, place: Place | None, knowledge: HorizonKnowledge
+) -> InitialGuess:
+    """Return the guess that a cone gives; `place` is None if the altitude is unknown.
+
+    If the rotation about nadir is unknown, the surface is a sphere, and the rotation is the one that explains
+    the brightness of the image best.
+    """
+    if place is None:
+        sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))
+        place = above_sphere((MEAN_RADIUS + UNIT_DEPTH_HEIGHT) / sine - MEAN_RADIUS, UNKNOWN)
     distance = float(np.linalg.norm(place.position))
+    down = -place.position / distance
+    stand = orientation(candidate.direction, down, knowledge if place.located else HorizonKnowledge())
+    view = LimbView(stand.rotation, place.position, place.surface, UNIT_DEPTH_HEIGHT)
+    if np.isfinite(stand.sigma):
+        return InitialGuess(place, view, stand, candidate.members)
     radius = distance - place.surface.height_of(place.position)
     view = replace(view, surface=Ellipsoid(place.surface.pole, radius, radius))
     sun = sun_from(place, knowledge)
-    if sun is None:
-        return view, stand
-    turns = [
-        replace(view, rotation=turned(stand.rotation, candidate.direction, angle))
-        for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
-    ]
-    looks = [agreement(each, sun, observation.samples) for each in turns]
-    best = int(
-        np.argmin([look.stray * look.dark_samples + look.missing * look.lit_samples for look in looks])
-    )
-    return turns[best], replace(stand, rotation=turns[best].rotation)
+    if sun is not None:
+        views = [
+            replace(view, rotation=np.asarray(turn(angle * candidate.direction) @ stand.rotation))
+            for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)
+        ]
+        looks = [agreement(each, sun, observation.samples) for each in views]
+        wrong = [look.stray * look.dark_samples + look.missing * look.lit_samples for look in looks]
+        view = views[int(np.argmin(wrong))]
+        stand = replace(stand, rotation=view.rotation)
+    return InitialGuess(place, view, stand, candidate.members)

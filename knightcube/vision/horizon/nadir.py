@@ -1,21 +1,18 @@
-"""Nadir from a picture: the default method.
+"""Nadir from the Earth's limb in one image, or in the images of several cameras.
 
-    solution = find_nadir(frame, camera, HorizonKnowledge(position=..., sun=..., attitude=...))
-    if solution.nadir is not None:
+    solution = find_nadir(image, camera, HorizonKnowledge(position=..., sun=..., attitude=...))
+    if solution:
         filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
 
-Finds edges on scan lines and cones on which many of them agree, fits the ellipsoid's limb to each, and tests
-each fit against chance, the air's breadth, the light of the whole picture, the coarse sensors and the rough
-attitude. A single consistent fit is the result; several are ambiguous; without one the picture is refused
-with the reason.
+`find_nadir` finds edges on scan lines and cones on which many of them agree, fits the ellipsoid's limb to
+each, and tests each fit against chance, the breadth of the air, the brightness of the whole image, the coarse
+sensors and the rough attitude. A single consistent fit is the result; several are ambiguous; without one the
+image is refused with the reason.
 
-Nadir from the pictures of several cameras at once (Meller et al., chapter 4: three or four of them).
-
-    found = nadir_of_cameras({0: frame, 2: other}, cameras, HorizonKnowledge(position=..., sun=...))
-
-Each picture is searched alone. What different cameras found must be one nadir; a picture that gave none, or
-several, is searched again with the others' nadir known. One limb is then fitted to the points of all: what
-shifts every limb outwards, the air's unknown height, shifts nadir only where a single side is seen.
+`nadir_of_cameras` searches each image alone (Meller et al., chapter 4: three or four cameras). The nadirs of
+different cameras must agree; an image that gave none, or several, is searched again with the nadir of the
+other cameras known. One limb is then fitted to the points of all images: the unknown height of the air shifts
+every limb outwards, which shifts nadir only if a single side of the limb is visible.
 """
 
 from __future__ import annotations
@@ -30,17 +27,16 @@ from knightcube.astro import chi_square
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import multiply
-from knightcube.vision.camera.lens import CameraModel, MountedCamera
-from knightcube.vision.frame import ArrayPixels, PixelAccess
-from knightcube.vision.horizon.edges import Nearby, Observation, find_edges, observe
+from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
+from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, find_edges, observe
 from knightcube.vision.horizon.hypothesis import Hypothesis, examine, near_limb
 from knightcube.vision.horizon.initial_guess import (
     MOST_MISMATCH,
     SPHERE_ALTITUDE_SIGMA,
     InitialGuess,
     Place,
+    above_sphere,
     best_cone,
-    cosine_at,
     initial_guess,
     left_free,
     orientation,
@@ -80,11 +76,11 @@ class NadirMeasurement:
     """The direction to the Earth's centre from one horizon.
 
     Attributes:
-        direction: (3,) unit vector in camera axes, towards the Earth's centre (geocentric nadir).
-        covariance: (3, 3) rad^2, of the direction's error; of rank 2, nothing along the direction itself.
-        altitude: m above the ellipsoid (or the sphere of the mean radius): given, or fitted where unknown.
-        altitude_sigma: m.
-        residual: px rms, normal to the fitted horizon, of the points used.
+        direction: unit vector (3,) towards the Earth's centre (geocentric nadir), camera axes.
+        covariance: covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction.
+        altitude: height above the ellipsoid, or the mean sphere, m; given, or fitted if unknown.
+        altitude_sigma: its standard deviation, m.
+        residual: rms distance of the used points from the fitted horizon, px.
         used: number of points on the horizon.
     """
 
@@ -97,12 +93,12 @@ class NadirMeasurement:
 
     @property
     def basis(self) -> FloatArray:
-        """Two unit vectors (2, 3) normal to the direction and to one another."""
+        """Two unit vectors (2, 3) normal to the direction and to each other."""
         return tangent_basis(self.direction)
 
     @property
     def tangent_covariance(self) -> FloatArray:
-        """The covariance (2, 2) rad^2 along `basis`."""
+        """The covariance (2, 2), rad^2, along `basis`."""
         return np.asarray(self.basis @ self.covariance @ self.basis.T)
 
     @property
@@ -113,16 +109,18 @@ class NadirMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonSolution:
-    """The outcome of one picture.
+    """The outcome of one image. It is true (`if solution:`) if a nadir was found.
 
     Attributes:
-        nadir: the measurement, when the status is FOUND.
-        candidates: the horizons that were not chosen; all of them if ambiguous.
-        points: (n, 2) px, every edge from dark to bright that was found.
-        on_horizon: (n,) whether the fit used them.
-        limb: (k, 3) unit vectors in camera axes, where the fit places those edges.
-        limb_sigma: (k,) rad, of each normal to the limb.
-        view: the camera's place and attitude by the best fit, accepted or not; see `limb_in_picture`.
+        status: the outcome.
+        reason: why there is no nadir, in one sentence; empty with a nadir.
+        nadir: the measurement; None unless the status is FOUND.
+        candidates: the horizons that were not chosen; all of them if the status is AMBIGUOUS.
+        points: all edges from dark to bright (n, 2), px.
+        on_horizon: whether the fit used each edge (n,).
+        limb: fitted directions of the used edges (k, 3), unit vectors in camera axes.
+        limb_sigma: their standard deviations normal to the limb (k,), rad.
+        view: position and attitude of the camera by the best fit, accepted or not; None without a fit.
         pixels_read: number of pixels read.
     """
 
@@ -137,6 +135,10 @@ class HorizonSolution:
     view: LimbView | None = None
     pixels_read: int = 0
 
+    def __bool__(self) -> bool:
+        """Return whether a nadir was found."""
+        return self.nadir is not None
+
 
 _WIDER = 2.0
 """Factor by which the search for cones exceeds the range of an unknown altitude: three edges are
@@ -144,9 +146,12 @@ inaccurate."""
 _MOST_ALTITUDE = 3.0
 """Largest excess of the fitted altitude over that range, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
+"""Largest fraction of bright sky and night, least coverage of the lit limb, largest fraction of points in the
+night."""
 _RIVAL = 0.3
-"""Share of the best horizon's edges with which a second horizon, with edges of its own, is a rival."""
+"""Fraction of the best horizon's edges with which a second horizon, or other cameras, make it ambiguous."""
 _SAME = np.radians(1.0)
+"""Angle (rad) below which two nadirs of one image are the same."""
 _MOST_CHANCE = -6.0
 """Largest log10 of the number of cones that chance edges would fit as well."""
 _BREADTH = 0.125, 2.0
@@ -156,26 +161,32 @@ _GAIN = 1.5
 
 
 def find_nadir(
-    frame: Image | PixelAccess,
+    image: Image,
     camera: CameraModel,
     knowledge: HorizonKnowledge | None = None,
     settings: HorizonSettings | None = None,
 ) -> HorizonSolution:
-    """Return the nadir that the horizon in a frame gives, or why there is none.
+    """Return the nadir from the Earth's limb in an image, or the reason why there is none.
 
-    Near a horizon of few edges more lines are read; edges without a horizon are searched again on more lines
-    everywhere. Raises ValueError for a frame of another size than the camera's, or with
-    pixels that are not finite.
+    Few columns and rows are read first. More lines are read near a horizon of few edges, and everywhere if no
+    horizon is found among the edges.
+
+    Args:
+        image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
+        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size.
+        knowledge: prior knowledge of position, altitude, Sun and attitude; None: none. Without position and
+            altitude the altitude is fitted too.
+        settings: settings of the search; None: the defaults.
+
+    Raises:
+        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+
+    Source: Meller et al., chapter 3; the fit follows Christian & Robinson 2016 (`limb`).
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
-    access = ArrayPixels(frame) if isinstance(frame, np.ndarray) else frame
-    if (access.columns, access.rows) != (camera.columns, camera.rows):
-        raise ValueError(
-            f"a frame of {access.columns} x {access.rows} pixels, but the camera has"
-            f" {camera.columns} x {camera.rows}"
-        )
-    look = _look(access, camera, knowledge, settings)
-    found = look.solution()
+    check_image(image, camera)
+    search = _search(image, camera, knowledge, settings)
+    found = search.solution()
     if found.nadir is not None and found.nadir.used >= settings.enough_edges:
         return found
     if len(found.points) < settings.some_edges:
@@ -183,22 +194,22 @@ def find_nadir(
     again = replace(settings, edges=replace(settings.edges, lines=settings.edges.more_lines))
     read = found.pixels_read
     if found.nadir is not None:
-        closer = _closer(look, access, camera, knowledge, again)
+        closer = _closer_search(search, image, camera, knowledge, again)
         read += closer.read
         second = closer.solution()
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
-            # The first look has already compared it with its rivals.
+            # The first search has already compared the horizon with its rivals.
             return replace(second, candidates=found.candidates, pixels_read=read)
-    second = _look(access, camera, knowledge, again).solution()
+    second = _search(image, camera, knowledge, again).solution()
     return replace(second, pixels_read=read + second.pixels_read)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Look:
-    """One search: `levels` as in `ScanLines`, hypotheses, the best first; number of pixels read."""
+class _Search:
+    """One search: its edges, brightness levels, hypotheses (the best first), and number of pixels read."""
 
     observation: Observation
-    levels: tuple[float, float, float]
+    levels: Levels
     hypotheses: list[Hypothesis]
     read: int
 
@@ -215,11 +226,15 @@ class _Look:
             )
         status, reason = _judged(hypotheses)
         best, found = hypotheses[0], status is HorizonStatus.FOUND
+        measured = [
+            _measurement(each.fit, each.covariance, each.guess.place.located, each.residual)
+            for each in hypotheses
+        ]
         return HorizonSolution(
             status,
             reason,
-            _measurement(best) if found else None,
-            tuple(_measurement(each) for each in (hypotheses[1:] if found else hypotheses)),
+            measured[0] if found else None,
+            tuple(measured[1:] if found else measured),
             points,
             best.members,
             best.limb.rays,
@@ -229,35 +244,35 @@ class _Look:
         )
 
 
-def _look(
-    access: PixelAccess, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
-) -> _Look:
-    edges, lines = find_edges(access, settings.edges)
+def _search(
+    image: Image, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
+) -> _Search:
+    """Return the search of a whole image."""
+    edges, lines = find_edges(image, settings.edges)
     observation = observe(edges, lines, camera)
     hypotheses = _hypotheses(observation, place_of(knowledge, settings), knowledge, settings, camera)
-    return _Look(observation, lines.levels, hypotheses, lines.pixels)
+    return _Search(observation, lines.levels, hypotheses, lines.pixels)
 
 
-def _closer(
-    look: _Look,
-    access: PixelAccess,
+def _closer_search(
+    search: _Search,
+    image: Image,
     camera: CameraModel,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
-) -> _Look:
-    """Return the best horizon of a look again, with more lines across it."""
-    best = look.hypotheses[0]
-    points = look.observation.edges.points[best.members]
-    box = np.stack([points.min(axis=0) - look.observation.space, points.max(axis=0) + look.observation.space])
-    edges, lines = find_edges(access, settings.edges, Nearby(box, look.levels))
-    # The first look's samples have already tested the whole picture's light.
-    observation = observe(edges, lines, camera, look.observation.samples)
+) -> _Search:
+    """Return the best horizon of a search again, with more lines across it."""
+    best, before = search.hypotheses[0], search.observation
+    points = before.edges.points[best.members]
+    box = np.stack([points.min(axis=0) - before.space, points.max(axis=0) + before.space])
+    edges, lines = find_edges(image, settings.edges, ImagePart(box, search.levels))
+    # The samples of the first search have already tested the brightness of the whole image.
+    observation = observe(edges, lines, camera, before.samples)
     members = near_limb(best.fit.view, observation, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
     found = examine(again, observation, knowledge, settings, camera)
-    return _Look(
-        observation, look.levels, [] if found is None or not _is_limb(found) else [found], lines.pixels
-    )
+    hypotheses = [] if found is None or not _is_limb(found) else [found]
+    return _Search(observation, search.levels, hypotheses, lines.pixels)
 
 
 def _hypotheses(
@@ -267,10 +282,10 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return the possible horizons, those without a flaw first, then by their edges."""
+    """Return the horizons fitted to the cones that the most edges agree on, the best first."""
     if place is None:
         least, most = settings.altitudes
-        low, high = (cosine_at(altitude) for altitude in (least / _WIDER, most * _WIDER))
+        low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
     else:
         low = high = place.cosine
     free = np.ones(len(observation.edges), dtype=bool)
@@ -285,7 +300,7 @@ def _hypotheses(
         if cone is None or np.count_nonzero(cone.members & free) < enough:
             break
         free = left_free(observation.rays, free, cone, settings.tolerance)
-        guess = initial_guess(cone, observation, place, knowledge, settings)
+        guess = initial_guess(cone, observation, place, knowledge)
         if guess.orientation.mismatch > MOST_MISMATCH:
             contradicted.append(guess)
             continue
@@ -309,11 +324,15 @@ def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
         return HorizonStatus.REFUSED, flaw
     count = np.count_nonzero(best.members)
     for other in hypotheses[1:]:
-        apart = float(np.arccos(np.clip(other.fit.view.nadir @ best.fit.view.nadir, -1.0, 1.0)))
+        apart = _angle(other.fit.view.nadir, best.fit.view.nadir)
         own = np.count_nonzero(other.members & ~best.members)
         if not _flaw(other) and apart > _SAME and own > _RIVAL * count:
             return HorizonStatus.AMBIGUOUS, f"two horizons {np.degrees(apart):.1f} deg apart"
     return HorizonStatus.FOUND, ""
+
+
+def _angle(one: FloatArray, other: FloatArray) -> float:
+    return float(np.arccos(np.clip(one @ other, -1.0, 1.0)))
 
 
 def _is_limb(one: Hypothesis) -> bool:
@@ -338,16 +357,16 @@ def _flaw(one: Hypothesis) -> str:
     return ""
 
 
-def _measurement(one: Hypothesis) -> NadirMeasurement:
-    view = one.fit.view
-    allowance = 0.0 if one.guess.place.located else SPHERE_ALTITUDE_SIGMA
+def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residual: float) -> NadirMeasurement:
+    """Return the nadir of a fit; `located` is whether the position of the camera is known."""
+    view = fit.view
     return NadirMeasurement(
         view.nadir,
-        one.covariance,
+        covariance,
         view.surface.height_of(view.position),
-        one.fit.altitude_sigma(allowance),
-        one.residual,
-        int(np.count_nonzero(one.members)),
+        fit.altitude_sigma(0.0 if located else SPHERE_ALTITUDE_SIGMA),
+        residual,
+        int(np.count_nonzero(fit.used)),
     )
 
 
@@ -355,8 +374,6 @@ _IMPROBABLE = 1e-6
 """Probability below which the nadirs of two cameras differ significantly."""
 _COMMON = 2.0
 """Largest ratio of a difference's variance to the sum of both: unknown air shifts opposite limbs apart."""
-_RIVAL_CAMERAS = 0.3
-"""Share of the edges with which as many disagreeing cameras make the nadir ambiguous."""
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation of an unknown rotation about nadir (rad)."""
 _OWN_AIR = 400.0
@@ -365,13 +382,14 @@ _OWN_AIR = 400.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointNadir:
-    """The outcome of one instant's pictures.
+    """The nadir from the images of several cameras at one instant.
 
     Attributes:
-        nadir: the measurement in body axes, when the status is FOUND.
-        cameras: the numbers of the cameras whose limb it rests on.
-        each: what each camera's picture gave, in its own axes.
-        limb_height: m above the ellipsoid, as fitted; NaN without a measurement.
+        status, reason: the outcome, and why there is no nadir.
+        nadir: the measurement in body axes; None unless the status is FOUND.
+        cameras: numbers of the cameras whose limb was used.
+        each: solution of each image, in the axes of its camera.
+        limb_height: fitted height of the limb above the ellipsoid, m; NaN without a measurement.
     """
 
     status: HorizonStatus
@@ -384,7 +402,7 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """One horizon that a camera proposes: nadir (3,) and covariance (3, 3), body axes; its edges."""
+    """A horizon that a camera proposes: nadir (3,) and covariance (3, 3), body axes; number of its edges."""
 
     camera: int
     nadir: FloatArray
@@ -393,20 +411,26 @@ class _Vote:
 
 
 def nadir_of_cameras(
-    frames: Mapping[int, Image | PixelAccess],
+    images: Mapping[int, Image],
     cameras: Sequence[MountedCamera],
     knowledge: HorizonKnowledge | None = None,
     settings: HorizonSettings | None = None,
 ) -> JointNadir:
-    """Return the nadir in body axes that the frames of some of the cameras, by number, give together.
+    """Return the nadir in body axes from the images of several cameras.
 
-    The frames are of one instant, and the axes of `knowledge` are the body's where those of a single picture
-    are the camera's. Raises ValueError like `find_nadir`.
+    Args:
+        images: images (rows, columns) of one instant, by the numbers of their cameras.
+        cameras: all cameras of the body.
+        knowledge: prior knowledge as for `find_nadir`, with the axes of the body instead of a camera's.
+        settings: settings of the search.
+
+    Raises:
+        ValueError: as `find_nadir`.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     each = {
-        number: find_nadir(frame, cameras[number].lens, _for(cameras[number], knowledge), settings)
-        for number, frame in frames.items()
+        number: find_nadir(image, cameras[number].lens, _in_camera(cameras[number], knowledge), settings)
+        for number, image in images.items()
     }
     votes = [vote for number, solution in each.items() for vote in _votes(number, solution, cameras[number])]
     group, rival = _agreed(votes)
@@ -414,11 +438,17 @@ def nadir_of_cameras(
         return JointNadir(HorizonStatus.AMBIGUOUS, rival, None, (), each)
     if not group:
         return JointNadir(*_why_none(each), None, (), each)
-    known = _with_nadir(knowledge, group, cameras, each)
-    for number, frame in frames.items():
-        if each[number].nadir is None and known is not None and _may_answer(each[number], settings):
+    vote = max(group, key=lambda one: one.edges)
+    view = each[vote.camera].view
+    assert view is not None  # a camera with a vote has fitted a horizon
+    position = knowledge.position if knowledge.position is not None else view.position
+    sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
+    sensed = (*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
+    known = replace(knowledge, sensed=sensed)
+    for number, image in images.items():
+        if each[number].nadir is None and len(each[number].points) >= settings.some_edges:
             camera = cameras[number]
-            second = find_nadir(frame, camera.lens, _for(camera, known), settings)
+            second = find_nadir(image, camera.lens, _in_camera(camera, known), settings)
             read = each[number].pixels_read + second.pixels_read
             each[number] = replace(second, pixels_read=read)
     votes = [v for k, s in each.items() if s.nadir is not None for v in _votes(k, s, cameras[k])]
@@ -426,23 +456,20 @@ def nadir_of_cameras(
     if rival or not group:
         reason = rival or "the cameras' horizons do not agree"
         return JointNadir(HorizonStatus.AMBIGUOUS, reason, None, (), each)
-    return _joined(tuple(vote.camera for vote in group), cameras, each, knowledge, settings)
+    return _joint_fit(tuple(vote.camera for vote in group), cameras, each, knowledge, settings)
 
 
-def _for(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKnowledge:
-    """Return what is known in body axes in those of a camera."""
+def _in_camera(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKnowledge:
+    """Return knowledge given in body axes in the axes of a camera."""
     rough = knowledge.attitude
-    return replace(
-        knowledge,
-        attitude=None
-        if rough is None
-        else RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma),
-        sensed=tuple(replace(one, camera=camera.in_camera(one.camera)) for one in knowledge.sensed),
-    )
+    if rough is not None:
+        rough = RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma)
+    sensed = tuple(replace(one, camera=camera.in_camera(one.camera)) for one in knowledge.sensed)
+    return replace(knowledge, attitude=rough, sensed=sensed)
 
 
 def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> list[_Vote]:
-    """Return the horizons that a picture leaves: the one found, or those between which it cannot choose."""
+    """Return the horizon found in an image, or all candidates of an ambiguous image."""
     if solution.nadir is not None:
         left: tuple[NadirMeasurement, ...] = (solution.nadir,)
     else:
@@ -452,14 +479,14 @@ def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> lis
 
 
 def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
-    """Return the votes for one nadir that have the most cameras and edges, and a rival nadir if there is one.
+    """Return the votes for the nadir with the most cameras and edges, or no vote and the reason.
 
-    The candidates of a single camera agree with none but those of other cameras.
+    The candidates of one camera never agree with each other.
     """
     groups = []
     for first in votes:
-        alike = [v for v in votes if v.camera != first.camera and _same(first, v)]
-        nearest = {v.camera: v for v in sorted(alike, key=lambda v: float(v.nadir @ first.nadir))}
+        agreeing = [v for v in votes if v.camera != first.camera and _same(first, v)]
+        nearest = {v.camera: v for v in sorted(agreeing, key=lambda v: float(v.nadir @ first.nadir))}
         groups.append([first, *nearest.values()])
     groups.sort(key=lambda group: (len(group), sum(v.edges for v in group)), reverse=True)
     if not groups:
@@ -467,16 +494,17 @@ def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
     best = groups[0]
     count = sum(v.edges for v in best)
     for other in groups[1:]:
-        apart = float(np.arccos(np.clip(other[0].nadir @ best[0].nadir, -1.0, 1.0)))
         if any(v is w for v in other for w in best) or any(_same(v, w) for v in other for w in best):
             continue
-        # Cameras that agree outvote fewer; the other candidates of one that agrees are fewer, too.
-        if len(other) == len(best) and sum(v.edges for v in other) > _RIVAL_CAMERAS * count:
-            return [], f"the cameras show two horizons {np.degrees(apart):.1f} deg apart"
+        # A larger group of cameras outvotes a smaller one.
+        if len(other) == len(best) and sum(v.edges for v in other) > _RIVAL * count:
+            apart = np.degrees(_angle(other[0].nadir, best[0].nadir))
+            return [], f"the cameras show two horizons {apart:.1f} deg apart"
     return best, ""
 
 
 def _same(one: _Vote, other: _Vote) -> bool:
+    """Return whether two nadirs agree within their covariances."""
     if float(one.nadir @ other.nadir) < 0.0:
         return False
     across = tangent_basis(one.nadir)
@@ -486,48 +514,25 @@ def _same(one: _Vote, other: _Vote) -> bool:
 
 
 def _why_none(each: Mapping[int, HorizonSolution]) -> tuple[HorizonStatus, str]:
-    """Return status and reason of the picture that came nearest to a horizon."""
-    order = (HorizonStatus.AMBIGUOUS, HorizonStatus.REFUSED, HorizonStatus.NO_HORIZON)
-    for status in order:
+    """Return status and reason of the image that came nearest to a horizon."""
+    for status in (HorizonStatus.AMBIGUOUS, HorizonStatus.REFUSED, HorizonStatus.NO_HORIZON):
         for number, solution in each.items():
             if solution.status is status:
                 return status, f"camera {number}: {solution.reason}"
     return HorizonStatus.NO_HORIZON, "no picture"
 
 
-def _may_answer(solution: HorizonSolution, settings: HorizonSettings) -> bool:
-    return len(solution.points) >= settings.some_edges
-
-
-def _with_nadir(
-    knowledge: HorizonKnowledge,
-    group: Sequence[_Vote],
-    cameras: Sequence[MountedCamera],
-    each: Mapping[int, HorizonSolution],
-) -> HorizonKnowledge | None:
-    """Return the knowledge with the nadir that a group of votes agrees on; None where no place is known."""
-    vote = max(group, key=lambda one: one.edges)
-    view = each[vote.camera].view
-    if view is None:
-        return None
-    position = knowledge.position if knowledge.position is not None else view.position
-    sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
-    return replace(
-        knowledge, sensed=(*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
-    )
-
-
-def _joined(
+def _joint_fit(
     numbers: tuple[int, ...],
     cameras: Sequence[MountedCamera],
     each: Mapping[int, HorizonSolution],
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
 ) -> JointNadir:
-    """Return one limb fitted to the points of all the cameras that agree."""
+    """Return one limb fitted to the points of all cameras that agree."""
     most = max(numbers, key=lambda number: len(each[number].limb))
     view, camera = each[most].view, cameras[most]
-    assert view is not None
+    assert view is not None  # the camera has found a horizon
     place = place_of(knowledge, settings)
     located = place is not None and place.located
     body = replace(view, rotation=camera.to_camera.T @ view.rotation, limb_height=UNIT_DEPTH_HEIGHT)
@@ -540,31 +545,14 @@ def _joined(
     fit = fit_limb(body, rays, sigma, prior)
     if fit is None:
         return JointNadir(HorizonStatus.REFUSED, "no limb fits all the cameras", None, (), each)
-    allowance = settings.sphere_sigma if np.isinf(stand.sigma) else 0.0
     groups = np.repeat(np.arange(len(numbers)), [len(each[number].limb) for number in numbers])
-    own = np.full(len(numbers), _OWN_AIR / _reach(fit.view))
-    covariance = fit.covariance + shared_error(fit, rays, sigma, prior, groups, own)
-    fit = replace(fit, covariance=covariance)
-    measured = _joint_measurement(fit, cameras[most], allowance, 0.0 if located else SPHERE_ALTITUDE_SIGMA)
-    return JointNadir(HorizonStatus.FOUND, "", measured, numbers, each, fit.view.limb_height)
-
-
-def _reach(view: LimbView) -> float:
-    """Return how far off the limb is, m."""
-    return float(np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0)))
-
-
-def _joint_measurement(
-    fit: FittedLimb, camera: MountedCamera, allowance: float, altitude: float
-) -> NadirMeasurement:
+    own = np.full(len(numbers), _OWN_AIR / fit.view.limb_distance)
+    shared = shared_error(fit, rays, sigma, prior, groups, own)
+    fit = replace(fit, covariance=fit.covariance + shared)
     nadir = fit.view.nadir
-    across = np.eye(3) - np.outer(nadir, nadir)
+    allowance = settings.sphere_sigma if np.isinf(stand.sigma) else 0.0
+    covariance = fit.nadir_covariance + allowance**2 * (np.eye(3) - np.outer(nadir, nadir))
     pixel = 1.0 / camera.lens.focal_length
-    return NadirMeasurement(
-        nadir,
-        fit.nadir_covariance + allowance**2 * across,
-        fit.view.surface.height_of(fit.view.position),
-        fit.altitude_sigma(altitude),
-        float(np.sqrt(np.mean(fit.residuals[fit.used] ** 2))) / pixel,
-        int(np.count_nonzero(fit.used)),
-    )
+    residual = float(np.sqrt(np.mean(fit.residuals[fit.used] ** 2))) / pixel
+    measured = _measurement(fit, covariance, located, residual)
+    return JointNadir(HorizonStatus.FOUND, "", measured, numbers, each, fit.view.limb_height)

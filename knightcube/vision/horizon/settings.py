@@ -1,4 +1,4 @@
-"""Settings of the horizon search, the camera's response to light, and prior knowledge for one image.
+"""Settings of the horizon search, the response of the camera, and prior knowledge for one image.
 
 A horizon does not determine the rotation about nadir. The prior knowledge (position, Sun, rough attitude,
 directions from other sensors) resolves it and tests a fitted horizon.
@@ -15,19 +15,18 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import UsageError
 
-ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
 LEAST_ALTITUDE = 50e3
-"""Least altitude (m): within the air no limb is visible."""
+"""Lowest altitude (m) from which a limb is visible: below, the camera is inside the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensedDirection:
-    """A direction known in both frames: the coarse Sun of the solar strings, or the magnetic field.
+    """A direction known in camera and inertial axes, such as the coarse Sun or the magnetic field.
 
     Attributes:
-        camera: (3,) as sensed, camera axes; of any length.
-        inertial: (3,) by ephemeris or field model; of any length.
-        sigma: rad, of an axis.
+        camera: measured direction (3,) in camera axes, of any length.
+        inertial: direction (3,) by ephemeris or field model in inertial axes, of any length.
+        sigma: standard deviation per axis, rad.
     """
 
     camera: FloatArray
@@ -37,7 +36,7 @@ class SensedDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoughAttitude:
-    """An attitude of the camera, inertial into camera axes, (4,) scalar last, and its spread, rad an axis."""
+    """An attitude (4,), inertial into camera axes, scalar last, and its standard deviation per axis, rad."""
 
     quaternion: FloatArray
     sigma: float
@@ -45,24 +44,25 @@ class RoughAttitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HorizonKnowledge:
-    """Data of GPS, ephemerides and coarse sensors; the horizon is fitted without them, too.
+    """Data of GPS, ephemerides and coarse sensors for one image, all of them optional.
 
     Attributes:
-        position: (3,) m from the Earth's centre, inertial axes: sets the altitude and, with `pole`, the
-            ellipsoid's cone.
-        altitude: m above a sphere of the mean radius, where there is no position.
-        sun: (3,) towards the Sun, inertial axes; of any length.
-        pole: (3,) the Earth's axis, inertial axes.
-        attitude: a rough one, from the filter.
+        position: position (3,), m from the Earth's centre, inertial axes. It gives the altitude and, with
+            `pole`, the limb of the ellipsoid.
+        altitude: height above a sphere of the mean radius, m, if the position is unknown.
+        sun: direction (3,) to the Sun, inertial axes, of any length.
+        pole: direction (3,) of the Earth's axis, inertial axes.
+        attitude: rough attitude of the camera, for instance predicted by a filter.
         sensed: directions from coarse sensors.
 
-    Raises ValueError for a value that is not finite, of another shape, or inside the Earth.
+    Raises:
+        ValueError: if a value is not finite, has another shape, or lies inside the Earth.
     """
 
     position: FloatArray | None = None
     altitude: float | None = None
     sun: FloatArray | None = None
-    pole: FloatArray = field(default_factory=ICRS_POLE.copy)
+    pole: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     attitude: RoughAttitude | None = None
     sensed: tuple[SensedDirection, ...] = ()
 
@@ -81,18 +81,18 @@ class HorizonKnowledge:
 
 @dataclass(frozen=True, slots=True)
 class LogarithmicResponse:
-    """counts = pedestal + counts_per_decade log10(1 + light), light in units of the dark current."""
+    """The response counts = pedestal + counts_per_decade log10(1 + light / dark current) of a detector."""
 
     pedestal: float
     counts_per_decade: float
 
     def light(self, counts: Image) -> FloatArray:
-        """Return the light of `counts` (...)."""
+        """Return the light of `counts` (...), in units of the dark current."""
         return np.asarray(10.0 ** ((counts - self.pedestal) / self.counts_per_decade) - 1.0)
 
 
 def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
-    """Return the light of counts (...), of any scale; without a response they are proportional to it."""
+    """Return the light of counts (...) in any unit; without a response, the light is proportional to them."""
     if response is None:
         return np.asarray(counts, dtype=float)
     if counts.dtype == np.uint8:
@@ -102,17 +102,17 @@ def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EdgeSettings:
-    """How edges are found along scan lines.
+    """Settings of the search for edges along scan lines.
 
     Attributes:
         lines: number of columns, and of rows, that are read.
-        more_lines: the same for a second look.
-        run: px, odd: shorter fluctuations are filtered out (Meller 3.1).
-        threshold: of bright pixels, as a share of the way from the low to the high average.
-        contrast: of the weakest edge, as a share of the same way.
-        most: edges kept for each of `lines`, those with the darkest dark side.
-        psf_sigma: px, the blur of the optics.
-        response: the detector's, if it is not linear.
+        more_lines: the same number for a second search.
+        run: window of the filter that removes short fluctuations, px, odd (Meller 3.1).
+        threshold: threshold of bright pixels, as a fraction of the span from dark to bright pixels.
+        contrast: height of the weakest edge, as a fraction of the same span.
+        most: maximum number of edges per line; the edges with the darkest dark side are kept.
+        psf_sigma: blur of the optics, px.
+        response: response of the detector; None: linear.
     """
 
     lines: int = 32
@@ -126,7 +126,7 @@ class EdgeSettings:
 
     def __post_init__(self) -> None:
         if self.lines < 2:
-            raise UsageError(f"lines {self.lines}: at least 2 columns and rows are read")
+            raise UsageError(f"lines {self.lines}: give at least 2 columns and rows")
         if self.run < 1 or self.run % 2 == 0:
             raise UsageError(f"run {self.run}: must be an odd number of pixels")
         for name in ("threshold", "contrast"):
@@ -136,22 +136,22 @@ class EdgeSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HorizonSettings:
-    """How the horizon is chosen among edges, and its assumed errors.
+    """Settings of the choice of the horizon among edges, and its assumed errors.
 
     Attributes:
-        edges: see `EdgeSettings`.
-        limb_height_sigma: m, of the apparent limb's height: the default is for air of unknown scale height
-            (6.5 to 9.5 km) and haze (a third more or less), 1,000 for known air.
-        altitude_sigma: m, of a given position.
-        altitudes: m, least and greatest of an unknown altitude. A disc of any size is the limb of some
-            altitude: the default, of low orbits, refuses logos and ghosts of a lens.
-        tolerance: px, within which edges agree with a circular cone; the Earth's flattening fits into it.
-        least_edges: of a horizon.
-        enough_edges: a horizon of fewer edges is searched again on more lines.
-        some_edges: a picture of fewer edges is not searched again.
-        candidates: number of horizons searched for in one picture.
-        tries: pairs or triples of edges tried for each.
-        sphere_sigma: rad an axis, added where the flattening's direction is unknown.
+        edges: settings of the search for edges.
+        limb_height_sigma: standard deviation of the apparent limb's height, m. The default holds for air of
+            unknown scale height (6.5 to 9.5 km) and haze (a third more or less); 1,000 holds for known air.
+        altitude_sigma: standard deviation of the altitude of a given position, m.
+        altitudes: range of an unknown altitude, m. A disc of any size is the limb from some altitude: the
+            default, for low orbits, excludes logos and lens ghosts.
+        tolerance: distance of an edge from a circular cone, px; it covers the flattening of the Earth.
+        least_edges: minimum number of edges of a horizon.
+        enough_edges: number of edges below which a horizon is searched again on more lines.
+        some_edges: number of edges below which an image is not searched again.
+        candidates: maximum number of horizons searched for in one image.
+        tries: number of pairs or triples of edges tried for each candidate.
+        sphere_sigma: standard deviation per axis, rad, added if the direction of the flattening is unknown.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)
@@ -170,6 +170,6 @@ class HorizonSettings:
         low, high = self.altitudes
         if not LEAST_ALTITUDE <= low < high < math.inf:
             raise UsageError(
-                f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: the limb is seen as one from"
-                f" {1e-3 * LEAST_ALTITUDE:g} km up, and the least comes first"
+                f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: give an increasing range from"
+                f" {1e-3 * LEAST_ALTITUDE:g} km, below which no limb is visible"
             )

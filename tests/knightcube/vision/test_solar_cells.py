@@ -10,7 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.errors import UsageError
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import cameras_by_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
@@ -119,20 +119,21 @@ def test_wrong_currents_and_strings_are_refused() -> None:
         SolarStringModel(sigma=0.0)
 
 
-def _mountings() -> list[FloatArray]:
-    """Return UW's: three sides 120 deg apart about z, and the top (Meller 4.2)."""
+def _cameras() -> list[MountedCamera]:
+    """Return the cameras of UW: three sides 120 deg apart about z, and the top (Meller 4.2)."""
     angles = np.radians([0.0, 120.0, 240.0])
     sides = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
     down = np.array([0.0, 0.0, -1.0])
-    return [pointing(side, down) for side in sides] + [pointing(-down, np.array([1.0, 0.0, 0.0]))]
+    mountings = [*(pointing(side, down) for side in sides), pointing(-down, np.array([1.0, 0.0, 0.0]))]
+    return [MountedCamera(CAMERA, mounting) for mounting in mountings]
 
 
 def test_the_camera_that_has_the_sun_is_read_first() -> None:
-    mountings = _mountings()
-    for index, mounting in enumerate(mountings):
-        boresight = quaternion.attitude_matrix(mounting)[2]
+    cameras = _cameras()
+    for index, camera in enumerate(cameras):
+        boresight = camera.to_camera[2]
         shares = np.maximum(STRINGS.normals @ boresight, 0.0)
-        order = cameras_by_sun(coarse_sun(shares, STRINGS), [CAMERA] * 4, mountings)
+        order = cameras_by_sun(coarse_sun(shares, STRINGS), cameras)
         assert order[0].index == index
         assert order[0].likely
         assert [choice.index for choice in order if choice.likely] == [index]
@@ -144,16 +145,14 @@ def test_a_sun_between_the_fields_is_likely_in_none_and_possible_in_the_nearest(
     towards = np.array([np.cos(np.radians(35.5)), np.sin(np.radians(35.5)), 0.0])
     basis = np.array([[-towards[1], towards[0], 0.0], [0.0, 0.0, 1.0]])
     sun = CoarseSun(CoarseSunStatus.FOUND, towards, basis, np.radians(3.0) ** 2 * np.eye(2))
-    order = cameras_by_sun(sun, [CAMERA] * 4, _mountings())
+    order = cameras_by_sun(sun, _cameras())
     assert not any(choice.likely for choice in order)
     assert [choice.index for choice in order if choice.possible] == [0]
 
 
 def test_in_the_dark_no_camera_is_read_and_in_doubt_all_are() -> None:
-    dark = cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), [CAMERA] * 4, _mountings())
+    dark = cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), _cameras())
     assert dark == []
-    doubt = cameras_by_sun(CoarseSun(CoarseSunStatus.UNCERTAIN), [CAMERA] * 4, _mountings())
+    doubt = cameras_by_sun(CoarseSun(CoarseSunStatus.UNCERTAIN), _cameras())
     assert [choice.index for choice in doubt] == [0, 1, 2, 3]
     assert all(choice.possible for choice in doubt)
-    with pytest.raises(ValueError, match="mountings"):
-        cameras_by_sun(CoarseSun(CoarseSunStatus.DARK), [CAMERA], _mountings())

@@ -19,7 +19,6 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
@@ -94,7 +93,7 @@ def test_a_wide_camera_sees_the_sun_where_it_is() -> None:
     frame = shot(looking(np.array(around.sun) + 0.2 * aside))
     assert frame is not None
     model = wide_model(orbit_config().wide_cameras[0])
-    solution = find_sun(ArrayPixels(frame.pixels), model.lens, SunSettings())
+    solution = find_sun(frame.pixels, model.lens, SunSettings())
     assert solution.sun is not None
     tilt = np.arccos(np.clip(solution.sun.direction[2], -1.0, 1.0))
     assert tilt == pytest.approx(np.arctan(0.2 * np.linalg.norm(aside)), abs=np.radians(0.5))

@@ -18,7 +18,6 @@ from typing import TypeVar
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.edges import find_edges, observe
 from knightcube.vision.horizon.nadir import find_nadir
 from sim_hal.earth_camera import nadir, render
@@ -51,7 +50,7 @@ def measure(view: str, frames: int, repeats: int, seed: int) -> FloatArray:
         scene = random_scene(generator, model, view)  # type: ignore[arg-type]  # one of VIEWS
         pixels = render(model, scene, generator)
         knowledge = coarse_knowledge(scene, generator)
-        edges_ms, (edges, lines) = least(partial(find_edges, ArrayPixels(pixels), settings.edges), repeats)
+        edges_ms, (edges, lines) = least(partial(find_edges, pixels, settings.edges), repeats)
         rays_ms, _ = least(partial(observe, edges, lines, model.lens), repeats)
         whole_ms, solution = least(partial(find_nadir, pixels, model.lens, knowledge, settings), repeats)
         error = np.nan

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.sun import LINEAR, SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
@@ -47,7 +46,7 @@ def frames_with_sun(name: str, count: int, seed: int) -> Outcome:
     outcome = Outcome()
     for _ in range(count):
         scene = random_sun_scene(generator, model)
-        pixels = ArrayPixels(render(model, scene, generator))
+        pixels = render(model, scene, generator)
         begin = time.process_time()
         solution = find_sun(pixels, model.lens, settings)
         outcome.seconds.append(time.process_time() - begin)
@@ -73,7 +72,7 @@ def frames_without_sun(name: str, count: int, seed: int) -> Outcome:
     outcome = Outcome()
     for _ in range(count):
         scene = random_scene(generator, model, "sunlit", accept=sun_is_away)
-        pixels = ArrayPixels(render(model, scene, generator))
+        pixels = render(model, scene, generator)
         begin = time.process_time()
         solution = find_sun(pixels, model.lens, settings)
         outcome.seconds.append(time.process_time() - begin)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, render, sun_direction
 from tests.sim_hal.earth_camera.scenes import random_sun_scene
@@ -27,7 +26,7 @@ def figures(size: int, frames: int, seed: int) -> tuple[float, float, int, float
         begin = time.process_time()
         frame = render(model, scene, generator)
         middle = time.process_time()
-        solution = find_sun(ArrayPixels(frame), model.lens, SunSettings())
+        solution = find_sun(frame, model.lens, SunSettings())
         rendered += middle - begin
         searched += time.process_time() - middle
         if solution.status.value == "found" and solution.sun is not None:

@@ -12,7 +12,6 @@ from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import conjugate, from_matrix, from_rotation_vector, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge
 from knightcube.vision.sun import SunSettings, find_sun
@@ -69,7 +68,7 @@ def sights() -> dict[str, VectorObservation]:
         assert nadir is not None
         found[camera.name] = observation_of(camera, nadir.direction, nadir.covariance, down)
     top = UW.cameras[3]
-    seen = find_sun(ArrayPixels(frame_of(top, 3)), MODEL.lens, SunSettings()).sun
+    seen = find_sun(frame_of(top, 3), MODEL.lens, SunSettings()).sun
     assert seen is not None
     found["sun"] = observation_of(top, seen.direction, seen.covariance, sun())
     return found

@@ -60,7 +60,7 @@ def test_a_small_disc_is_the_limb_of_no_low_orbit() -> None:
     assert low.nadir is None
     assert any_.nadir is not None
     assert 27e6 < any_.nadir.altitude < 30e6
-    with pytest.raises(UsageError, match="least comes first"):
+    with pytest.raises(UsageError, match="increasing range"):
         HorizonSettings(altitudes=FAR[::-1])
 
 

@@ -63,8 +63,15 @@ def test_the_limb_is_the_simulators_and_so_is_the_suns_elevation() -> None:
 
 
 def test_the_quadratic_cone_is_zero_on_the_limb_and_positive_within() -> None:
+    """M = Q r r' Q - (r' Q r - 1) Q is the discriminant of |L (r + t u)| = 1 in t, with Q = L' L."""
     view = _view(np.random.default_rng(3))
-    cone, limb = view.cone(), limb_rays(view, 60)
+    stretching = view.surface.stretching(view.limb_height)
+    form = stretching @ stretching
+    normal = form @ view.position
+    cone = (
+        view.rotation @ (np.outer(normal, normal) - (view.position @ normal - 1.0) * form) @ view.rotation.T
+    )
+    limb = limb_rays(view, 60)
     scale = np.abs(cone).max()
     assert np.einsum("ij,jk,ik->i", limb, cone, limb) / scale == pytest.approx(np.zeros(60), abs=1e-9)
     within = 0.9 * limb + 0.1 * view.nadir

@@ -19,7 +19,6 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.frame import ArrayPixels
 from knightcube.vision.horizon.edges import find_edges
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
 from knightcube.vision.horizon.limb import UNIT_DEPTH_HEIGHT, limb_light
@@ -77,16 +76,16 @@ def test_the_airs_profile_is_the_simulators() -> None:
 
 def test_edges_lie_on_the_true_limb_to_a_fraction_of_a_pixel(day: tuple[EarthScene, Image]) -> None:
     scene, frame = day
-    edges, _ = find_edges(ArrayPixels(frame), SETTINGS.edges)
+    edges, _ = find_edges(frame, SETTINGS.edges)
     truth = limb_truth(scene, MODEL, height=UNIT_DEPTH_HEIGHT).points
     apart = np.min(np.linalg.norm(edges.points[:, None] - truth[None], axis=2), axis=1)
     assert np.count_nonzero(apart < 0.7) > 25
 
 
 def test_only_the_scanned_lines_are_read(day: tuple[EarthScene, Image]) -> None:
-    pixels = ArrayPixels(day[1])
-    find_edges(pixels, EdgeSettings(lines=8))
-    assert pixels.pixels_read == 16 * 512
+    _, lines = find_edges(day[1], EdgeSettings(lines=8))
+    assert lines.pixels == 16 * 512
+    assert lines.columns.tolist() == lines.rows.tolist() == list(range(32, 512, 64))
 
 
 def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthScene, Image]) -> None:
