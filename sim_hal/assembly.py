@@ -18,7 +18,7 @@ from flight.schema.sections import Config
 from hal.drivers.h_bridge import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
-from sim_hal.device import EmulatedDevice, FaultTimeline, SerialEnd
+from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
 from sim_hal.emulators.camera import EmulatedCamera, Expose
 from sim_hal.emulators.coil_circuit import CoilCircuit
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -30,8 +30,7 @@ from sim_hal.objects import Objects
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
 from sim_hal.orbit_sky import from_orbit
 from sim_hal.settings import Simulation, SkySection
-from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
-from sim_hal.worlds.world import BodyMotion, OrbitingWorld, World, WorldInputs, make_world
+from sim_hal.worlds.world import BodyMotion, OrbitingWorld, TruthRecorder, World, WorldInputs, make_world
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import SourceTrack, StarCameraModel

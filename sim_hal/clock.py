@@ -1,47 +1,111 @@
-"""Simulated time: sleeping advances the world to the deadline and returns at once.
+"""Simulated time: the clock, the devices that act at their own event times, and a queue of timed actions.
 
-Due tickers run one after the other, in the order in which they were made, so a flight repeats bit for bit. A
-job that itself sleeps (a driver waiting for its chip) advances the world, but no other ticker runs meanwhile.
+Sleeping advances the world to the deadline and returns at once. Due tickers run one after the other, in the
+order in which they were created, so a flight repeats bit for bit. A job that itself sleeps (a driver waiting
+for its chip) advances the world, but no other ticker runs meanwhile.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import heapq
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from hal.buses.clock import ContainedJob
 from hal.interfaces.wires import Ticker
 
+NEVER = 1 << 62
+"""A time (ns) later than the end of any run: 146 years."""
 
-class TimedWorld(Protocol):
-    """A world that a SimClock advances."""
+
+class EmulatedDevice(Protocol):
+    """A device on the simulation's time line."""
 
     def next_event_ns(self) -> int:
-        """Return the time of the next event."""
+        """Return the time of the device's next event; NEVER if it has none."""
+
+    def advance(self, now_ns: int) -> None:
+        """Process all events due at or before `now_ns`, in order, each at its own time."""
+
+
+class SerialEnd(Protocol):
+    """The device's end of a serial line."""
+
+    baud_rate: int
+
+    def write(self, data: bytes, now_ns: int) -> None:
+        """Send bytes from `now_ns` on, after all bytes that wait already."""
+
+    def read(self, now_ns: int) -> bytes:
+        """Return unread bytes from the host that have arrived by `now_ns`."""
+
+    def next_arrival_ns(self) -> int:
+        """Return when bytes from the host next arrive; NEVER if none are under way."""
+
+
+class FaultTimeline:
+    """A queue of timed actions, as an emulated device."""
+
+    def __init__(self) -> None:
+        self._order = itertools.count()
+        self._actions: list[tuple[int, int, Callable[[], None]]] = []
+
+    def at(self, time_ns: int, action: Callable[[], None]) -> None:
+        """Run `action` at `time_ns` of the simulation."""
+        heapq.heappush(self._actions, (time_ns, next(self._order), action))
+
+    def next_event_ns(self) -> int:
+        """Return when the next action is due."""
+        return self._actions[0][0] if self._actions else NEVER
+
+    def advance(self, now_ns: int) -> None:
+        """Run the actions that are due."""
+        while self.next_event_ns() <= now_ns:
+            heapq.heappop(self._actions)[2]()
+
+
+class TimedSimulation:
+    """Advances the world to each device's next event, then runs that device."""
+
+    def __init__(self, advance_world: Callable[[int], None], devices: Sequence[EmulatedDevice]) -> None:
+        self._advance_world = advance_world
+        self._devices = tuple(devices)
+
+    def next_event_ns(self) -> int:
+        """Return the time of the next event of any device."""
+        return min([device.next_event_ns() for device in self._devices], default=NEVER)
 
     def run_events(self, event_ns: int) -> None:
-        """Process the events of that time, the next."""
+        """Advance to the next event, and run the devices that are due then."""
+        self._advance_world(event_ns)
+        for device in self._devices:
+            if device.next_event_ns() <= event_ns:
+                device.advance(event_ns)
 
     def advance_to(self, time_ns: int) -> None:
-        """Process all events due at or before `time_ns`."""
+        """Process all events due at or before `time_ns`, in order."""
+        while (event_ns := self.next_event_ns()) <= time_ns:
+            self.run_events(event_ns)
+        self._advance_world(time_ns)
 
 
 class SimClock:
-    """A Clock that jumps to each deadline. Time begins at `start_ns`; `utc_start_ns` is the label of time 0.
+    """A Clock that jumps to each deadline. Time begins at `start_ns`; `utc_start_ns` is the UTC of time 0.
 
     Attributes:
-        tickers: those that run, in the order in which they were made.
+        tickers: the tickers that run, in the order in which they were created.
     """
 
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:
         self._now_ns = start_ns
         self._utc_start_ns = utc_start_ns
-        self._world: TimedWorld | None = None
+        self._world: TimedSimulation | None = None
         self.tickers: list[SimTicker] = []
         self._running_jobs = False
 
-    def attach(self, world: TimedWorld) -> None:
-        """Advance this world from now on."""
+    def attach(self, world: TimedSimulation) -> None:
+        """Advance this world and its devices from now on."""
         self._world = world
 
     def now_ns(self) -> int:
@@ -60,10 +124,10 @@ class SimClock:
                 self._run_due_jobs()
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
-        """Run `job` every `period_ns` of simulated time, the first time one period from now."""
-        made = SimTicker(self, name, period_ns, job)
-        self.tickers.append(made)
-        return made
+        """Run `job` every `period_ns` of simulated time, first one period from now."""
+        ticker = SimTicker(self, name, period_ns, job)
+        self.tickers.append(ticker)
+        return ticker
 
     def utc_ns(self) -> int:
         """Return UTC in ns, a label for telemetry."""
@@ -100,7 +164,7 @@ class SimTicker(ContainedJob):
         self._busy = False
 
     def kick(self) -> None:
-        """Run the job now; its period starts again, as a thread's wait does."""
+        """Run the job now and restart its period."""
         self.due_ns = self._clock.now_ns() + self.period_ns
         self.run()
 

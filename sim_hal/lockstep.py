@@ -27,7 +27,7 @@ from sim_hal.assembly import (
     inline_exposure,
     line_generator,
 )
-from sim_hal.clock import SimClock
+from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults.bench import Bench
@@ -35,8 +35,7 @@ from sim_hal.faults.schedule import put, scheduled
 from sim_hal.objects import Objects
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.settings import Simulation
-from sim_hal.worlds.simulation import TimedSimulation, TruthRecorder
-from sim_hal.worlds.world import BodyMotion, WorldInputs, make_world
+from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
 
 
 def posed_camera(

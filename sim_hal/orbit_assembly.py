@@ -13,14 +13,14 @@ from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.vision.camera.lens import Lens, Pinhole
-from sim_hal.device import SerialEnd
+from sim_hal.clock import SerialEnd
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from sim_hal.emulators.camera import EmulatedCamera, Expose
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices
 from sim_hal.settings import OrbitDeviceTruth, Simulation
-from sim_hal.worlds import sun
+from sim_hal.worlds.orbit import sun_position
 from sim_hal.worlds.world import OrbitingWorld, World, orbiting
 
 _STREAM = 0x0B17
@@ -112,7 +112,7 @@ def _wide(
         scene = EarthScene(
             position=np.array(world.surroundings().position),
             attitude=attitudes[len(attitudes) // 2],
-            sun=sun.position(date),
+            sun=sun_position(date),
             rotation=_EARTH_TURN * world.utc_ns() * 1e-9 % (2.0 * math.pi),
         )
         return make(model, scene, (*seed, sequence))

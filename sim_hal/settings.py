@@ -79,7 +79,7 @@ class Disturbances(Section, frozen=True, kw_only=True):
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):
-    """The whole section; `craft` is one of `sim_hal.worlds.free_body.craft.CRAFTS`, or described in full."""
+    """The whole section; `craft` is one of `sim_hal.worlds.free_body.CRAFTS`, or described in full."""
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection = "knightcube"
     orbit: OrbitSection = OrbitSection()

@@ -1,7 +1,7 @@
 """The image model of a wide-angle camera that views Earth and Sun from a low orbit.
 
     model = EarthCameraModel.fuga15d(seed=1)
-    scene = EarthScene(position, attitude, sun.position(julian_date))
+    scene = EarthScene(position, attitude, sun_position(julian_date))
     frame = render(model, scene, generator)
     truth = limb_truth(scene, model)          # the true limb, and the Sun's elevation there
 

@@ -17,7 +17,7 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.errors import NotResponding
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import multiply
-from sim_hal.device import NEVER
+from sim_hal.clock import NEVER
 from sim_hal.worlds.world import BodyMotion
 
 if TYPE_CHECKING:

@@ -36,7 +36,7 @@ from knightcube.astro.earth.orientation import (
     geodetic,
     north_east_down,
 )
-from sim_hal.device import NEVER, SerialEnd
+from sim_hal.clock import NEVER, SerialEnd
 from sim_hal.worlds.world import OrbitingWorld
 
 UNIX_EPOCH = 2_440_587.5

@@ -1,7 +1,7 @@
 """A serial line with transmission times and wire faults, in memory or on a pseudo-terminal.
 
 Each direction is a `Wire`. In memory, the host's end is a `hal.interfaces.wires.SerialPort` and the device's
-end a `sim_hal.device.SerialEnd`; the line is deterministic for a given generator. A `PtyLine` serves any
+end a `sim_hal.clock.SerialEnd`; the line is deterministic for a given generator. A `PtyLine` serves any
 client on a pseudo-terminal, paced in real time at the line's speed. The client's speed is read from the
 terminal, so a wrong speed garbles the bytes as on a cable.
 """
@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from hal.interfaces.errors import NotResponding
-from sim_hal.device import NEVER
+from sim_hal.clock import NEVER
 
 _BITS = 10  # start, eight, stop
 _SECOND_NS = 1_000_000_000
@@ -206,7 +206,7 @@ class HostEnd:
 
 
 class DeviceEnd:
-    """The device's end; implements `sim_hal.device.SerialEnd`."""
+    """The device's end; implements `sim_hal.clock.SerialEnd`."""
 
     def __init__(self, line: EmulatedSerialLine, baud_rate: int) -> None:
         self.baud_rate = baud_rate

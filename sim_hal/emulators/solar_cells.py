@@ -24,7 +24,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
-from sim_hal.worlds import sun
+from sim_hal.worlds.orbit import sun_position
 from sim_hal.worlds.world import OrbitingWorld
 
 DEVICE = "solar strings"
@@ -231,4 +231,4 @@ class EmulatedSolarCells:
         body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
         around = self._world.surroundings()
         date = _UNIX_EPOCH + self._world.utc_ns() * 1e-9 / 86_400.0
-        return self._model.currents(np.array(around.position), sun.position(date), body, self._generator)
+        return self._model.currents(np.array(around.position), sun_position(date), body, self._generator)

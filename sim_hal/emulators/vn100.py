@@ -24,7 +24,7 @@ import numpy as np
 from hal.drivers.vn100.protocol import Checksum, Sentence, build, parse
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_vector, multiply, normalise
-from sim_hal.device import NEVER, SerialEnd
+from sim_hal.clock import NEVER, SerialEnd
 from sim_hal.emulators.vn100_registers import (
     ASYNC_RATES_HZ,
     BINARY_OUTPUTS,
@@ -414,7 +414,7 @@ class Vn100EmulatorSettings:
 
 
 class Vn100Emulator:
-    """The unit; a `sim_hal.device.EmulatedDevice`.
+    """The unit; a `sim_hal.clock.EmulatedDevice`.
 
     Attributes:
         alter: changes each measurement before it is sent, for faults.

@@ -35,7 +35,7 @@ from sim_hal.faults.schedule import parse, put
 from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, SkySection
-from sim_hal.worlds.simulation import TruthRecorder
+from sim_hal.worlds.world import TruthRecorder
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene

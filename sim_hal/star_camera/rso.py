@@ -32,8 +32,7 @@ from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import DAY, SUN_RADIUS, Shadow, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera import SourceTrack
-from sim_hal.worlds import sun
-from sim_hal.worlds.orbit import Orbit
+from sim_hal.worlds.orbit import Orbit, sun_position
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:
@@ -133,7 +132,7 @@ def source_tracks(
         position = item.orbit.positions_at(times)
         observer = camera.positions_at(times)
         seen = np.where(hidden_by_earth(observer, position), 0.0, 1.0)
-        seen *= sunlit_share(position, sun.position(epoch + times / DAY), shadow)
+        seen *= sunlit_share(position, sun_position(epoch + times / DAY), shadow)
         share = float(np.trapezoid(seen, times) / (end - start))
         if share > 0.0:
             direction = directions(observer, position)

@@ -1,8 +1,8 @@
-"""The testbed's body on its thread in a Helmholtz cage that plays the field of an orbit.
+"""The testbed in a Helmholtz cage that reproduces the magnetic field along an orbit.
 
-The truth beside the flight's belief (`flight.bodies.testbed.cage`): IGRF-14 with a ring current along an
-orbit under J2, in the local frame whose y is the thread's axis; the components normal to the thread, times
-the cage's scale and the gain of its coils.
+The true field is IGRF-14 with a ring current along an orbit under J2, in the local frame whose y axis is the
+axis of the thread. The cage produces the components normal to the thread, multiplied by its scale and the
+gain of its coils. `flight.bodies.testbed.cage` is the model of the flight software.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import CageTruth, Disturbances
-from sim_hal.worlds.free_body.body import elements, julian_date
-from sim_hal.worlds.free_body.environment import Environment
+from sim_hal.worlds.orbit import Environment, elements, julian_date
 from sim_hal.worlds.testbed import Testbed, TestbedModel, model_of
 from sim_hal.worlds.world import BodyMotion, WorldInputs
 
@@ -26,19 +25,18 @@ _STREAM = 0xCA6E
 
 
 class OrbitField:
-    """The field that the cage makes, reference axes."""
+    """The field of the cage, reference axes."""
 
     def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
         date = julian_date(utc)
         generator = np.random.default_rng([seed, _STREAM])
         multiples = Disturbances(ring_current=section.ring_current)
-        self._around = Environment(elements(section.orbit, date), date, generator, multiples)
+        self._environment = Environment(elements(section.orbit, date), date, generator, multiples)
         self._scale = scale * section.gain
 
     def at(self, seconds: float) -> tuple[float, float]:
         """Return the components along x and z, T, at a time since the start."""
-        there = self._around.at(seconds)
-        position, velocity, field = (np.array(each) for each in there[:3])
+        position, velocity, field = (np.array(vector) for vector in self._environment.at(seconds)[:3])
         down = -position / np.linalg.norm(position)
         across = np.cross(velocity, position)
         ahead = np.cross(across / np.linalg.norm(across), down)
@@ -46,7 +44,7 @@ class OrbitField:
 
 
 class CagedTestbed(Testbed):
-    """The testbed with the field of the cage in place of the fixed one."""
+    """The testbed with the field of the cage instead of the constant one."""
 
     def __init__(
         self,
@@ -63,7 +61,7 @@ class CagedTestbed(Testbed):
         self._bx, self._bz = field.at(0.0)
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance the state to `time_ns`; the field stands still for the few ms of an advance."""
+        """Advance the state to `time_ns`; the field is constant during the few ms of an advance."""
         if time_ns > self.time_ns:
             self._bx, self._bz = self._orbit.at((time_ns - self._start_ns) * 1e-9)
         super().advance_to(time_ns)

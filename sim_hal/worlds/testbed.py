@@ -21,15 +21,16 @@ from sim_hal.settings import Simulation
 from sim_hal.worlds.world import BodyMotion, WorldInputs, WorldTruth, about_thread
 
 VACUUM_PERMEABILITY = 4e-7 * math.pi
-"""T m/A, as the thesis has it."""
+"""Vacuum permeability (T m/A), with the value of the thesis."""
 
 
 def helmholtz_field(turns: float, current: float, radius: float) -> float:
-    """Return the field in T in the middle of two coils of `turns` each; `current` in A, `radius` in m."""
+    """Return the field (T) at the centre of two coils of `turns` each; `current` in A, `radius` in m."""
     return math.pow(0.8, 1.5) * VACUUM_PERMEABILITY * turns * current / radius
 
 
 _LONGEST_STEP = 0.025
+"""Longest step of the integration (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ class TestbedModel:
         supply_voltage: V across a coil that is fully on.
     """
 
-    __test__ = False  # pytest: not a test, in spite of its name
+    __test__ = False  # for pytest: this is not a test
 
     inertia: float
     dipole_per_ampere: float
@@ -110,12 +111,12 @@ class Testbed:
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion there; `time_ns` is never before the state."""
+        """Advance to `time_ns` and return the motion; `time_ns` must not be before the present state."""
         self.advance_to(time_ns)
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the state as it is."""
+        """Return currents and energies of the present state."""
         return WorldTruth(self.mean_current, self.energy, self.supply_energy)
 
     def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
@@ -143,9 +144,9 @@ def make(inputs: WorldInputs) -> Testbed:
 
 
 def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, float, float]:
-    """Return the true constants, and angle and rate of the release; `section` takes precedence.
+    """Return the true constants, and angle (rad) and rate (rad/s) of the release.
 
-    Raises ConfigError without a release.
+    Values of `section` override those of `config`. Raises ConfigError without a release.
     """
     release = section.release
     if release is None:

@@ -1,4 +1,4 @@
-"""The world seam: what the emulated devices need of any simulated world.
+"""The interface between simulated worlds and emulated devices, and the recorder of the true state.
 
 A configuration names its world in `simulation.world`: one of `WORLDS`, or a third party's factory as
 `module:factory`, which takes `WorldInputs` and returns a `World`. A world in orbit is an `OrbitingWorld`.
@@ -14,10 +14,14 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUTH
+from flight.link.telemetry.packets import Packer
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import DAY
 from knightcube.astro.quaternion import about_axis_y
+from sim_hal.clock import NEVER
 from sim_hal.settings import Simulation
 
 STANDARD_GRAVITY = 9.80665
@@ -43,7 +47,7 @@ class BodyMotion:
 
 
 def about_thread(time_ns: int, angle: float, rate: float, field: float) -> BodyMotion:
-    """Return the motion of a body turned on the thread by `angle` rad, at `rate` rad/s, `field` T on -z_T."""
+    """Return the motion of a body on the thread at `angle` rad and `rate` rad/s, with `field` T on -z_T."""
     return BodyMotion(
         time_ns=time_ns,
         quaternion=about_axis_y(angle),
@@ -57,13 +61,13 @@ def about_thread(time_ns: int, angle: float, rate: float, field: float) -> BodyM
 WORLDS = {
     "testbed": "sim_hal.worlds.testbed:make",
     "cage": "sim_hal.worlds.cage:make",
-    "free_body": "sim_hal.worlds.free_body.body:make",
+    "free_body": "sim_hal.worlds.free_body:make",
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldTruth:
-    """The quantities in the truth log besides the motion.
+    """The quantities of the truth log other than the motion.
 
     Attributes:
         current: (3,) A, mean currents that acted on the body.
@@ -78,7 +82,7 @@ class WorldTruth:
 
 @runtime_checkable
 class World(Protocol):
-    """The body and its surroundings, advanced in time under the currents that the coils carry."""
+    """The body and its environment, advanced in time under the currents that the coils carry."""
 
     def release_at(self, time_ns: int) -> None:
         """Release the body at `time_ns`, now or later; until then it is held still."""
@@ -132,19 +136,23 @@ def make_world(inputs: WorldInputs) -> World:
 
 Floats = tuple[float, float, float]
 
+UNIX_EPOCH = 2_440_587.5
+"""Julian date of 1970-01-01."""
 CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
 
 
 class OrbitEnvironment(NamedTuple):
-    """What surrounds the craft at an instant, ICRS.
+    """Position, field, light and air of the craft at one time; vectors in ICRS.
 
     Attributes:
-        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
-        sun: (3,) its direction from the craft.
-        light: sunlight over that at one astronomical unit; 0 in the umbra.
-        sunlit: the share of the Sun's disc that is seen.
-        density: of the air, kg/m^3.
-        walk: (3,) of the walking dipole, of unit standard deviation, body axes.
+        position: (3,) m.
+        velocity: (3,) m/s.
+        field: (3,) T.
+        sun: (3,) direction from the craft to the Sun.
+        light: sunlight relative to its intensity at one astronomical unit; 0 in the umbra.
+        sunlit: visible fraction of the Sun's disc.
+        density: kg/m^3, of the air.
+        walk: (3,) random walk of the residual dipole, of unit standard deviation, body axes.
     """
 
     position: Floats
@@ -159,14 +167,20 @@ class OrbitEnvironment(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitTruth(WorldTruth):
-    """The state of a world in orbit; vectors in ICRS where nothing else is said.
+    """The state of a world in orbit; vectors in ICRS unless stated otherwise.
 
     Attributes:
-        utc: Julian date. quaternion: (4,) ICRS into body. rate: (3,) rad/s, body axes.
-        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
-        sun: (3,) its direction. sunlit: share of its disc that is seen.
+        utc: Julian date.
+        quaternion: (4,) ICRS into body.
+        rate: (3,) rad/s, body axes.
+        position: (3,) m.
+        velocity: (3,) m/s.
+        field: (3,) T.
+        sun: (3,) direction from the craft to the Sun.
+        sunlit: visible fraction of the Sun's disc.
         residual_dipole: (3,) A m^2, body axes.
-        causes: evaluates `torques`, which few readers want.
+        torques: evaluates the torques (3,) N m, body axes, by `CAUSES`; empty if the world does not know
+            them separately.
     """
 
     utc: float
@@ -178,30 +192,108 @@ class OrbitTruth(WorldTruth):
     sun: FloatArray
     sunlit: float
     residual_dipole: FloatArray
-    causes: Callable[[], dict[str, FloatArray]]
-
-    @property
-    def torques(self) -> dict[str, FloatArray]:
-        """Torques (3,) N m, body axes, by `CAUSES`; empty where the world does not know them apart."""
-        return self.causes()
+    torques: Callable[[], dict[str, FloatArray]]
 
 
 @runtime_checkable
 class OrbitingWorld(World, Protocol):
-    """A world with an orbit: what GPS receiver, solar strings and wide cameras measure."""
+    """A world with an orbit, as GPS receiver, solar cells and horizon cameras need it."""
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return what surrounds the craft at the present state."""
+        """Return the environment of the craft at the present state."""
 
     def utc_ns(self) -> int:
         """Return UTC of the present state, ns since 1970."""
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return all of the present state, with the torques by their causes."""
+        """Return the whole present state."""
 
 
 def orbiting(world: World, section: str) -> OrbitingWorld:
-    """Return the world as one with an orbit, for a device of `section`. Raises ConfigError without orbit."""
+    """Return the world if it has an orbit. Raises ConfigError, naming `section`, if it has none."""
     if not isinstance(world, OrbitingWorld):
         raise ConfigError(section, "needs a world with an orbit, such as `simulation.world: free_body`")
     return world
+
+
+def utc_date(world: OrbitingWorld) -> float:
+    """Return the Julian date, UTC, of the present state of a world."""
+    return UNIX_EPOCH + world.utc_ns() * 1e-9 / DAY
+
+
+PERIOD_NS = 25_000_000
+ORBIT_PERIOD_NS = 1_000_000_000
+_UNKNOWN = np.full(3, np.nan)
+
+
+class PacketLog(Protocol):
+    """A log of packets."""
+
+    def write(self, packet: bytes) -> None:
+        """Append a packet."""
+
+
+class TruthRecorder:
+    """Writes the true state at 40 Hz, and that of an orbit at 1 Hz, to a log; an emulated device."""
+
+    def __init__(self, log: PacketLog) -> None:
+        self._log = log
+        self._packer = Packer()
+        self._world: World | None = None
+        self._epoch_ns = 0
+        self._due_ns = NEVER
+
+    def watch(self, world: World) -> None:
+        """Record this world."""
+        self._world = world
+
+    def begin(self, epoch_ns: int) -> None:
+        """Record from mission time zero, `epoch_ns`, on."""
+        self._epoch_ns = self._due_ns = epoch_ns
+
+    def next_event_ns(self) -> int:
+        """Return when the next record is due."""
+        return self._due_ns
+
+    def advance(self, now_ns: int) -> None:
+        """Write the records that are due."""
+        while self._due_ns <= now_ns:
+            if self._world is not None:
+                self._write(self._world, self._due_ns)
+            self._due_ns += PERIOD_NS
+
+    def _write(self, world: World, time_ns: int) -> None:
+        since_ns = time_ns - self._epoch_ns
+        motion, truth = world.motion(time_ns), world.truth()
+        packet = self._packer.pack(
+            TRUTH,
+            since_ns,
+            quaternion=motion.quaternion.tolist(),
+            rate=motion.rate.tolist(),
+            current=truth.current.tolist(),
+            energy=truth.energy,
+            supply_energy=truth.supply_energy,
+        )
+        self._log.write(packet)
+        if since_ns % ORBIT_PERIOD_NS != 0 or not isinstance(world, OrbitingWorld):
+            return
+        orbit = world.orbit_truth()
+        torques = orbit.torques()
+        coils, dipole, gravity, drag, sunlight = (torques.get(cause, _UNKNOWN).tolist() for cause in CAUSES)
+        packet = self._packer.pack(
+            ORBIT_TRUTH,
+            since_ns,
+            utc=orbit.utc,
+            position=orbit.position.tolist(),
+            velocity=orbit.velocity.tolist(),
+            field=orbit.field.tolist(),
+            sun=orbit.sun.tolist(),
+            sunlit=orbit.sunlit,
+            residual_dipole=orbit.residual_dipole.tolist(),
+            coil_torque=coils,
+            dipole_torque=dipole,
+            gravity_torque=gravity,
+            drag_torque=drag,
+            sunlight_torque=sunlight,
+        )
+        self._log.write(packet)

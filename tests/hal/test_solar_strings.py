@@ -12,12 +12,11 @@ from hal.interfaces.errors import OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.vision.solar_cells import CoarseSunStatus, SolarStringModel, coarse_sun
-from sim_hal.clock import SimClock
+from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.solar_cells import EmulatedAds1115, EmulatedSolarCells, SolarCellsModel
 from sim_hal.settings import FreeBodySection, OrbitSection, TipOff
-from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.free_body import FreeBody
 
 WIRINGS = tuple(StringWiring(0x48 + index // 3, index % 3, 2.0) for index in range(6))
 FACES = np.concatenate([np.eye(3), -np.eye(3)])

@@ -14,7 +14,7 @@ from ground.report.orbit import FINE, AttitudeErrors, attitude_errors
 from ground.telemetry import Run
 from knightcube.astro import quaternion
 from sim_hal.settings import FaultEntry, Simulation
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from tests.scenario.test_orbit import orbit_config, world
 from tests.support.flights import event_names, fly
 

@@ -30,8 +30,7 @@ from sim_hal.star_camera.rso import (
     in_field,
     sun_in_field,
 )
-from sim_hal.worlds import sun
-from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
+from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate, sun_position
 
 DEVICE = "observation opportunities"
 ORBITS = 10
@@ -155,11 +154,11 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
     # Few times pass; only those are tested further.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
-    sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / DAY)
-    excluded = sun_in_field(boresight, camera, sun_position, scenario.half_angle, scenario.buffer)
+    sun_at = sun_position(scenario.epoch + np.asarray(times)[left] / DAY)
+    excluded = sun_in_field(boresight, camera, sun_at, scenario.half_angle, scenario.buffer)
     excluded |= earth_in_field(boresight, camera, scenario.half_angle, scenario.buffer)
     excluded |= hidden_by_earth(camera, position)
-    excluded |= sunlit_share(position, sun_position, scenario.shadow) < 0.5
+    excluded |= sunlit_share(position, sun_at, scenario.shadow) < 0.5
     good[left] = ~excluded
     return good
 

@@ -15,7 +15,7 @@ from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.telemetry import Run
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.settings import CraftSection, FaultEntry, Simulation
-from sim_hal.worlds.free_body.craft import CRAFTS
+from sim_hal.worlds.free_body import CRAFTS
 from tests.support.flights import CONFIG
 
 

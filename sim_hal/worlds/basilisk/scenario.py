@@ -1,8 +1,8 @@
 """The Basilisk simulation of one craft: modules, messages and their wiring.
 
 Dynamics, gravity with J2, gravity gradient, field (WMM), drag, solar pressure and eclipse are Basilisk's own.
-From ours come the craft that a seed builds, the elements, and the directions of Earth and Sun at a time.
-Basilisk downloads its tables from the network at need; everything here does without.
+The craft, the orbital elements, and the directions of Earth and Sun come from this simulator. Tables
+that Basilisk would download from the network are not used.
 """
 
 from __future__ import annotations
@@ -33,21 +33,19 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
+from knightcube.astro.earth.sun import DAY
 from sim_hal.settings import Disturbances
-from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
-from sim_hal.worlds.free_body.craft import TrueCraft
-from sim_hal.worlds.free_body.loads import DRAG_COEFFICIENT
-from sim_hal.worlds.orbit import KeplerianElements
+from sim_hal.worlds.free_body import DRAG_COEFFICIENT, TrueCraft
+from sim_hal.worlds.orbit import KeplerianElements, sun_position
+from sim_hal.worlds.world import UNIX_EPOCH
 
 MASS = 1.0
-"""kg: matters to the orbit's decay alone."""
-_DENSITY, _SCALE_HEIGHT, _HEIGHT = (
-    0.8 * 6.967e-13,
-    63_822.0,
-    500e3,
-)  # Vallado's Table 8-4, mean over the bulge
-_MOST_DIPOLE = 10.0
+"""Mass (kg); it affects the decay of the orbit only."""
+_DENSITY, _SCALE_HEIGHT, _HEIGHT = 0.8 * 6.967e-13, 63_822.0, 500e3
+"""Air density (kg/m^3), mean over the day bulge, scale height (m) and height (m): Vallado, Table 8-4."""
+_MAX_DIPOLE = 10.0
+"""Limit (A m^2) of each bar, larger than any dipole of coils and residual dipole together."""
 _TASK = "craft"
 
 
@@ -68,17 +66,17 @@ class BasiliskScenario:
         self._earth = messaging.SpicePlanetStateMsg()
         self._sun = messaging.SpicePlanetStateMsg()
         self._command = messaging.MTBCmdMsg()
-        self._kept: list[Any] = []
+        self._dynamics: list[Any] = []
         self.craft = _spacecraft(craft, elements, attitude)
         self.craft.gravField.gravBodies = spacecraft.GravBodyVector([self._gravity()])
         self.shadow = self._shadow()
         self.field = self._field(utc_ns)
         self.air = self._air()
         self._effectors(craft)
-        modules = [self.shadow, self.field, self.air, *self._kept, self.craft]
+        modules = [self.shadow, self.field, self.air, *self._dynamics, self.craft]
         for module in modules:
             self._simulation.AddModelToTask(_TASK, module)
-        self.place_bodies(2_440_587.5 + utc_ns * 1e-9 / 86_400.0, 0)
+        self.place_bodies(UNIX_EPOCH + utc_ns * 1e-9 / DAY, 0)
         self.set_dipole((0.0, 0.0, 0.0), 0)
         self._simulation.InitializeSimulation()
 
@@ -88,17 +86,17 @@ class BasiliskScenario:
         self._simulation.ExecuteSimulation()
 
     def place_bodies(self, julian_date: float, time_ns: int) -> None:
-        """Write the Earth's orientation and the Sun's place, ICRS about the Earth, of a Julian date UTC."""
+        """Write the Earth's orientation and the Sun's position, geocentric ICRS, at a Julian date UTC."""
         earth = messaging.SpicePlanetStateMsgPayload()
         earth.PlanetName, earth.computeOrient = "earth", 1
         earth.J20002Pfix = celestial_to_terrestrial(julian_date).tolist()
         self._earth.write(earth, time_ns)
         far = messaging.SpicePlanetStateMsgPayload()
-        far.PlanetName, far.PositionVector = "sun", sun.position(julian_date).tolist()
+        far.PlanetName, far.PositionVector = "sun", sun_position(julian_date).tolist()
         self._sun.write(far, time_ns)
 
     def set_dipole(self, dipole: tuple[float, float, float], time_ns: int) -> None:
-        """Command the three bars, which stand for coils and residual dipole together, A m^2, body axes."""
+        """Set the dipole (3,) A m^2, body axes, of coils and residual dipole together."""
         command = messaging.MTBCmdMsgPayload()
         command.mtbDipoleCmds = list(dipole)
         self._command.write(command, time_ns)
@@ -154,17 +152,17 @@ class BasiliskScenario:
     def _effectors(self, craft: TrueCraft) -> None:
         bars = messaging.MTBArrayConfigMsgPayload()
         bars.numMTB, bars.GtMatrix_B = 3, np.eye(3).ravel().tolist()
-        bars.maxMtbDipoles = [_MOST_DIPOLE] * 3
+        bars.maxMtbDipoles = [_MAX_DIPOLE] * 3
         self._bars = messaging.MTBArrayConfigMsg().write(bars)
         coils = MtbEffector.MtbEffector()
         coils.mtbParamsInMsg.subscribeTo(self._bars)
         coils.mtbCmdInMsg.subscribeTo(self._command)
         coils.magInMsg.subscribeTo(self.field.envOutMsgs[0])
-        self._kept.append(coils)
+        self._dynamics.append(coils)
         if self._multiples.gravity_gradient:
             gradient = GravityGradientEffector.GravityGradientEffector()
             gradient.addPlanetName("earth")
-            self._kept.append(gradient)
+            self._dynamics.append(gradient)
         drag = facetDragDynamicEffector.FacetDragDynamicEffector()
         drag.atmoDensInMsg.subscribeTo(self.air.envOutMsgs[0])
         light = facetSRPDynamicEffector.FacetSRPDynamicEffector()
@@ -177,8 +175,8 @@ class BasiliskScenario:
             drag.addFacet(self._multiples.drag * face.area, DRAG_COEFFICIENT, normal, arm)
             area = self._multiples.solar_pressure * face.area
             light.addFacet(area, np.eye(3), normal, np.array([1.0, 0.0, 0.0]), arm, 0.0, face.mirrored)
-        self._kept += [drag, light]
-        for effector in self._kept:
+        self._dynamics += [drag, light]
+        for effector in self._dynamics:
             self.craft.addDynamicEffector(effector)
 
 
@@ -200,6 +198,6 @@ def _column(vector: FloatArray) -> list[list[float]]:
 
 
 def rodrigues(attitude: FloatArray) -> FloatArray:
-    """Return the modified Rodrigues parameters (3,) of a quaternion (4,), the smaller ones."""
+    """Return the shorter modified Rodrigues parameters (3,) of a quaternion (4,)."""
     q = attitude if attitude[3] >= 0.0 else -attitude
     return np.asarray(q[:3] / (1.0 + q[3]))

@@ -1,9 +1,9 @@
 """Basilisk as the world of a flight: `simulation.world: sim_hal.worlds.basilisk.world:make`.
 
-It reads the section `simulation.free_body` and builds the same craft from the same seed as our own world, so
-their figures can be laid side by side. Basilisk steps by 25 ms; between two steps the motion is carried on at
-its rate. A change of currents acts from the next step on. The walks of air and dipole, the ring current and
-the day bulge are ours alone.
+It reads the section `simulation.free_body` and builds the same craft from the same seed as the world
+`free_body`, so that results can be compared. Basilisk steps by 25 ms; between two steps the motion is
+extrapolated at its rate. A change of currents acts from the next step on. The random walks of air and dipole,
+the ring current and the day bulge are not modelled.
 """
 
 from __future__ import annotations
@@ -19,20 +19,29 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
-from sim_hal.device import NEVER
+from sim_hal.clock import NEVER
 from sim_hal.settings import FreeBodySection
-from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
-from sim_hal.worlds.free_body.body import (
+from sim_hal.worlds.free_body import (
+    CRAFTS,
     KNIGHTCUBE_SUPPLY,
     CoilSupply,
-    elements,
+    build,
+    coil_supply,
     generators,
-    julian_date,
     released,
 )
-from sim_hal.worlds.free_body.craft import CRAFTS, build
-from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
+from sim_hal.worlds.orbit import elements, julian_date, sun_position
+from sim_hal.worlds.world import (
+    UNIX_EPOCH,
+    BodyMotion,
+    Floats,
+    OrbitEnvironment,
+    OrbitTruth,
+    WorldInputs,
+    WorldTruth,
+    utc_date,
+)
 
 if TYPE_CHECKING:
     from sim_hal.worlds.basilisk.scenario import BasiliskScenario
@@ -45,7 +54,7 @@ class BasiliskWorld:
         self,
         section: FreeBodySection,
         currents: Callable[[], FloatArray],
-        power: CoilSupply = KNIGHTCUBE_SUPPLY,
+        supply: CoilSupply = KNIGHTCUBE_SUPPLY,
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
@@ -64,7 +73,7 @@ class BasiliskWorld:
         self._scenario = _scenario()(
             self.craft, section.disturbances, orbit, self._attitude, self._utc_start_ns
         )
-        self._currents, self._power = currents, power
+        self._currents, self._supply = currents, supply
         self._acting: FloatArray = np.zeros(3)
         self._stepped_ns = 0  # since the start; Basilisk's own time
         self._placed_ns = 0
@@ -81,7 +90,9 @@ class BasiliskWorld:
             return
         self._acting = self._currents()
         if not self._held:
-            self._spend((time_ns - self.time_ns) * 1e-9)
+            span, acting = (time_ns - self.time_ns) * 1e-9, self._acting
+            self.energy += span * float(np.dot(self._supply.resistance, acting * acting))
+            self.supply_energy += span * self._supply.voltage * float(np.abs(acting).sum())
         self.time_ns = time_ns
         since = time_ns - self._start_ns
         while self._stepped_ns + STEP_NS <= since:
@@ -91,7 +102,7 @@ class BasiliskWorld:
             self._step(since)
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion there; in free fall nothing presses on the body."""
+        """Advance to `time_ns` and return the motion there; the specific force is zero."""
         self.advance_to(time_ns)
         attitude, rate = self._attitude, np.zeros(3)
         if not self._held:
@@ -103,11 +114,11 @@ class BasiliskWorld:
         return BodyMotion(self.time_ns, attitude, rate, field, np.zeros(3))
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return what surrounds the craft now, ICRS."""
+        """Return the environment of the craft at the present state."""
         state = self._scenario.craft.scStateOutMsg.read()
         velocity = np.array(state.v_BN_N)
         position = np.array(state.r_BN_N) + velocity * self._behind()
-        away = sun.position(self._date()) - position
+        away = sun_position(self._date()) - position
         distance = float(np.linalg.norm(away))
         seen = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
         return OrbitEnvironment(
@@ -126,17 +137,17 @@ class BasiliskWorld:
         return self._utc_start_ns + self.time_ns - self._start_ns
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the state as it is."""
+        """Return currents and energies of the present state."""
         return WorldTruth(self._acting, self.energy, self.supply_energy)
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the state as it is; torques by their causes are not known here."""
+        """Return the present state; Basilisk does not give the torques by their causes."""
         motion, around = self.motion(self.time_ns), self.surroundings()
         return OrbitTruth(
             current=self._acting,
             energy=self.energy,
             supply_energy=self.supply_energy,
-            utc=2_440_587.5 + self.utc_ns() * 1e-9 / DAY,
+            utc=utc_date(self),
             quaternion=motion.quaternion,
             rate=motion.rate,
             position=np.array(around.position),
@@ -145,11 +156,11 @@ class BasiliskWorld:
             sun=np.array(around.sun),
             sunlit=around.sunlit,
             residual_dipole=self._residual(),
-            causes=dict,
+            torques=dict,
         )
 
     def _step(self, until_ns: int) -> None:
-        """Run as many steps as fit before `until_ns`, the release and the next whole second."""
+        """Run all steps before `until_ns`, the release and the next whole second."""
         ends = min(until_ns, (self._stepped_ns // SECOND_NS + 1) * SECOND_NS)
         if self._held and self._release_ns < NEVER:
             ends = min(ends, max(self._stepped_ns + STEP_NS, self._release_ns - self._start_ns))
@@ -170,16 +181,11 @@ class BasiliskWorld:
         return np.array(self._scenario.field.envOutMsgs[0].read().magField_N)
 
     def _behind(self) -> float:
-        """Return by how many seconds Basilisk is behind the present time."""
+        """Return the time (s) since Basilisk's last step."""
         return (self.time_ns - self._start_ns - self._stepped_ns) * 1e-9
 
     def _date(self) -> float:
-        return 2_440_587.5 + (self._utc_start_ns + self._stepped_ns) * 1e-9 / DAY
-
-    def _spend(self, span: float) -> None:
-        squares = self._acting * self._acting
-        self.energy += span * float(np.dot(self._power.resistance, squares))
-        self.supply_energy += span * self._power.supply_voltage * float(np.abs(self._acting).sum())
+        return UNIX_EPOCH + (self._utc_start_ns + self._stepped_ns) * 1e-9 / DAY
 
 
 def _scenario() -> type[BasiliskScenario]:
@@ -204,12 +210,8 @@ def _floats(vector: FloatArray) -> Floats:
 
 def make(inputs: WorldInputs) -> BasiliskWorld:
     """Return the world of a configuration. Raises ConfigError without its section, or without Basilisk."""
-    config, section = inputs.config, inputs.section
+    section, currents = inputs.section, inputs.currents
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
-    power = CoilSupply(
-        section.truth.resistance or config.coils.resistance,
-        section.truth.supply_voltage or config.coils.supply_voltage,
-    )
-    body = section.free_body
-    return BasiliskWorld(body, inputs.currents, power, section.seed, section.utc, inputs.start_ns)
+    supply = coil_supply(inputs)
+    return BasiliskWorld(section.free_body, currents, supply, section.seed, section.utc, inputs.start_ns)

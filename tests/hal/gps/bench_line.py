@@ -9,12 +9,11 @@ import numpy as np
 from hal.drivers.ublox import UbloxReceiver
 from hal.interfaces.devices import GpsReading
 from hal.interfaces.wires import SECOND_NS
-from sim_hal.clock import SimClock
+from sim_hal.clock import SimClock, TimedSimulation
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.settings import FreeBodySection
-from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.free_body import FreeBody
 
 UTC = "2026-03-20T12:00:00Z"
 EXACT = GpsErrors(walk=0.0, noise=0.0, velocity_noise=0.0)

@@ -19,7 +19,8 @@ from knightcube.astro.earth.sun import DAY
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.serial_line import LineFaults, PtyLine
 from sim_hal.settings import FreeBodySection
-from sim_hal.worlds.free_body.body import UNIX_EPOCH, FreeBody
+from sim_hal.worlds.free_body import FreeBody
+from sim_hal.worlds.world import UNIX_EPOCH
 from tests.hal.gps.bench_line import EXACT, bench
 from tests.hal.gps.test_codec import PVT
 

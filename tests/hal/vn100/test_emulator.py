@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, Sentence, StreamParser, build
 from knightcube.astro.quaternion import attitude_matrix
-from sim_hal.device import NEVER
+from sim_hal.clock import NEVER
 from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS

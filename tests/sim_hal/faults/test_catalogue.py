@@ -9,8 +9,7 @@ from flight.schema import reader as configuration
 from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
-from sim_hal.clock import SimClock
-from sim_hal.device import NEVER
+from sim_hal.clock import NEVER, SimClock
 from sim_hal.emulators.coil_circuit import CoilCondition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.faults.bench import Bench, FaultKind, Where

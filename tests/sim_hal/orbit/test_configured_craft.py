@@ -9,7 +9,7 @@ import pytest
 from flight.schema import reader
 from flight.schema.orbit import as_orbit
 from sim_hal.settings import Simulation
-from sim_hal.worlds.free_body.craft import CRAFTS
+from sim_hal.worlds.free_body import CRAFTS
 from tests.studies.campaigns.orbit_pointing_flight import WEIGHTS
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"

@@ -28,7 +28,7 @@ from sim_hal.settings import (
     SkySection,
     Tumble,
 )
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitingWorld
 
 UTC = "2026-03-20T12:00:00Z"

@@ -15,8 +15,7 @@ from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import DAY, sunlit_share
 from sim_hal.star_camera import StarCameraModel, expected_electrons
 from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
-from sim_hal.worlds import sun
-from sim_hal.worlds.orbit import KeplerianElements, propagate
+from sim_hal.worlds.orbit import KeplerianElements, propagate, sun_position
 from tests.support.opportunities import (
     Scenario,
     constant_slew,
@@ -78,7 +77,7 @@ def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
 def test_in_the_umbra_there_is_no_track_and_in_the_penumbra_a_fainter_one() -> None:
     camera, leader = _pair(0.1)
     times = np.linspace(0.0, 6000.0, 60_001)
-    lit = sunlit_share(leader.orbit.positions_at(times), sun.position(EPOCH + times / DAY))
+    lit = sunlit_share(leader.orbit.positions_at(times), sun_position(EPOCH + times / DAY))
     dark = times[np.flatnonzero(lit == 0.0)]
     assert dark.size > 15_000
     half = float(times[np.argmin(np.abs(lit - 0.4))])
@@ -105,7 +104,7 @@ def test_several_objects_come_in_their_order_and_brightness() -> None:
     camera, leader = _pair(0.1)
     other = ResidentSpaceObject(leader.orbit, 6.5)
     times = np.linspace(0.0, 6000.0, 601)
-    lit = sunlit_share(leader.orbit.positions_at(times), sun.position(EPOCH + times / DAY))
+    lit = sunlit_share(leader.orbit.positions_at(times), sun_position(EPOCH + times / DAY))
     start = float(times[np.flatnonzero(lit == 1.0)[0]])
     tracks = source_tracks(camera.orbit, [other, leader], EPOCH, start, start + 0.5)
     assert [track.magnitude for track in tracks] == [6.5, 4.0]

@@ -10,7 +10,7 @@ from flight.schema.testbed import TestbedConfig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import FreeBodySection, OrbitSection, Simulation, TipOff
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment
 from tests.support.flights import demo_config, demo_world
 

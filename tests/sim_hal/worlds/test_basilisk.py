@@ -14,7 +14,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection
 from sim_hal.worlds.basilisk.world import BasiliskWorld, make
-from sim_hal.worlds.free_body.body import CoilSupply, FreeBody
+from sim_hal.worlds.free_body import CoilSupply, FreeBody
 from sim_hal.worlds.world import OrbitingWorld, WorldInputs, make_world
 from tests.support.flights import demo_config, demo_world
 

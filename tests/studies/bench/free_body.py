@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_hal.settings import FreeBodySection
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 
 PERIOD_NS = 25_000_000
 

@@ -25,7 +25,7 @@ from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER, SEMI_MAJOR_AXIS
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from sim_hal.settings import FaultEntry, FreeBodySection, Simulation, TipOff
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from tests.studies.campaigns.campaign import Result
 from tests.support.flights import CONFIG, fly
 

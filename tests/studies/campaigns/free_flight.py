@@ -13,8 +13,7 @@ from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection, TipOff
-from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.craft import CRAFTS
+from sim_hal.worlds.free_body import CRAFTS, FreeBody
 
 SECOND = 1_000_000_000
 CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}

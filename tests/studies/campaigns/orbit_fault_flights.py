@@ -20,7 +20,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import OrbitEnvironment
 from tests.support.flights import CONFIG
 

@@ -23,7 +23,7 @@ from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, Su
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
-from sim_hal.worlds import sun
+from sim_hal.worlds.orbit import sun_position
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.detumble import SAMPLES_NS, SCHEDULE, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
@@ -96,7 +96,7 @@ class SafeFlight:
         flight = self._flight
         truth = flight.body.orbit_truth()
         body = attitude_matrix(truth.quaternion)
-        place = sun.position(truth.utc)
+        place = sun_position(truth.utc)
         currents = self._light.currents(truth.position, place, body, self._draws)
         found = coarse_sun(currents, self._strings)
         if found.direction is not None:

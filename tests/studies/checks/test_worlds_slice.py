@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body import FreeBody
 from tests.studies.campaigns import worlds
 from tests.studies.campaigns.campaign import Case
 

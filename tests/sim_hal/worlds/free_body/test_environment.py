@@ -8,10 +8,17 @@ import pytest
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, sunlit_share
 from sim_hal.settings import Disturbances, OrbitSection
-from sim_hal.worlds import geomagnetism, sun
-from sim_hal.worlds.free_body.body import elements, julian_date
-from sim_hal.worlds.free_body.environment import RING_CURRENT, Environment, air_flow, log_density
-from sim_hal.worlds.orbit import propagate
+from sim_hal.worlds import magnetic_field
+from sim_hal.worlds.orbit import (
+    RING_CURRENT,
+    Environment,
+    air_flow,
+    elements,
+    julian_date,
+    log_density,
+    propagate,
+    sun_position,
+)
 
 DATE = julian_date("2026-03-20T12:00:00Z")
 ORBIT = OrbitSection(local_time=12.0)
@@ -27,8 +34,8 @@ def test_between_knots_position_velocity_field_and_sun_are_the_models() -> None:
     times = np.random.default_rng(5).uniform(20.0, 2980.0, 40)
     times.sort()
     states = propagate(elements(ORBIT, DATE), 3000.0).states_at(times)
-    fields = geomagnetism.field(DATE + times / DAY, states[:, :3])
-    suns = sun.position(DATE + times / DAY) - states[:, :3]
+    fields = magnetic_field.field(DATE + times / DAY, states[:, :3])
+    suns = sun_position(DATE + times / DAY) - states[:, :3]
     for time, state, field, away in zip(times, states, fields, suns, strict=True):
         around = environment.at(float(time))
         np.testing.assert_allclose(around.position, state[:3], atol=0.01)
@@ -52,7 +59,7 @@ def test_an_orbit_over_noon_has_a_third_of_its_time_in_shadow() -> None:
 
 def test_the_local_time_of_the_node_places_the_sun_over_it() -> None:
     position, _ = elements(ORBIT, DATE).state()
-    away = sun.position(DATE)
+    away = sun_position(DATE)
     cosine = position @ away / np.linalg.norm(position) / np.linalg.norm(away)
     assert np.degrees(np.arccos(cosine)) < 1.0  # at the equinox the Sun stands over the equator
 

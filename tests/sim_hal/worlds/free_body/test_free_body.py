@@ -1,4 +1,4 @@
-"""The free body as a world: its loads, its errors, and its place behind the seam."""
+"""The free body as a world: its free_body, its errors, and its place behind the seam."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from flight.schema.errors import ConfigError
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection, Simulation, TipOff
-from sim_hal.worlds.free_body import loads
-from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.craft import CRAFTS, box, build
+from sim_hal.worlds import free_body
+from sim_hal.worlds.free_body import CRAFTS, FreeBody, box, build
 from sim_hal.worlds.world import World, WorldInputs, make_world
 from tests.support.flights import demo_config, demo_world
 
@@ -94,16 +93,16 @@ def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
     shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
     expected = np.cross(arm, -0.5 * 2.2 * 1e-12 * shadow * flow)
     x, y, z = flow.tolist()
-    np.testing.assert_allclose(loads.air_torque(faces, (x, y, z), 1e-12), expected, rtol=1e-12)
+    np.testing.assert_allclose(free_body.air_torque(faces, (x, y, z), 1e-12), expected, rtol=1e-12)
 
 
 def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> None:
     arm = np.array([0.0, 0.02, 0.0])
-    black = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.zeros(6)), (1.0, 0.0, 0.0), 1.0)
+    black = free_body.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.zeros(6)), (1.0, 0.0, 0.0), 1.0)
     np.testing.assert_allclose(black, [0.0, 0.0, 0.02 * 4.56e-6 * 0.01], atol=1e-20)
-    mirror = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 1.0)
+    mirror = free_body.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 1.0)
     np.testing.assert_allclose(mirror, 2.0 * np.array(black), atol=1e-20)
-    dark = loads.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 0.0)
+    dark = free_body.sunlight_torque(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 0.0)
     assert dark == (0.0, 0.0, 0.0)
 
 
@@ -114,7 +113,7 @@ def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None
         body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
         for time in range(0, 2000, 100):
             body.advance_to(time * SECOND)
-            for cause, torque in body.orbit_truth().torques.items():
+            for cause, torque in body.orbit_truth().torques().items():
                 sizes.setdefault(cause, []).append(float(np.linalg.norm(torque)))
     assert 4.4e-8 < max(sizes["gravity gradient"]) <= 5.0e-8
     assert 1e-8 < np.median(sizes["residual dipole"]) < max(sizes["residual dipole"]) < 7e-8

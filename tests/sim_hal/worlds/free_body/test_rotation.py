@@ -12,8 +12,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from sim_hal.settings import Disturbances, FreeBodySection, TipOff
-from sim_hal.worlds.free_body.body import FreeBody
-from sim_hal.worlds.free_body.rotation import Loads, Rotation, State
+from sim_hal.worlds.free_body import FreeBody, Loads, Rotation, State
 
 SECOND = 1_000_000_000
 QUIET = Disturbances(drag=0.0, solar_pressure=0.0, residual_dipole=0.0)

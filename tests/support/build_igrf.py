@@ -1,4 +1,4 @@
-"""Make the table of the geomagnetic field: python -m sim_hal.worlds.build_igrf WHEEL_OR_SHC.
+"""Makes the table of the true magnetic field: python -m tests.support.build_igrf WHEEL_OR_SHC.
 
 The source is the file `ppigrf/IGRF14.shc` of the PyPI wheel ppigrf 2.1.0 (`pip download --no-deps
 ppigrf==2.1.0`): the International Geomagnetic Reference Field as published (doi 10.5281/zenodo.14012302).
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from knightcube.errors import UsageError
-from sim_hal.worlds.geomagnetism import DEGREE, TABLE
+from sim_hal.worlds.magnetic_field import DEGREE, TABLE
 
 WHEEL_MEMBER = "ppigrf/IGRF14.shc"
 FIRST_EPOCH = 2000
@@ -62,7 +62,7 @@ def parse(text: str) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the table; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m sim_hal.worlds.build_igrf", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.support.build_igrf", description=__doc__)
     parser.add_argument("source", type=Path, metavar="WHEEL_OR_SHC")
     options = parser.parse_args(arguments)
     try:

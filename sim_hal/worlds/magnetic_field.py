@@ -1,13 +1,13 @@
-"""The Earth's true field in the simulator: the International Geomagnetic Reference Field, 14th generation.
+"""The Earth's true magnetic field: the International Geomagnetic Reference Field, 14th generation (IGRF-14).
 
 Spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49, eq. 1; coefficients of 2024,
 doi 10.5281/zenodo.14012302), linear in time between epochs. The flight software uses another model
-(`knightcube.astro.earth.geomagnetism`), so the two differ as a model differs from the world, except for the
-ring current and the ionosphere; `ring_current` gives the larger of these.
+(`knightcube.astro.earth.geomagnetism`), so that it has a realistic model error. The field of the ring current
+is added by `ring_current`; currents in the ionosphere are not modelled.
 
-The table `igrf.npz` holds whole hundredths of a nanotesla; `sim_hal.worlds.build_igrf` makes it from the file
-that the package ppigrf ships. Not ppigrf itself, which was measured: the fields agree within 0.06 nT, but one
-position takes 81 ms against 3 ms here and 5,400 positions 0.8 s against 0.27 s, and it needs pandas.
+The table `igrf.npz` holds whole hundredths of a nanotesla. `tests/support/build_igrf.py` makes it from the
+file that the package ppigrf ships. The package itself is not used: its fields agree within 0.06 nT, but it is
+slower (81 ms against 3 ms for one position) and needs pandas.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from knightcube.astro.earth.orientation import celestial_to_terrestrial, julian_
 TABLE = Path(__file__).with_name("igrf.npz")
 DEGREE = 13
 REFERENCE_RADIUS = 6_371_200.0
-"""m, of the expansion."""
+"""Reference radius (m) of the expansion."""
 UNIT = 1e-11
-"""T, of the table's whole numbers."""
+"""Unit (T) of the whole numbers in the table."""
 DEVICE = "geomagnetic field"
 _NEAR_POLE = 0.5 * np.pi - 1e-8
-"""rad: east is undefined at the pole itself; the field 7 cm beside it is the same."""
+"""Largest latitude (rad), 7 cm from the pole, where the direction east is undefined."""
 
 
 def field(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArray:
     """Return the field (..., 3) T, ICRS axes, at Julian dates UTC (...) and positions (..., 3) m, ICRS.
 
-    Raises OutOfRange before the table's first epoch and after its last.
+    Raises OutOfRange for a date outside the epochs of the table.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     there = np.einsum("...ij,...j->...i", to_ground, position)
@@ -59,12 +59,12 @@ def field_on_ground(julian_date: npt.ArrayLike, position: FloatArray) -> FloatAr
 
 
 def ring_current(julian_date: npt.ArrayLike, disturbance: float) -> FloatArray:
-    """Return the uniform field (..., 3) T, ICRS axes, of a ring current: against the dipole's axis.
+    """Return the uniform field (..., 3) T, ICRS axes, of a ring current, opposite to the dipole field.
 
-    `disturbance` T is the Dst index taken positive: 20 nT on a quiet day, 100 nT in a storm.
+    `disturbance` (T) is the negative Dst index: 20 nT on a quiet day, 100 nT in a storm.
     """
     dipole = _coefficients(np.atleast_1d(julian_epoch(julian_date)).reshape(-1))[0, :3]
-    # (g10, g11, h11) point to the pole in the south; the ring current's field inside points south too.
+    # The dipole (g10, g11, h11) and the field inside the ring current both point south.
     axis = np.array([dipole[1], dipole[2], dipole[0]]) / np.linalg.norm(dipole)
     to_ground = celestial_to_terrestrial(julian_date)
     return np.asarray(np.einsum("...ji,j->...i", to_ground, disturbance * axis))
@@ -91,7 +91,7 @@ def _coefficients(year: FloatArray) -> FloatArray:
 def _expansion(
     coefficients: FloatArray, radius: FloatArray, colatitude: FloatArray, longitude: FloatArray
 ) -> FloatArray:
-    """Return the field (n, 3) T, geocentric north, east and down: minus the potential's gradient."""
+    """Return the field (n, 3) T, geocentric north, east and down: the negative gradient of the potential."""
     legendre, slope = _legendre(np.cos(colatitude), np.sin(colatitude))
     sine = np.sin(colatitude)
     ratio = REFERENCE_RADIUS / radius
@@ -113,9 +113,9 @@ def _expansion(
 
 
 def _legendre(cosine: FloatArray, sine: FloatArray) -> tuple[list[list[FloatArray]], list[list[FloatArray]]]:
-    """Return Schmidt's P[n][m] and their derivatives by the colatitude, each (points,).
+    """Return Schmidt's functions P[n][m] and their derivatives by the colatitude, each (points,).
 
-    By the recursions of Langel (The main field, in Geomagnetism, ed. Jacobs, 1987, eq. 27 and table 2).
+    The recursions are those of Langel (The main field, in Geomagnetism, ed. Jacobs, 1987, eq. 27, table 2).
     """
     p = [[np.ones_like(cosine)]]
     d = [[np.zeros_like(cosine)]]

@@ -1,1 +1,0 @@
-"""A free body in low Earth orbit: craft, environment, disturbances and the rotation that they cause."""
