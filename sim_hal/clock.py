@@ -90,6 +90,19 @@ class TimedSimulation:
         self._advance_world(time_ns)
 
 
+class TimedWorld(Protocol):
+    """A world that a SimClock advances."""
+
+    def next_event_ns(self) -> int:
+        """Return the time of the next event."""
+
+    def run_events(self, event_ns: int) -> None:
+        """Process the events at `event_ns`, the time of the next event."""
+
+    def advance_to(self, time_ns: int) -> None:
+        """Process all events due at or before `time_ns`."""
+
+
 class SimClock:
     """A Clock that jumps to each deadline. Time begins at `start_ns`; `utc_start_ns` is the UTC of time 0.
 
@@ -100,11 +113,11 @@ class SimClock:
     def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:
         self._now_ns = start_ns
         self._utc_start_ns = utc_start_ns
-        self._world: TimedSimulation | None = None
+        self._world: TimedWorld | None = None
         self.tickers: list[SimTicker] = []
         self._running_jobs = False
 
-    def attach(self, world: TimedSimulation) -> None:
+    def attach(self, world: TimedWorld) -> None:
         """Advance this world and its devices from now on."""
         self._world = world
 
