@@ -14,8 +14,8 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, normalise
-from knightcube.gnc.estimation.filter_settings import FilterSettings
-from knightcube.gnc.estimation.rigid_body import Parameters
+from knightcube.gnc.estimation.attitude_filter import FilterSettings
+from knightcube.gnc.estimation.estimate import Parameters
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 
 CYCLE_NS = 25_000_000

@@ -51,7 +51,7 @@ from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
 from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track

@@ -33,8 +33,8 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.estimate import TURN, Knowledge
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.estimate import ATTITUDE, Knowledge
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
 from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.settings import (
@@ -137,7 +137,7 @@ class CoarseSunFeed:
         then = self._filter.past(time_ns)
         if then is None:  # the filter began after this reading
             return
-        claim = then.covariance[TURN, TURN]
+        claim = then.covariance[ATTITUDE, ATTITUDE]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))
         contradicts = float(off @ np.linalg.solve(claim + fix.covariance, off)) > GATE
         self._against = self._against + 1 if contradicts else 0
@@ -147,7 +147,7 @@ class CoarseSunFeed:
             self._filter.measure_late([DirectionMeasurement(time_ns, seen, sun, covariance)], lambda _: None)
 
 
-def _sky(around: Around, sun: FloatArray) -> KnownDirections:
+def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
     """Return the directions and the light of the Earth below, with clouds that are not known."""
     up = around.position / np.linalg.norm(around.position)
     light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
@@ -227,7 +227,7 @@ class WideFeed:
             return False, False
         # The strings' own Sun reaches the filter with the field (`coarse_sun`).
         mine = [None if _is_of_strings(found.sun) else seen[0], seen[1]]
-        claim, turn = then.covariance[TURN, TURN], attitude_matrix(then.quaternion)
+        claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
         refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
         self._judge(mine, refused)
         sun_used, nadir_used = (
@@ -292,7 +292,7 @@ class WideFeed:
             sensed = (SensedDirection(field.observed, field.reference, math.hypot(field.sigma, FIELD_SIGMA)),)
         then, rough = self._filter.past(time_ns) if self._filter.runs else None, None
         if then is not None:
-            sigma = math.sqrt(max(float(np.linalg.eigvalsh(then.covariance[TURN, TURN])[-1]), 0.0))
+            sigma = math.sqrt(max(float(np.linalg.eigvalsh(then.covariance[ATTITUDE, ATTITUDE])[-1]), 0.0))
             rough = RoughAttitude(then.quaternion, sigma) if sigma < ROUGH_SIGMA else None
         return HorizonKnowledge(position=around.position, sun=sun, attitude=rough, sensed=sensed)
 

@@ -20,7 +20,7 @@ from knightcube.astro.earth.geomagnetism import GeomagneticError
 from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_velocity
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Span (s) of the short prediction, after and before the time for which it is made."""
@@ -86,13 +86,13 @@ class OrbitEnvironment:
         """Return place and velocity, ICRS; None while no orbit is known."""
         return self._state(self.julian_date(now_ns))
 
-    def at(self, now_ns: int) -> Around | None:
+    def at(self, now_ns: int) -> FilterEnvironment | None:
         """Return field, place, torques' shapes and sunlight; None while no orbit is known."""
         near, times = self._prediction(now_ns)
         if near is None:
             return None
         shape = pressures(near, times)
-        return Around(
+        return FilterEnvironment(
             near.field_at(times)[0],
             near.position_at(times)[0],
             Pressures(shape.air, shape.light),

@@ -29,17 +29,27 @@ from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.directions import cross_product
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.estimation import estimate as form
-from knightcube.gnc.estimation import free_motion as states
-from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge
-from knightcube.gnc.estimation.free_filter import FreeFilter, FreeMemory, SlowStates
-from knightcube.gnc.estimation.free_motion import AXES, DIPOLE, GYRO, MAGNET, SUNLIT, TORQUES, Around
-from knightcube.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
+from knightcube.gnc.estimation import free_filter as states
+from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate, Knowledge, Parameters
+from knightcube.gnc.estimation.free_filter import (
+    AXES,
+    DIPOLE,
+    GYRO,
+    MAGNET,
+    PLAUSIBLE,
+    SUNLIT,
+    TORQUES,
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+    FreeMemory,
+    SlowStates,
+)
 from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     FieldMeasurement,
     Measurement,
 )
-from knightcube.gnc.estimation.rigid_body import Parameters
 
 STUCK, CONTRADICTED = 20, 4
 """Readings in a row with the same field, whose noise never repeats; fields that contradict the estimate."""
@@ -70,8 +80,8 @@ class StuckFieldCheck:
         return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""
 
 
-_FROM = np.r_[states.TURN, states.RATE, states.GYRO, states.MAGNET]
-_TO = np.r_[form.TURN, form.RATE, form.BIAS, form.FIELD_BIAS]
+_FROM = np.r_[states.ATTITUDE, states.RATE, states.GYRO, states.MAGNET]
+_TO = np.r_[form.ATTITUDE, form.RATE, form.BIAS, form.FIELD_BIAS]
 _PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
 _SIZE = FIELD_BIAS.stop
 _PARAMETERS = Parameters()
@@ -88,7 +98,7 @@ class _Beginning:
         field, residual: (3,) T and A m^2, body axes.
     """
 
-    around: Around
+    around: FilterEnvironment
     quaternion: FloatArray
     rate: FloatArray
     bias: FloatArray
@@ -108,7 +118,7 @@ class EstimatePropagation:
         self._changes = -1
 
     def now(
-        self, time_ns: int, seconds: float, dipole: FloatArray, around: Around, measured_ns: int
+        self, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment, measured_ns: int
     ) -> Estimate:
         """Return the newest estimate `seconds` s later under a dipole (3,) A m^2."""
         free, newest = self._free, self._newest
@@ -119,7 +129,7 @@ class EstimatePropagation:
         return self._carry(newest, time_ns, seconds, dipole, measured_ns)
 
     def then(
-        self, memory: FreeMemory, time_ns: int, seconds: float, dipole: FloatArray, around: Around
+        self, memory: FreeMemory, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment
     ) -> Estimate:
         """Return an earlier estimate `seconds` s later under a dipole (3,) A m^2."""
         bias, magnet = memory.constants[states.GYRO], memory.constants[states.MAGNET]
@@ -133,11 +143,11 @@ class EstimatePropagation:
         bias: FloatArray,
         magnet: FloatArray,
         covariance: FloatArray,
-        around: Around,
+        around: FilterEnvironment,
     ) -> _Beginning:
         spread = np.zeros((_SIZE, _SIZE))
         spread[_PLACED] = covariance[_PICKED]
-        mixed = spread[form.TURN, form.RATE]
+        mixed = spread[form.ATTITUDE, form.RATE]
         field = attitude_matrix(quaternion) @ around.field
         residual = self._free.residual_dipole(around.sunlit)
         return _Beginning(around, quaternion, rate, bias, magnet, spread, mixed + mixed.T, field, residual)
@@ -152,7 +162,7 @@ class EstimatePropagation:
         grown = seconds * free.rate_noise(dipole, begun.around)
         spread = begun.spread.copy()
         widened = seconds**2 * (begun.spread[form.RATE, form.RATE] + grown / 3.0)
-        spread[form.TURN, form.TURN] += seconds * begun.mixed + widened
+        spread[form.ATTITUDE, form.ATTITUDE] += seconds * begun.mixed + widened
         spread[form.RATE, form.RATE] += grown
         return Estimate(
             time_ns=time_ns,
@@ -180,7 +190,9 @@ class OrbitFilter:
         restarts: how often an estimate was discarded for a new one.
     """
 
-    def __init__(self, settings: OrbitFilterSettings, around: Callable[[int], Around | None]) -> None:
+    def __init__(
+        self, settings: OrbitFilterSettings, around: Callable[[int], FilterEnvironment | None]
+    ) -> None:
         """`around` returns the orbit environment at a time of the clock; None while it is not known."""
         self._settings = settings
         self._around = around
@@ -456,8 +468,8 @@ def start_from(
         if name not in learned:
             continue
         values, covariance = learned[name].arrays()
-        if values.shape != at.shape or not settings.believes(values, at).all():
-            problems.append(f"{name} {values.tolist()}: not within {BELIEVED:g} sigma of what is expected")
+        if values.shape != at.shape or not settings.plausible(values, at).all():
+            problems.append(f"{name} {values.tolist()}: not within {PLAUSIBLE:g} sigma of what is expected")
             continue
         prior.values[at] = values
         prior.covariance[np.ix_(at, at)] = covariance + np.diag(grown[at])

@@ -19,9 +19,13 @@ from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
-from knightcube.gnc.estimation.free_filter import FreeFilter, FreeMemory, SlowStates
-from knightcube.gnc.estimation.free_motion import Around
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+    FreeMemory,
+    SlowStates,
+)
 from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,
@@ -101,7 +105,7 @@ class FilterStep:
     end_ns: int
     dipole: FloatArray
     doubt: float
-    around: Around
+    around: FilterEnvironment
     gyro: FloatArray
     gyro_ns: int
     samples: int
@@ -145,7 +149,7 @@ class OpenStep:
         """Return whether it has lasted long enough, or the coils have begun or ceased to act."""
         return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
 
-    def close(self, dipole: FloatArray, doubt: float, around: Around) -> FilterStep:
+    def close(self, dipole: FloatArray, doubt: float, around: FilterEnvironment) -> FilterStep:
         """Return the step from its beginning to the newest reading."""
         samples, fields = len(self._rates), len(self._fields)
         return FilterStep(

@@ -46,11 +46,10 @@ from knightcube.gnc.control.detumble import (
     WindowSchedule,
     share_in_rotating_field,
 )
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.estimation.filter_settings import FilterSettings, slow_prior
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
+from knightcube.gnc.estimation.estimate import Estimate, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
-from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
+from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.guidance.one_axis import job as plan_job
 from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuidance
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant

@@ -29,11 +29,9 @@ from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.astro.earth.sun import DAY
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
 from knightcube.errors import UsageError
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import Estimate
-from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from knightcube.gnc.estimation.estimate import Estimate, SlowPrior
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.estimation.slow_prior import SlowPrior
 from knightcube.gnc.guidance.one_axis.path import PathSample
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 

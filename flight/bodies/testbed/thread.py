@@ -11,8 +11,7 @@ from flight.loop.body import Target
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
-from knightcube.gnc.estimation.estimate import PARAMETERS, Estimate
-from knightcube.gnc.estimation.rigid_body import NOMINAL, Parameters
+from knightcube.gnc.estimation.estimate import NOMINAL, PARAMETERS, Estimate, Parameters
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 
 

@@ -9,7 +9,7 @@ A gain beyond `LARGEST_GAIN` is physically impossible: the model is wrong then, 
 The gyroscopic acceleration of a free body exceeds the coils' hundredfold in a tumble, so that an inertia 2 %
 wrong makes healthy coils look reversed. The fit therefore subtracts the acceleration that the believed
 inertia makes, and estimates the error that remains by nuisance parameters
-(`knightcube.gnc.estimation.gyroscopic`). Where the coils' field at the magnetometer is as large as the
+(`knightcube.gnc.estimation.rigid_body`). Where the coils' field at the magnetometer is as large as the
 Earth's, the field measured in their last pause is rotated with the body.
 
 The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
@@ -28,7 +28,7 @@ import numpy as np
 from flight.loop.fdir.supply_current import CoilFault
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import cross_matrices
-from knightcube.gnc.estimation.gyroscopic import (
+from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
     gyroscopic_coefficients,

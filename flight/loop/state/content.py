@@ -24,9 +24,15 @@ from msgspec import Meta
 
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.estimate import BIAS, FIELD_BIAS, LATENCY, PARAMETERS, Estimate
-from knightcube.gnc.estimation.rigid_body import Parameters
-from knightcube.gnc.estimation.slow_prior import SlowPrior
+from knightcube.gnc.estimation.estimate import (
+    BIAS,
+    FIELD_BIAS,
+    LATENCY,
+    PARAMETERS,
+    Estimate,
+    Parameters,
+    SlowPrior,
+)
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Seconds = Annotated[float, Meta(ge=0.0)]

@@ -24,7 +24,8 @@ from flight.loop.tasks.navigation import Navigation, Positioning, SunSensing
 from flight.loop.tasks.steering import CoilDrive, Steering
 from flight.loop.tasks.wide_imaging import WideImaging
 from hal.interfaces.devices import CoilState, ImuReading
-from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate
+from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
+from knightcube.gnc.estimation.estimate import RATE, Estimate
 
 ATTITUDE_EVERY = 4
 """Control cycles from one attitude packet to the next."""
@@ -187,7 +188,7 @@ class ControlCycle:
             mode=int(output.mode),
             quaternion=(_NAN4 if estimate is None else estimate.quaternion).tolist(),
             rate=(_NAN3 if estimate is None else estimate.rate).tolist(),
-            angle_sigma=_sigmas(estimate, TURN),
+            angle_sigma=_sigmas(estimate, ATTITUDE_ERROR),
             rate_sigma=_sigmas(estimate, RATE),
             wanted=(_NAN4 if reference is None else reference.quaternion).tolist(),
             wanted_rate=(_NAN3 if reference is None else reference.body_rate).tolist(),

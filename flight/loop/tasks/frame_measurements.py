@@ -17,7 +17,7 @@ from hal.interfaces.devices import Frame
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
+from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
@@ -149,7 +149,7 @@ class FrameMeasurer:
         return Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, sigma)
 
     def _attitude_prior(self, past: Estimate) -> AttitudePrior:
-        widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])
+        widest = float(np.linalg.eigvalsh(past.covariance[ATTITUDE, ATTITUDE])[-1])
         sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
         return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
 

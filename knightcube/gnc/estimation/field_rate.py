@@ -1,16 +1,16 @@
-"""The body's rate from the magnetometer: an extended Kalman filter of rate, field and its change.
+"""The body rate from the magnetometer: an extended Kalman filter of rate, field and field derivative.
 
-A body that turns in a field sees the field turn on a cone about its rate, so the field's direction over time
-gives all three components, the one along the field too; only a spin exactly along the field shows nothing,
-until the field has turned (by about two turns an orbit). A gyro, where there is one, shows it at once. The
-states are in body axes: rate w, field B, and the field's change v with respect to the stars; and a small turn
-a of the principal axes from those of the believed inertia, because at a fast spin of a long body the
-gyroscopic torque of 2 deg is the model's largest error:
+In a rotating body the field rotates on a cone about the rate, so that the direction of the field over time
+gives all three components of the rate, including the one along the field. Only a spin exactly along the field
+is not observable until the field has rotated (by about two revolutions an orbit). A gyro gives that spin at
+once. The states are in body axes: rate w, field B, derivative v of the field with respect to the stars, and a
+small rotation a of the principal axes from those of the assumed inertia, because at a fast spin of a long
+body the gyroscopic torque of 2 deg is the largest error of the model:
 
     J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
 
-The dipole m of the coils is known, so the coils may act between measurements. The filter keeps the turn since
-its start, which serves as an inertial frame.
+The dipole m of the coils is known, so that the coils may act between measurements. The filter also keeps the
+rotation since its start, which serves as an inertial frame.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.turn import (
+from knightcube.gnc.estimation.rotation import (
     Matrix,
     Quaternion,
     Vector,
@@ -36,10 +36,10 @@ from knightcube.gnc.estimation.turn import (
 
 RATE, FIELD, CHANGE, AXES = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 SIZE = 12
-LARGEST_TURN = 0.15
-"""rad, of a step of integration."""
+LARGEST_ROTATION = 0.15
+"""Largest rotation (rad) in a step of integration."""
 _AGREEING = 3
-"""Samples that start the filter."""
+"""Number of samples that start the filter."""
 _EYE: FloatArray = np.eye(SIZE)
 _NONE: Vector = (0.0, 0.0, 0.0)
 
@@ -50,17 +50,17 @@ class FieldRateSettings:
 
     Attributes:
         inertia: (3, 3) kg m^2, body axes.
-        field_sigma: T of an axis of a measurement, constant errors of the magnetometer included.
-        rate_start: rad/s, of the rate along the field at the start.
-        change_start: T/s, of the field's change with respect to the stars.
-        change_walk: T/s per sqrt(s), its random walk.
-        torque_walk: rad/s per sqrt(s) of an axis, from torques that are not modelled.
-        axes_sigma: rad, by which the principal axes are turned from those of `inertia`, at the start.
-        inertia_error: share of the gyroscopic torque that no turn of the axes explains, once that is known.
-        gate_sigma: a measurement less likely than this many sigma of one component is refused.
-        refusals: this many in a row, and the filter starts again; of a gyro, and it is not asked again.
-        gyro_sigma: rad/s of an axis, the bound of a gyro's bias.
-        longest_gap: s, between the samples that start it: longer gaps hide fast spins.
+        field_sigma: T per axis of a measurement, including constant errors of the magnetometer.
+        rate_start: rad/s, standard deviation of the rate along the field at the start.
+        change_start: T/s, standard deviation of the field's derivative with respect to the stars.
+        change_walk: T/s per sqrt(s), random walk of that derivative.
+        torque_walk: rad/s per sqrt(s) per axis, from torques that are not modelled.
+        axes_sigma: rad, rotation of the principal axes from those of `inertia` at the start.
+        inertia_error: share of the gyroscopic torque that no rotation of the axes explains.
+        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
+        refusals: number of consecutive refusals after which the filter restarts, or the gyro is excluded.
+        gyro_sigma: rad/s per axis, bound of the gyro bias.
+        longest_gap: s, largest time between the samples that start the filter: longer gaps hide fast spins.
     """
 
     inertia: FloatArray
@@ -78,23 +78,21 @@ class FieldRateSettings:
 
 
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
-    """Return the rate (3,) across the field, rad/s, that turned `before` into `after` (3,) T in the body.
+    """Return the rate (3,) rad/s across the field that rotated `before` into `after` (3,) T, body axes.
 
-    Exact for a steady rotation across the field by less than half a turn. Zero without a field.
+    The result is exact for a steady rotation across the field by less than half a revolution, and zero
+    without a field.
     """
-    turned = np.cross(after, before)  # -w x B: the field turns opposite to the body
-    length = float(np.linalg.norm(turned))
+    rotated = np.cross(after, before)  # -w x B: the field rotates opposite to the body
+    length = float(np.linalg.norm(rotated))
     if length == 0.0:
         return np.zeros(3)
     angle = math.atan2(length, float(before @ after))
-    return turned * (angle / (length * seconds))
+    return rotated * (angle / (length * seconds))
 
 
 class FieldRate:
-    """The filter; `restarts` counts how often it began again because its predictions failed.
-
-    Longer than 200 lines because start, steps and both measurements act on the one state.
-    """
+    """The filter; `restarts` counts the restarts after failed predictions."""
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings
@@ -103,61 +101,61 @@ class FieldRate:
         self._inertia_rows, self._inverse_rows = _rows(inertia), _rows(self._inverse)
         moments = np.linalg.eigvalsh(inertia)
         self._differences = float(moments[-1] - moments[0]) / np.diag(inertia)
-        # As rare as `gate_sigma` of one component, by the tail's exponential part.
+        # About as rare as `gate_sigma` of one component, by the exponential part of the tail.
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
         self.restart()
 
     def restart(self) -> None:
-        """Forget all but how often the predictions failed."""
+        """Forget everything except `restarts`."""
         self._waiting: list[tuple[float, FloatArray]] = []
         self._since = 0.0
         self._refused = self._gyro_refused = 0
         self._gyro_used = False
-        self._turn: Quaternion = (0.0, 0.0, 0.0, 1.0)
+        self._rotation: Quaternion = (0.0, 0.0, 0.0, 1.0)
         self._rate: Vector | None = None
         self._field = self._change = _NONE
-        self._turn_axes(np.asarray(self._settings.inertia, dtype=float), (0.0, 0.0, 0.0))
+        self._rotate_axes(np.asarray(self._settings.inertia, dtype=float), (0.0, 0.0, 0.0))
         self._covariance = np.zeros((SIZE, SIZE))
 
     @property
     def started(self) -> bool:
-        """Whether there is a rate."""
+        """Whether a rate is known."""
         return self._rate is not None
 
     @property
     def rate(self) -> FloatArray:
-        """The rate (3,) rad/s, body axes."""
+        """Body rate (3,) rad/s, body axes."""
         return np.array(self._rate or _NONE)
 
     @property
     def field(self) -> FloatArray:
-        """The field (3,) T, body axes, at the end of the last `advance`."""
+        """Field (3,) T, body axes, at the end of the last `advance`."""
         return np.array(self._field)
 
     @property
     def change(self) -> FloatArray:
-        """The field's change (3,) T/s with respect to the stars, in body axes."""
+        """Derivative (3,) T/s of the field with respect to the stars, body axes."""
         return np.array(self._change)
 
     @property
-    def turn(self) -> FloatArray:
-        """The rotation (4,) since the start, from the body's axes then into those of now."""
-        return np.array(self._turn)
+    def rotation(self) -> FloatArray:
+        """Rotation (4,) since the start, from the body axes at the start into the present ones."""
+        return np.array(self._rotation)
 
     @property
     def inverse(self) -> FloatArray:
-        """The inverse (3, 3) of the inertia about the principal axes as they are estimated."""
+        """Inverse (3, 3) of the inertia with the estimated principal axes."""
         return self._inverse
 
     @property
     def momentum(self) -> FloatArray:
-        """The angular momentum (3,) N m s, body axes."""
+        """Angular momentum (3,) N m s, body axes."""
         return np.array(times(self._inertia_rows, self._rate or _NONE))
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (12, 12) of rate, field, change and axes (RATE, FIELD, ...)."""
+        """Covariance (12, 12) of rate, field, derivative and axes (RATE, FIELD, ...)."""
         return self._covariance
 
     def advance(self, dipole: FloatArray, seconds: float) -> None:
@@ -166,15 +164,15 @@ class FieldRate:
         if self._rate is None:
             return
         speed = math.sqrt(sum(w * w for w in self._rate))
-        steps = max(1, math.ceil(speed * seconds / LARGEST_TURN))
+        steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
         mx, my, mz = dipole.tolist()
         for _ in range(steps):
             self._step((mx, my, mz), seconds / steps)
 
     def measure(self, field: FloatArray, age: float = 0.0) -> bool:
-        """Accept the field (3,) T measured `age` s ago with the coils off; return whether it was plausible.
+        """Apply the field (3,) T measured `age` s ago with the coils off; return whether it was plausible.
 
-        The body's rate carries it on to now.
+        The field is propagated to the present with the body rate.
         """
         if not np.all(np.isfinite(field)):
             return False
@@ -191,18 +189,18 @@ class FieldRate:
         if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
             self._refused += 1
             if self._refused >= self._settings.refusals:
-                self._begin_again(self._gyro_used or self._gyro_refused >= self._settings.refusals)
+                self._restart_counted(self._gyro_used or self._gyro_refused >= self._settings.refusals)
             return False
         self._refused = 0
         self._correct(np.asarray(gain), innovation, FIELD)
         return True
 
     def measure_rate(self, rate: FloatArray) -> None:
-        """Accept a gyro's rate (3,) rad/s of now where it says more than the filter knows.
+        """Apply the present gyro rate (3,) rad/s, if it is more accurate than the filter.
 
-        Its error is a bias: used more often it would narrow the filter's claim to less than that bias. One
-        that contradicts the filter several times in a row, or after which the field's predictions failed, is
-        not used again before `restart`. Where it contradicts what it has taught, the filter begins again.
+        The error of the gyro is a bias: frequent use would reduce the covariance below that bias. A gyro that
+        contradicts the filter several times in a row, or after which the predictions of the field failed, is
+        excluded until `restart`. If it contradicts an estimate that used it, the filter restarts.
         """
         settings, covariance = self._settings, self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
@@ -212,17 +210,17 @@ class FieldRate:
         if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
             self._gyro_refused += 1
             if self._gyro_used and self._gyro_refused >= settings.refusals:
-                self._begin_again(misled=True)
+                self._restart_counted(exclude_gyro=True)
             return
         self._gyro_refused = 0
         if float(covariance.diagonal()[RATE].max()) > settings.gyro_sigma**2:
             self._gyro_used = True
             self._correct(np.asarray(np.linalg.solve(spread, covariance[RATE]).T), innovation, RATE)
 
-    def _begin_again(self, misled: bool) -> None:
-        """Begin again, and count it; `misled`: by the gyro, which is not asked again."""
+    def _restart_counted(self, exclude_gyro: bool) -> None:
+        """Restart and count it."""
         self.restart()
-        self._gyro_refused = self._settings.refusals if misled else 0
+        self._gyro_refused = self._settings.refusals if exclude_gyro else 0
         self.restarts += 1
 
     def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
@@ -232,22 +230,22 @@ class FieldRate:
         self._rate = _sum(self._rate, change[RATE])
         self._field = _sum(self._field, change[FIELD])
         self._change = _sum(self._change, change[CHANGE])
-        self._turn_axes(self._inertia, change[AXES])
+        self._rotate_axes(self._inertia, change[AXES])
         covariance = self._covariance - gain @ self._covariance[measured]
         self._covariance = 0.5 * (covariance + covariance.T)
-        self._look_at_axes()
+        self._update_unexplained()
 
-    def _look_at_axes(self) -> None:
-        """Take for unexplained, of the gyroscopic torque, the doubt of the axes that can be seen.
+    def _update_unexplained(self) -> None:
+        """Set the unexplained share of the gyroscopic torque to the uncertainty of the principal axes.
 
-        The filter is linear: what it takes from turns that it hardly knows it would believe too firmly. The
-        axes' worst direction is left out, as a turn about a symmetric body's axis shows nothing.
+        The filter is linear and would become overconfident from poorly known rotations of the axes. The worst
+        direction is omitted, because a rotation about the axis of a symmetric body is not observable.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[AXES, AXES])[1])
         self._unexplained = max(self._settings.inertia_error, math.sqrt(unknown))
 
     def _start(self, field: FloatArray) -> None:
-        """Begin with the rate across the field from three samples in a row that agree; else wait for more."""
+        """Start with the rate across the field if three consecutive samples agree; otherwise wait."""
         settings = self._settings
         if self._since > settings.longest_gap:
             self._waiting.clear()
@@ -265,18 +263,15 @@ class FieldRate:
             return
         rates = rate_across(first, middle, span_a), rate_across(middle, last, span_b)
         apart, speed = (float(np.linalg.norm(v)) for v in (rates[0] - rates[1], rates[1]))
-        if apart <= 2.0 * noise / (strength * min(span_a, span_b)) + 0.3 * speed:
-            self._begin(rates, span_a + span_b, last)
-
-    def _begin(self, rates: tuple[FloatArray, FloatArray], span: float, field: FloatArray) -> None:
-        """Begin from the rates across the field in the halves of a span, s, at whose end it is `field`."""
-        settings = self._settings
+        if apart > 2.0 * noise / (strength * min(span_a, span_b)) + 0.3 * speed:
+            return
+        span = span_a + span_b
         rate = 0.5 * (rates[0] + rates[1])
-        square = float(field @ field)
-        self._rate, self._field, self._change = _floats(rate), _floats(field), _NONE
-        along = np.outer(field, field) / square
+        square = float(last @ last)
+        self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
+        along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
-        # The rate changes meanwhile: in body axes it turns about the field.
+        # The rate across the field changes meanwhile: in body axes it rotates about the field.
         across += (float(rate @ rate) * span) ** 2
         self._covariance[RATE, RATE] = (
             across * np.eye(3) + (settings.rate_start**2 + float(rate @ rate)) * along
@@ -284,18 +279,18 @@ class FieldRate:
         self._covariance[FIELD, FIELD] = settings.field_sigma**2 * np.eye(3)
         self._covariance[CHANGE, CHANGE] = settings.change_start**2 * np.eye(3)
         self._covariance[AXES, AXES] = settings.axes_sigma**2 * np.eye(3)
-        self._look_at_axes()
+        self._update_unexplained()
 
-    def _turn_axes(self, inertia: FloatArray, turn: Sequence[float]) -> None:
-        """Turn the principal axes of `inertia` by a rotation vector (3,) rad."""
-        x, y, z = turn
+    def _rotate_axes(self, inertia: FloatArray, vector: Sequence[float]) -> None:
+        """Rotate the principal axes of `inertia` by a rotation vector (3,) rad."""
+        x, y, z = vector
         rotation = np.array(matrix(exponential(x, y, z))).T
         self._inertia = rotation @ inertia @ rotation.T
         self._inverse = np.linalg.inv(self._inertia)
         self._inertia_rows, self._inverse_rows = _rows(self._inertia), _rows(self._inverse)
 
     def _step(self, dipole: Vector, dt: float) -> None:
-        """One step of the midpoint rule, and of the covariance."""
+        """Propagate state and covariance by one step of the midpoint rule."""
         assert self._rate is not None
         rate, field, change = self._rate, self._field, self._change
         acceleration = self._acceleration(rate, field, dipole)
@@ -303,17 +298,17 @@ class FieldRate:
         half = _moved(field, _difference(change, cross(rate, field)), 0.5 * dt)
         acceleration = self._acceleration(middle, half, dipole)
         flow = self._flow(middle, half, change, dipole, dt)
-        turned = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
-        rotation = matrix(turned)
+        rotated = exponential(dt * middle[0], dt * middle[1], dt * middle[2])
+        rotation = matrix(rotated)
         self._rate = _moved(rate, acceleration, dt)
-        # The turn of the field is exact: over an hour the midpoint rule would let its length grow.
+        # The rotation of the field is exact: by the midpoint rule its length would grow over an hour.
         self._field = _moved(times(rotation, field), times(rotation, change), dt)
         self._change = times(rotation, change)
-        self._turn = compose(turned, self._turn)
+        self._rotation = compose(rotated, self._rotation)
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The gyroscopic error turns with the body: it lasts for the time of a radian.
+        # The gyroscopic error rotates with the body: it keeps its sign for the time of a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         gyroscopic = self._unexplained * self._differences
@@ -326,19 +321,21 @@ class FieldRate:
         return times(self._inverse_rows, _difference(cross(dipole, field), cross(rate, momentum)))
 
     def _flow(self, rate: Vector, field: Vector, change: Vector, dipole: Vector, dt: float) -> FloatArray:
-        """Return the derivative (12, 12) of the states' change over dt by the states."""
-        turning = np.array(skew(rate))
+        """Return the derivative (12, 12) of the change of the states over dt by the states."""
+        cross_rate = np.array(skew(rate))
         momentum = times(self._inertia_rows, rate)
         torque = _difference(cross(dipole, field), cross(rate, momentum))
         flow = np.zeros((SIZE, SIZE))
         gyroscopic = np.array(skew(momentum))
-        flow[RATE, RATE] = self._inverse @ (gyroscopic - turning @ self._inertia)
-        # A small turn d changes J w by d x J w - J (d x w), and the inverse likewise.
-        by_turn = self._inverse @ (np.array(skew(torque)) - turning @ (self._inertia @ turning - gyroscopic))
-        flow[RATE, AXES] = by_turn - skew(times(self._inverse_rows, torque))
+        flow[RATE, RATE] = self._inverse @ (gyroscopic - cross_rate @ self._inertia)
+        # A small rotation d changes J w by d x J w - J (d x w), and J^-1 T in the same way.
+        by_rotation = self._inverse @ (
+            np.array(skew(torque)) - cross_rate @ (self._inertia @ cross_rate - gyroscopic)
+        )
+        flow[RATE, AXES] = by_rotation - skew(times(self._inverse_rows, torque))
         flow[RATE, FIELD] = self._inverse @ np.array(skew(dipole))
         flow[FIELD, RATE] = skew(field)
-        flow[FIELD, FIELD] = flow[CHANGE, CHANGE] = -turning
+        flow[FIELD, FIELD] = flow[CHANGE, CHANGE] = -cross_rate
         flow[FIELD, CHANGE] = np.eye(3)
         flow[CHANGE, RATE] = skew(change)
         return np.asarray(dt * flow)

@@ -1,21 +1,20 @@
 """The navigation filter of a free satellite: attitude, rate, biases, residual dipole and torques.
 
-A multiplicative extended Kalman filter that integrates Euler's equation over the coils' dipole, the gravity
-gradient and the estimated disturbances, a second or two at a step; gyros are measurements. That is leaner
-than the filter of the testbed (`attitude_filter`), which replays each late sample at its own time: here a
-late attitude is turned on to now by the present rate, and its innovation knows that rate's error: right for
-the seconds in which a body slow enough for star images turns evenly. One step with its gyro sample takes 0.3
+A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
+gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. Unlike
+`attitude_filter`, which replays each late sample at its own time, a late attitude is propagated to the
+present with the present rate, and its innovation includes the error of that rate. This is accurate for the
+seconds in which a body slow enough for star images rotates evenly. One step with its gyro sample takes 0.3
 ms.
 
-The residual dipole has a constant part and a part that comes and goes with sunlight. The other torques have
-the shapes of `knightcube.astro.earth.disturbance`; their sizes are states, and so is a small turn of the
-principal axes from those believed: while a body tumbles its gyroscopic torque would else pass for a bias of
-the gyros.
+The residual dipole has a constant part and a part in sunlight. The other torques are those of
+`knightcube.astro.earth.disturbance`; their sizes are states. So is a small rotation of the principal axes
+from the assumed ones: at a fast spin of a long body its gyroscopic torque is the largest unknown torque, and
+would otherwise be attributed to the gyro bias.
 
-The field is off its model by a vector that keeps its sign for minutes: a Gauss-Markov process of first order
-in body axes. How large it is, is learned as in expectation maximisation (Dempster, Laird & Rubin 1977):
-its variance follows the square of the estimate and the estimate's own variance, which tell nothing where
-the attitude is not known.
+The error of the field model is a vector that keeps its sign for minutes: a Gauss-Markov process of first
+order in body axes. Its size is learned as in expectation maximisation (Dempster, Laird & Rubin 1977) from
+the square of the estimate and the variance of the estimate, while the attitude is known accurately.
 """
 
 from __future__ import annotations
@@ -26,8 +25,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.directions import cross_matrix, tangent_basis
+from knightcube.astro.earth.disturbance import SIZES, Pressures, box_areas, shapes
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
@@ -36,39 +37,180 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.free_motion import (
-    AXES,
-    DIPOLE,
-    FIELD,
-    GYRO,
-    MAGNET,
-    RATE,
-    SLOW,
-    STATES,
-    SUNLIT,
-    TORQUES,
-    TURN,
-    Around,
-    FreeMotion,
-    crossed,
-)
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings, acceleration_noise
 
-LARGEST_TURN = 0.1
-"""rad, of a step of integration."""
+ATTITUDE, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
+TORQUES = slice(18, 18 + SIZES)
+AXES = slice(18 + SIZES, 21 + SIZES)
+SLOW = slice(GYRO.start, AXES.stop)
+FIELD = slice(21 + SIZES, 24 + SIZES)
+STATES = 24 + SIZES
+"""Indices of the parts of the error state; SLOW are the states that are learned."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterEnvironment:
+    """The environment of the satellite at one time, ICRS.
+
+    `field` (3,) T, `position` (3,) m, `pressures` of air and light, and the visible share `sunlit` of the
+    Sun.
+    """
+
+    field: FloatArray
+    position: FloatArray
+    pressures: Pressures
+    sunlit: float
+
+
+class FreeMotion:
+    """Euler's equation of a satellite in orbit, whose principal axes may be rotated."""
+
+    def __init__(self, inertia: FloatArray) -> None:
+        """`inertia` (3, 3) kg m^2, body axes."""
+        self._assumed: FloatArray = np.asarray(inertia, dtype=float)
+        moments = np.linalg.eigvalsh(self._assumed)
+        self.largest_difference = float(moments[-1] - moments[0])
+        """Largest difference of the principal moments, kg m^2."""
+        self._areas = box_areas(self._assumed)
+        self._rotation: FloatArray = np.zeros(3)
+        self._set_inertia(self._assumed)
+
+    def rotate_axes(self, rotation: FloatArray) -> None:
+        """Rotate the principal axes from the assumed ones by a rotation vector (3,) rad, body axes."""
+        if np.array_equal(rotation, self._rotation):
+            return
+        self._rotation = rotation.copy()
+        back = attitude_matrix(from_rotation_vector(rotation))
+        self._set_inertia(np.asarray(back.T @ self._assumed @ back, dtype=float))
+
+    def _set_inertia(self, inertia: FloatArray) -> None:
+        self.inertia: FloatArray = inertia
+        self.inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
+        self.by_torque: FloatArray = self.inverse @ self.inverse
+        """Covariance (3, 3) of the acceleration per variance of the torque."""
+
+    def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
+        """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
+        return np.asarray(self.inverse @ (torque - cross_matrix(rate) @ (self.inertia @ rate)))
+
+    def stiffness(self, rate: FloatArray) -> FloatArray:
+        """Return the derivative (3, 3) of the acceleration by the rate (3,) rad/s."""
+        return np.asarray(
+            self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
+        )
+
+    def torque(
+        self, quaternion: FloatArray, dipole: FloatArray, sizes: FloatArray, around: FilterEnvironment
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the torque (3,) N m, and the dynamics (6, 33) of the error without those of rate and axes.
+
+        `dipole` (3,) A m^2 is that of the coils plus the residual one; `sizes` (9,) N m are those of the
+        other torques.
+        """
+        to_body = attitude_matrix(quaternion)
+        field, position = to_body @ around.field, to_body @ around.position
+        radius = math.sqrt(float(position @ position))
+        up = position / radius
+        stiff = self.inertia @ up
+        strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
+        shape = shapes(around.pressures.facing(self._areas, to_body[None]), to_body[None])[0]
+        across, upright = cross_matrix(field), cross_matrix(up)
+        torque = -across @ dipole + strength * upright @ stiff + shape @ sizes
+        flow = np.zeros((6, STATES))
+        stiffness = strength * (upright @ self.inertia - cross_matrix(stiff)) @ upright
+        flow[3:6, ATTITUDE] = self.inverse @ (cross_matrix(dipole) @ across + stiffness)
+        flow[3:6, DIPOLE] = -self.inverse @ across
+        flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
+        flow[3:6, TORQUES] = self.inverse @ shape
+        flow[3:6, AXES] = strength * self.inverse @ upright @ self._by_rotation(up)
+        return torque, flow
+
+    def by_axes(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
+        """Return the derivative (3, 3) of the acceleration by a rotation of the axes, without gravity."""
+        return np.asarray(
+            -self.inverse @ (cross_matrix(rate) @ self._by_rotation(rate) + self._by_rotation(acceleration))
+        )
+
+    def _by_rotation(self, vector: FloatArray) -> FloatArray:
+        """Return the derivative (3, 3) of J v by a small rotation d of J: d x J v - J (d x v)."""
+        return np.asarray(self.inertia @ cross_matrix(vector) - cross_matrix(self.inertia @ vector))
+
+
+LASTING = 20.0
+"""Time (s) for which an error of the coils or of the inertia keeps its sign; it scales the white noise that
+models the error."""
+CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
+"""Expected sizes of the torques, relative to that of air. The constant torque is small, because the rotation
+of the principal axes has states of its own. At one attitude the torques cannot be distinguished, and a torque
+of air that is attributed to the constant one is wrong in every other attitude."""
+PLAUSIBLE = 4.0
+"""Largest plausible deviation of a slow state, in standard deviations at the start."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeFilterSettings:
+    """Noise and limits; a pair is the standard deviation at the start and the random walk per sqrt(s).
+
+    Attributes:
+        gyro: rad/s, gyro bias.
+        dipole, sunlit: A m^2, residual dipole: constant part, and part in sunlight.
+        magnet: T, magnetometer bias.
+        field: T per axis, error of the field model before it is learned.
+        field_memory: s, correlation time of that error.
+        torque: N m, size of the torque by air; the others follow by their relative sizes.
+        torque_noise: N m sqrt(s), white noise of all other torques.
+        coil_error: relative error of the coils' dipole for tens of seconds, in any direction.
+        coil_noise: A m^2 sqrt(s), white noise of each coil while the coils are driven.
+        axes: rad, rotation of the principal axes.
+        inertia_error: share of the gyroscopic torque that no rotation of the axes explains.
+        rate_start: rad/s, error of the first rate.
+        fine, coarse: rad, largest sigma of the worst axis of a fine and of a coarse attitude.
+        gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
+    """
+
+    gyro: tuple[float, float] = (1e-3, 2e-6)
+    dipole: tuple[float, float] = (1e-3, 1.5e-6)
+    sunlit: tuple[float, float] = (3e-4, 2e-7)
+    magnet: tuple[float, float] = (3e-7, 3e-10)
+    field: float = 5e-8
+    field_memory: float = 600.0
+    torque: tuple[float, float] = (3e-9, 5e-12)
+    torque_noise: float = 1e-9
+    coil_error: float = 0.04
+    coil_noise: float = 0.0
+    axes: tuple[float, float] = (0.03, 0.0)
+    inertia_error: float = 0.003
+    rate_start: float = 1e-3
+    fine: float = math.radians(0.1)
+    coarse: float = math.radians(5.0)
+    gate_sigma: float = 5.0
+
+    def of_slow(self, which: int) -> FloatArray:
+        """Return the start deviations (`which` 0) or the random walks (1) of the slow states, (24,)."""
+        start, walk = self.torque
+        torques = [(share * start, walk) for share in (CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE)]
+        pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *torques, self.axes]
+        return np.repeat([pair[which] for pair in pairs], 3)
+
+    def plausible(self, values: FloatArray, at: IntArray | slice = slice(None)) -> BoolArray:
+        """Return which `values` (k,) of the slow states with the indices `at` are plausible."""
+        return np.asarray(np.abs(values) <= PLAUSIBLE * self.of_slow(0)[at])
+
+
+LARGEST_ROTATION = 0.1
+"""Largest rotation (rad) in a step of integration."""
 FIELD_LEARNED = 2_000.0
-"""s over which the size of the field's error is averaged."""
-LEAST_FIELD = 1e-8
-"""T, of an axis of that error at least: a magnetometer's own errors change as much."""
+"""Time (s) over which the size of the field model's error is averaged."""
+MINIMUM_FIELD_ERROR = 1e-8
+"""Smallest error (T per axis) of the field model: the magnetometer's own errors change as much."""
 CURRENTS = 1e-7
-"""T of an axis: of currents in the aurora, which change from field to field; it is not refused over them."""
+"""Error (T per axis) of a field by currents in the aurora, which must not cause its rejection."""
 _EYE: FloatArray = np.eye(3)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowStates:
-    """The states after the rate: `values` (24,) and their covariance (24, 24)."""
+    """The slow states: `values` (24,) and their covariance (24, 24)."""
 
     values: FloatArray
     covariance: FloatArray
@@ -76,7 +218,7 @@ class SlowStates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
-    """An estimate of the filter: its attributes of these names."""
+    """A copy of the estimate: the attributes of the filter with the same names."""
 
     quaternion: FloatArray
     rate: FloatArray
@@ -87,24 +229,24 @@ class FreeMemory:
 
 
 class FreeFilter:
-    """Owns the estimate. `refused` counts the measurements that did not pass their gate.
-
-    More than 200 lines: a method for each kind of measurement, and a property for each thing estimated.
+    """Owns the estimate. `refused` counts the measurements that did not pass the gate.
 
     Attributes:
         quaternion: (4,) ICRS into body.
         rate: (3,) rad/s, body axes.
         acceleration: (3,) rad/s^2, body axes, of the last step.
-        covariance: (33, 33) of the errors (TURN, RATE, ...).
-        field_error: T of an axis, of the field's model.
-        knowledge: how well the attitude is known.
-        changes: counts the changes of the estimate.
+        covariance: (33, 33) of the error state (ATTITUDE, RATE, ...).
+        field_error: T per axis, standard deviation of the field model's error.
+        changes: number of changes of the estimate.
     """
 
     def __init__(
         self, inertia: FloatArray, settings: FreeFilterSettings, slow: SlowStates | None = None
     ) -> None:
-        """`inertia` (3, 3) kg m^2, body axes; `slow` is what is known of the slow states before the start."""
+        """Use `inertia` (3, 3) kg m^2, body axes.
+
+        `slow` is the prior of the slow states, by default the settings.
+        """
         self.motion = FreeMotion(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
@@ -112,7 +254,7 @@ class FreeFilter:
         self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
-        self._slope: FloatArray = np.zeros((3, STATES))  # of the acceleration, by the states
+        self._slope: FloatArray = np.zeros((3, STATES))  # derivative of the acceleration by the states
         self.started = False
         self.refused = 0
         self.changes = 0
@@ -121,27 +263,27 @@ class FreeFilter:
         self.covariance: FloatArray = np.zeros((STATES, STATES))
         self.covariance[SLOW, SLOW] = np.diag(settings.of_slow(0) ** 2)
         self.field_error = settings.field
-        self._doubt_field()
+        self._reset_field()
         if slow is not None:
             self._constants[SLOW], self.covariance[SLOW, SLOW] = slow.values, slow.covariance
 
     def start(
         self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
     ) -> None:
-        """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro's rate (3,) rad/s.
+        """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
-        What was learned of the slow states is kept; `doubted`: the estimate was contradicted, so how well
-        they are claimed to be known is not, nor what is farther off than is believed of a start.
+        The slow states are kept. If the estimate was contradicted (`doubted`), their covariance is that of
+        the settings again, and implausible values are zeroed.
         """
         self.changes += 1
         if doubted:
             slow, known = self._constants[SLOW], self._settings.of_slow(0)
-            slow[~self._settings.believes(slow)] = 0.0
+            slow[~self._settings.plausible(slow)] = 0.0
             self.covariance[SLOW, SLOW] = np.diag(known**2)
             self.field_error = max(self.field_error, self._settings.field)
-            self._doubt_field()
+            self._reset_field()
         self.covariance[:6] = self.covariance[:, :6] = 0.0
-        self.covariance[TURN, TURN] = covariance
+        self.covariance[ATTITUDE, ATTITUDE] = covariance
         bias = self.covariance[GYRO, GYRO]
         self.covariance[RATE, RATE] = bias + self._settings.rate_start**2 * _EYE
         # The gyro measures the sum of rate and bias, so their errors are opposite.
@@ -151,24 +293,24 @@ class FreeFilter:
 
     @property
     def knowledge(self) -> Knowledge:
-        """How well the attitude is known."""
+        """Accuracy with which the attitude is known."""
         if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
 
     @property
     def worst_sigma(self) -> float:
-        """The attitude's standard deviation about its worst axis, rad."""
+        """Standard deviation of the attitude about its worst axis, rad."""
         covariance = self.covariance
         return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
 
     @property
     def slow(self) -> SlowStates:
-        """What is known of the states that change slowly or not at all."""
+        """The slow states and their covariance."""
         return SlowStates(self._constants[SLOW].copy(), self.covariance[SLOW, SLOW].copy())
 
     def memory(self) -> FreeMemory:
-        """Return the estimate as it stands, for `recall`."""
+        """Return a copy of the estimate, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
         return FreeMemory(
             self.quaternion, self.rate, self.acceleration, constants, covariance, self.field_error
@@ -183,45 +325,47 @@ class FreeFilter:
 
     @property
     def gyro_bias(self) -> FloatArray:
-        """The gyros' bias (3,) rad/s."""
+        """Gyro bias (3,) rad/s."""
         return self._constants[GYRO].copy()
 
     @property
     def magnet_bias(self) -> FloatArray:
-        """The magnetometer's bias (3,) T, body axes."""
+        """Magnetometer bias (3,) T, body axes."""
         return self._constants[MAGNET].copy()
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """The sizes (9,) N m of the torques."""
+        """Sizes (9,) N m of the disturbance torques."""
         return self._constants[TORQUES].copy()
 
     @property
-    def axes_turn(self) -> FloatArray:
-        """The turn (3,) rad of the principal axes from those believed, body axes."""
+    def axes_rotation(self) -> FloatArray:
+        """Rotation (3,) rad of the principal axes from the assumed ones, body axes."""
         return self._constants[AXES].copy()
 
     def residual_dipole(self, sunlit: float) -> FloatArray:
-        """Return the residual dipole (3,) A m^2 in a share of sunlight, body axes."""
+        """Return the residual dipole (3,) A m^2, body axes, for the visible share `sunlit` of the Sun."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
-    def advance(self, seconds: float, dipole: FloatArray, around: Around, doubt: float = 0.0) -> None:
-        """Propagate by `seconds` under the coils' dipole (3,) A m^2, body axes; a second or two at once.
+    def advance(
+        self, seconds: float, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0
+    ) -> None:
+        """Propagate by `seconds`, a second or two, under the coils' dipole (3,) A m^2, body axes.
 
-        `doubt` A m^2 is the standard deviation of an axis of a dipole that may not have flown.
+        `doubt` A m^2 is the standard deviation per axis of the dipole, if it may differ from the command.
         """
         speed = math.sqrt(float(self.rate @ self.rate))
-        steps = max(1, math.ceil(speed * seconds / LARGEST_TURN))
+        steps = max(1, math.ceil(speed * seconds / LARGEST_ROTATION))
         for _ in range(steps):
             self._step(seconds / steps, dipole, around, doubt)
 
     def gyro(
         self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
     ) -> bool:
-        """Accept a gyro's rate (3,) rad/s and its covariance (3, 3).
+        """Apply a gyro rate (3,) rad/s with its covariance (3, 3); return whether it passed the gate.
 
-        Of a mean over the past, `change` (3,) is by how much the rate has changed since its middle, `since` s
-        ago, by the last step's acceleration.
+        For a mean over the past, `change` (3,) rad/s is the change of the rate since the middle of the mean,
+        `since` s ago, by the acceleration of the last step.
         """
         rows = -since * self._slope
         rows[:, RATE] += _EYE
@@ -230,74 +374,74 @@ class FreeFilter:
         return self._update(value if change is None else value + change, rows, covariance)
 
     def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
-        """Accept a rate (3,) rad/s without the gyros' bias, such as of streaks, and its covariance (3, 3).
+        """Apply a rate (3,) rad/s free of gyro bias, as from streaks, with its covariance (3, 3).
 
-        `change` (3,) is by how much the rate has changed since.
+        `change` (3,) rad/s is the change of the rate since then.
         """
         rows = np.zeros((3, STATES))
         rows[:, RATE] = _EYE
         return self._update(rate + change - self.rate, rows, covariance)
 
     def attitude(self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0) -> bool:
-        """Accept an attitude (4,) measured `age` s ago, covariance (3, 3) rad^2, body axes of now."""
+        """Apply an attitude (4,) measured `age` s ago; covariance (3, 3) rad^2 in the present body axes."""
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The turn since then has the error of the rate.
-        rows[:, TURN], rows[:, RATE] = _EYE, -age * _EYE
+        # The rotation since then has the error of the rate.
+        rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
         error = multiply(multiply(since, quaternion), conjugate(self.quaternion))
         return self._update(to_rotation_vector(error), rows, covariance)
 
     def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Accept a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
+        """Apply a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
-        rows[:, TURN] = across @ crossed(expected)
+        rows[:, ATTITUDE] = across @ cross_matrix(expected)
         return self._update(across @ observed, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
-        """Accept the field (3,) T of now in body axes, the model's (3,) T, ICRS; covariance (3, 3) T^2."""
+        """Apply the field (3,) T, body axes, with its model (3,) T, ICRS, and covariance (3, 3) T^2."""
         expected = attitude_matrix(self.quaternion) @ reference
         rows = np.zeros((3, STATES))
-        rows[:, TURN], rows[:, MAGNET], rows[:, FIELD] = crossed(expected), _EYE, _EYE
-        wrong = self._constants[MAGNET] + self._constants[FIELD]
-        return self._update(measured - expected - wrong, rows, covariance + CURRENTS**2 * _EYE)
+        rows[:, ATTITUDE], rows[:, MAGNET], rows[:, FIELD] = cross_matrix(expected), _EYE, _EYE
+        bias = self._constants[MAGNET] + self._constants[FIELD]
+        return self._update(measured - expected - bias, rows, covariance + CURRENTS**2 * _EYE)
 
-    def _doubt_field(self) -> None:
-        """Know nothing of the field's error but its size."""
+    def _reset_field(self) -> None:
+        """Forget the error of the field model except for its size."""
         self._constants[FIELD] = 0.0
         self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
         self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
 
-    def _age_field(self, dt: float) -> None:
-        """Let the field's error fade, and learn its size where the attitude is fine."""
+    def _propagate_field_error(self, dt: float) -> None:
+        """Let the error of the field model decay, and learn its size while the attitude is fine."""
         covariance, error = self.covariance, self._constants[FIELD]
         if self.worst_sigma <= self._settings.fine:
             square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
             variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
-            self.field_error = max(math.sqrt(variance), LEAST_FIELD)
+            self.field_error = max(math.sqrt(variance), MINIMUM_FIELD_ERROR)
         kept = math.exp(-dt / self._settings.field_memory)
         error *= kept
         covariance[FIELD] *= kept
         covariance[:, FIELD] *= kept
         covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
 
-    def _step(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
+    def _step(self, dt: float, dipole: FloatArray, around: FilterEnvironment, doubt: float) -> None:
         """Take one step of the midpoint rule, with its covariance."""
         self.changes += 1
         motion = self.motion
-        motion.turn_axes(self._constants[AXES])
+        motion.rotate_axes(self._constants[AXES])
         middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
         whole = dipole + self.residual_dipole(around.sunlit)
         torque, flow = motion.torque(middle, whole, self._constants[TORQUES], around)
         half = self.rate + 0.5 * dt * motion.acceleration(self.rate, torque)
         acceleration = motion.acceleration(half, torque)
-        flow[0:3, TURN], flow[0:3, RATE] = -crossed(half), _EYE
+        flow[0:3, ATTITUDE], flow[0:3, RATE] = -cross_matrix(half), _EYE
         flow[3:6, RATE] = motion.stiffness(half)
         flow[3:6, AXES] += motion.by_axes(half, acceleration)
         self._slope = flow[3:6].copy()
-        turn = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
-        self.quaternion = multiply(turn, self.quaternion)
+        rotation = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
+        self.quaternion = multiply(rotation, self.quaternion)
         self.acceleration = acceleration
         self.rate = self.rate + dt * acceleration
         flow *= dt
@@ -306,23 +450,30 @@ class FreeFilter:
         covariance = self.covariance
         covariance[:6] = flow @ covariance
         covariance[:, :6] = covariance @ flow.T
-        self._add_noise(dt, dipole, around, doubt)
-
-    def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
-        field = attitude_matrix(self.quaternion) @ around.field
-        return acceleration_noise(self._settings, self.motion, self.rate, field, dipole, doubt)
-
-    def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         density = dt * self.rate_noise(dipole, around, doubt)
-        covariance = self.covariance
         covariance[RATE, RATE] += density
-        covariance[TURN, TURN] += dt * dt / 3.0 * density
-        covariance[TURN, RATE] += 0.5 * dt * density
-        covariance[RATE, TURN] += 0.5 * dt * density
-        diagonal = covariance.reshape(-1)[:: STATES + 1]
-        diagonal[SLOW] += dt * self._walks
-        self._age_field(dt)
+        covariance[ATTITUDE, ATTITUDE] += dt * dt / 3.0 * density
+        covariance[ATTITUDE, RATE] += 0.5 * dt * density
+        covariance[RATE, ATTITUDE] += 0.5 * dt * density
+        covariance.reshape(-1)[:: STATES + 1][SLOW] += dt * self._walks
+        self._propagate_field_error(dt)
+
+    def rate_noise(self, dipole: FloatArray, around: FilterEnvironment, doubt: float = 0.0) -> FloatArray:
+        """Return the noise density (3, 3) rad^2/s^3 of the acceleration for the coils' dipole (3,) A m^2."""
+        settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
+        coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
+        coils += settings.coil_noise**2 if square else 0.0
+        # The gyroscopic error rotates with the body: it keeps its sign for the time of a radian to either
+        # side.
+        speed = math.sqrt(float(self.rate @ self.rate))
+        gyroscopic = speed**2 * settings.inertia_error * motion.largest_difference
+        lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed
+        density = (settings.torque_noise**2 + lasting * gyroscopic**2) * motion.by_torque
+        if coils:
+            field = attitude_matrix(self.quaternion) @ around.field
+            across = motion.inverse @ cross_matrix(field)
+            density = density + coils * (across @ across.T)
+        return np.asarray(density)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
         """Correct by an innovation (k,), derivative (k, 33) and noise (k, k); return whether it was used."""
@@ -336,7 +487,7 @@ class FreeFilter:
         error = gain @ value
         covariance = self.covariance - gain @ cross.T
         self.covariance = 0.5 * (covariance + covariance.T)
-        self.quaternion = multiply(from_rotation_vector(error[TURN]), self.quaternion)
+        self.quaternion = multiply(from_rotation_vector(error[ATTITUDE]), self.quaternion)
         self.rate = self.rate + error[RATE]
         self._constants[6:] += error[6:]
         return True

@@ -1,7 +1,7 @@
-"""The filter's measurements: attitudes, gyro rates, mean rates, directions, fields; each with its time.
+"""Measurements of the attitude filter: attitudes, gyro rates, mean rates, directions and fields.
 
-`latency` is for a unit whose samples are older than their stamps by an age that the filter estimates: the s
-that were subtracted from the stamp to give `time_ns`. None: the time is known.
+`latency` belongs to a unit whose samples are older than their time stamps by an age that the filter
+estimates. It is the time (s) that was subtracted from the stamp to give `time_ns`. None marks a known time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from knightcube.astro.arrays import FloatArray
 
 
 class _AtOneTime:
-    """A measurement of the state at `time_ns` alone."""
+    """A measurement of the state at the single time `time_ns`."""
 
     __slots__ = ()
     time_ns: int
@@ -25,7 +25,7 @@ class _AtOneTime:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeMeasurement(_AtOneTime):
-    """An attitude: quaternion (4,) reference into body, covariance (3, 3) rad^2 of small turns, body axes."""
+    """An attitude: quaternion (4,) reference into body, covariance (3, 3) rad^2 of small rotations, body."""
 
     time_ns: int
     quaternion: FloatArray
@@ -47,7 +47,7 @@ class RateMeasurement(_AtOneTime):
 class MeanRateMeasurement:
     """The mean body rate (3,) rad/s of an exposure, free of the gyro's bias, and its covariance (3, 3).
 
-    The constant rate that turns the attitude at `since_ns` into that at `time_ns`.
+    It is the constant rate that takes the attitude at `since_ns` to that at `time_ns`.
     """
 
     since_ns: int
@@ -65,8 +65,8 @@ class MeanRateMeasurement:
 class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as of the Sun or nadir.
 
-    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors; `covariance` (3, 3)
-    rad^2 is of `observed` in body axes; its part along the direction has no effect.
+    `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors. `covariance` (3, 3)
+    rad^2 is that of `observed` in body axes; its part along the direction has no effect.
     """
 
     time_ns: int
@@ -79,7 +79,7 @@ class DirectionMeasurement(_AtOneTime):
 class FieldMeasurement(_AtOneTime):
     """A magnetometer's `field` (3,) T in body axes, bias included, and the model's `reference` (3,) T.
 
-    `covariance` (3, 3) T^2, body axes, is of white noise; the filter estimates the constant part.
+    `covariance` (3, 3) T^2, body axes, is that of the white noise; the filter estimates the constant part.
     """
 
     time_ns: int

@@ -1,42 +1,99 @@
-"""Applies measurements in order of time from a checkpoint on, at once or a few at a time.
+"""Replay of measurements in order of time, the recent coil commands, and the filter's recent checkpoints.
 
-After a late measurement all later ones are applied again. A second of them costs more than the time of a
-control cycle, so the work can be spread over cycles while the filter continues unchanged.
+After a late measurement all later ones are applied again. A second of measurements takes more time than a
+control cycle has, so that the work can be spread over cycles while the filter continues unchanged.
 """
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.commands import CommandHistory
-from knightcube.gnc.estimation.estimate import LATENCY, Estimate
-from knightcube.gnc.estimation.innovation import innovation
-from knightcube.gnc.estimation.latency import Motion, considered, motion
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.gnc.estimation.estimate import LATENCY, RATE, SIZE, Estimate, FilterState
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
 from knightcube.gnc.estimation.mekf import (
+    RateChange,
     correct,
+    innovation,
     keep_attitude,
     normalised_square,
-    of_the_rate_alone,
+    rate_change,
     release_attitude,
 )
-from knightcube.gnc.estimation.propagation import ProcessNoise, propagate
-from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.estimation.state import SIZE, State
+from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
 
-_SURPRISING = {size: chi_square.bound(0.025, size) for size in (1, 3)}
-"""Normalised squares of a gyro's sample, by its size, beyond which it corrects the rate alone.
 
-A sample corrects angle, disturbance and coil gain too, by what the model says of the coils. In the tenths of
-a second before a broken coil is noticed that is wrong: the angle went off by up to 40 of its sigmas while the
-rate was right. A sound filter has one such sample in forty.
+class CommandHistory:
+    """The recent commands in order of time; before the first command no coil is driven.
+
+    Attributes:
+        idle: the torquing without driven coils.
+    """
+
+    def __init__(self, body: RigidBody, history_ns: int) -> None:
+        self._body = body
+        self.idle = body.torquing(np.zeros(3))
+        self._history_ns = history_ns
+        self._times: list[int] = []
+        self._torquings: list[Torquing] = []
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def record(
+        self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
+    ) -> None:
+        """Record the coil currents (3,) A in force from `time_ns` on, in the field (3,) T, reference axes."""
+        torquing = self._body.torquing(currents, field, known)
+        if self._torquings and self._torquings[-1] == torquing:
+            return
+        self._times.append(time_ns)
+        self._torquings.append(torquing)
+        oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
+        if oldest > 64:  # in batches instead of each cycle
+            del self._times[:oldest], self._torquings[:oldest]
+
+    def mark_unknown(self, since_ns: int) -> None:
+        """Treat the currents in force from `since_ns` on as unknown."""
+        first = bisect.bisect_left(self._times, since_ns)
+        if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
+            self._torquings.insert(first, self.at(since_ns))
+            self._times.insert(first, since_ns)
+        self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
+
+    def at(self, time_ns: int) -> Torquing:
+        """Return the torquing in force at a time."""
+        index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
+        return self._torquings[index] if self._torquings else self.idle
+
+    def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
+        """Yield each torquing in force between two times and its duration in ns, in order of time."""
+        time_ns = from_ns
+        index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
+        while time_ns < to_ns:
+            torquing = self._torquings[index] if self._torquings else self.idle
+            more = index + 1 < len(self._torquings)
+            until_ns = min(to_ns, self._times[index + 1]) if more else to_ns
+            if until_ns > time_ns:
+                yield torquing, until_ns - time_ns
+                time_ns = until_ns
+            index += more
+
+
+_RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
+"""Normalised square of a gyro sample, by its size, above which it corrects the rate only.
+
+Through the model of the coils a sample corrects angle, disturbance and coil gain too. In the tenths of a
+second before a broken coil is detected this is wrong: the angle error reached 40 sigma while the rate was
+right. In a consistent filter one sample in forty exceeds the limit.
 """
 
 
@@ -45,13 +102,13 @@ class Checkpoint:
     """A measurement, whether it passed the gate, and the state just after it.
 
     Attributes:
-        innovation: its components, of the measurement's unit; empty at the start.
-        variance: their covariance; None at the start.
+        innovation: components in the unit of the measurement; empty at the start.
+        variance: covariance of the innovation; None at the start.
     """
 
     measurement: Measurement
     used: bool
-    state: State
+    state: FilterState
     covariance: FloatArray
     nis: float = math.nan
     innovation: tuple[float, ...] = ()
@@ -59,13 +116,13 @@ class Checkpoint:
 
     @property
     def time_ns(self) -> int:
-        """When the measurement was taken."""
+        """Time of the measurement."""
         return self.measurement.time_ns
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
-    """The model of propagation: body, noise and commands; `gate` by a measurement's degrees of freedom."""
+class PropagationModel:
+    """Model of propagation: body, noise and commands; `gate` by the degrees of freedom of a measurement."""
 
     body: RigidBody
     noise: ProcessNoise
@@ -74,9 +131,9 @@ class Model:
     gate: Mapping[int, float]
 
     def propagate(
-        self, state: State, covariance: FloatArray, from_ns: int, to_ns: int
-    ) -> tuple[State, FloatArray]:
-        """Propagate state and covariance over the commands in force between two times, forward only."""
+        self, state: FilterState, covariance: FloatArray, from_ns: int, to_ns: int
+    ) -> tuple[FilterState, FloatArray]:
+        """Return state and covariance propagated forward under the commands between two times."""
         for torquing, span_ns in self.commands.spans(from_ns, to_ns):
             state, covariance = propagate(
                 self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
@@ -84,7 +141,10 @@ class Model:
         return state, covariance
 
     def estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
-        """Return the estimate of `time_ns` propagated from a checkpoint; measured at `measured_ns` last."""
+        """Return the estimate at `time_ns` propagated from a checkpoint.
+
+        The last measurement is `measured_ns`.
+        """
         state, covariance = self.propagate(then.state, then.covariance, then.time_ns, time_ns)
         return Estimate(
             time_ns,
@@ -99,25 +159,27 @@ class Model:
             np.array(state.field_bias),
         )
 
-    def motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
-        """Return how the rate changes around the time of a sample whose age is estimated."""
+    def rate_change(self, state: FilterState, covariance: FloatArray, time_ns: int) -> RateChange:
+        """Return the change of the rate around the time of a sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
         first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
         before = self.body.accelerate(state.quaternion, state.rate, state.parameters, first)
         after = before
         if last is not first:
             after = self.body.accelerate(state.quaternion, state.rate, state.parameters, last)
-        return motion(before, after, state.disturbance, covariance)
+        return rate_change(before, after, state.disturbance, covariance)
 
 
 class Replay:
-    """Applies measurements in order of time; `checkpoints` are the results so far."""
+    """Applies measurements in order of time; `checkpoints` holds the results so far."""
 
-    def __init__(self, model: Model, start: Checkpoint, measurements: Sequence[Measurement]) -> None:
+    def __init__(
+        self, model: PropagationModel, start: Checkpoint, measurements: Sequence[Measurement]
+    ) -> None:
         self._model = model
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
-        # Exposures that have not begun yet, the first one last.
+        # Exposures that have not begun yet; the next one is the last element.
         self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
         self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
         self.checkpoints: list[Checkpoint] = []
@@ -128,12 +190,12 @@ class Replay:
         return not self._pending
 
     def add(self, measurement: Measurement) -> None:
-        """Append a measurement that is not older than the others and not a mean over an exposure."""
+        """Append a measurement, neither older than the others nor a mean over an exposure."""
         self._pending.append(measurement)
 
-    def advance(self, most: int | None = None) -> None:
-        """Apply the next `most` measurements, or all remaining."""
-        for _ in range(len(self._pending) if most is None else min(most, len(self._pending))):
+    def advance(self, maximum: int | None = None) -> None:
+        """Apply the next `maximum` measurements, or all remaining ones."""
+        for _ in range(len(self._pending) if maximum is None else min(maximum, len(self._pending))):
             self._ingest(self._pending.popleft())
 
     def _ingest(self, measurement: Measurement) -> None:
@@ -144,20 +206,21 @@ class Replay:
             self._state, self._covariance = keep_attitude(self._state, self._covariance, exposure)
         self._propagate_to(measurement.time_ns)
         state, covariance = self._state, self._covariance
-        aging = None
+        is_rate = isinstance(measurement, RateMeasurement)
+        change = None
         if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
-            aging = model.motion(state, covariance, measurement.time_ns)
-        found = innovation(state, measurement, model.body.suspended, aging)
+            change = model.rate_change(state, covariance, measurement.time_ns)
+        found = innovation(state, measurement, model.body.suspended, change)
         nis, gain, variance = normalised_square(found, covariance)
         used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
-        if aging is not None:
-            gain = considered(gain)
-        if (
-            isinstance(measurement, RateMeasurement)
-            and model.noise.unknown_current
-            and nis > _SURPRISING[len(found.value)]
-        ):
-            gain = of_the_rate_alone(gain)
+        # Joseph's form is right for any gain.
+        if is_rate and model.noise.unknown_current and nis > _RATE_ONLY[len(found.value)]:
+            rate_gain = np.zeros_like(gain)
+            rate_gain[RATE] = gain[RATE]
+            gain = rate_gain
+        elif change is not None:
+            gain = gain.copy()
+            gain[LATENCY] = 0.0  # considered, not estimated
         if used:
             state, covariance = correct(state, covariance, found, gain)
         if isinstance(measurement, MeanRateMeasurement):
@@ -173,3 +236,84 @@ class Replay:
             self._state, self._covariance, self._time_ns, time_ns
         )
         self._time_ns = time_ns
+
+
+_SPARE_NS = 1_000_000_000
+"""Duration kept beyond the history, so that checkpoints are dropped in batches."""
+_TIME = attrgetter("time_ns")
+
+
+class CheckpointHistory:
+    """Holds the checkpoints of the last `history_ns`; it is empty before the filter starts."""
+
+    def __init__(self, history_ns: int) -> None:
+        self._history_ns = history_ns
+        self._checkpoints: list[Checkpoint] = []
+
+    def __len__(self) -> int:
+        return len(self._checkpoints)
+
+    def __getitem__(self, index: int) -> Checkpoint:
+        return self._checkpoints[index]
+
+    @property
+    def newest(self) -> Checkpoint:
+        """The newest checkpoint. Raises IndexError if there is none."""
+        return self._checkpoints[-1]
+
+    @property
+    def newest_used(self) -> Checkpoint:
+        """The newest checkpoint whose measurement passed the gate, otherwise the newest one."""
+        return next((c for c in reversed(self._checkpoints) if c.used), self._checkpoints[-1])
+
+    def at(self, time_ns: int) -> Checkpoint | None:
+        """Return the last checkpoint up to a time; None before the first checkpoint."""
+        index = bisect.bisect_right(self._checkpoints, time_ns, key=_TIME)
+        return self._checkpoints[index - 1] if index else None
+
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return times (n,) ns and rates (n, 3) rad/s from the last checkpoint up to `begin_ns` on.
+
+        They end with the first checkpoint from `end_ns` on, or with the newest. None if no checkpoint is old
+        enough.
+        """
+        first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
+        last = bisect.bisect_left(self._checkpoints, end_ns, key=_TIME)
+        spanning = self._checkpoints[first - 1 : last + 1]
+        if not first:
+            return None
+        return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
+
+    def index_before(self, begin_ns: int) -> int:
+        """Return the number of checkpoints up to `begin_ns`, or up to the start of a mean that spans it."""
+        while True:
+            index = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
+            spanning = [c.measurement.begin_ns for c in self._checkpoints[index:]]
+            earliest = min(spanning, default=begin_ns)
+            if earliest >= begin_ns:
+                return index
+            begin_ns = earliest
+
+    def measurements_from(self, index: int) -> list[Measurement]:
+        """Return the measurements of the checkpoints from `index` on."""
+        return [checkpoint.measurement for checkpoint in self._checkpoints[index:]]
+
+    def replace_from(self, index: int, checkpoints: Sequence[Checkpoint]) -> None:
+        """Replace the checkpoints from `index` on."""
+        self._checkpoints[index:] = checkpoints
+
+    def index_of(self, checkpoint: Checkpoint) -> int:
+        """Return the index of a checkpoint of the history."""
+        return next(k for k in range(len(self) - 1, -1, -1) if self._checkpoints[k] is checkpoint)
+
+    def restart(self, first: Checkpoint | None) -> None:
+        """Drop all checkpoints and start with `first`."""
+        self._checkpoints = [] if first is None else [first]
+
+    def forget(self, now_ns: int) -> None:
+        """Drop checkpoints that are too old, in batches; keep the newest one."""
+        checkpoints = self._checkpoints
+        horizon_ns = now_ns - self._history_ns
+        if len(checkpoints) > 2 and checkpoints[0].time_ns < horizon_ns - _SPARE_NS:
+            keep = bisect.bisect_left(checkpoints, horizon_ns, key=_TIME)
+            del checkpoints[: min(keep, len(checkpoints) - 1)]

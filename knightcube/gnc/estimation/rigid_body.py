@@ -1,9 +1,16 @@
-"""The filter's model of the rigid body: Euler's equation under coils in a known field, and a thread.
+"""The motion of a rigid body as the filters model it: Euler's equation, propagation, uncertainty.
 
-J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the coils' dipole moment. On the testbed's
-thread the body turns about its y axis alone: the constraint balances all other torques, so the response to a
-torque T is T_y / J22 about y only, and the thread adds -k theta - c w (5.4). The parameters that the filter
-may estimate are arguments.
+J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the dipole moment of the coils. On the
+testbed's thread the body rotates about its y axis only: the constraint balances all other torques, so that
+the response to a torque T is T_y / J22 about y, and the thread adds -k theta - c w (5.4).
+
+`propagate` integrates state and covariance. The attitude error is a small rotation about the body axes; all
+accelerations that the model does not contain are random walks.
+
+Without torque the acceleration is a quadratic form of the rate, w' = Q p(w), with the six products p of the
+rate's components. Errors of the inertia tensor, and of the gyro's scale and alignment, only change the
+coefficients Q. A fit with the changes of Q as nuisance parameters is therefore insensitive to these errors
+(Psiaki 2005, JGCD 28(4); Pittelkau 2001, JGCD 24(6)).
 """
 
 from __future__ import annotations
@@ -16,32 +23,37 @@ from typing import NamedTuple
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_matrices
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import UsageError
-from knightcube.gnc.estimation.turn import Matrix, Quaternion, Vector, cross, matrix, skew, times, twist
-
-
-class Parameters(NamedTuple):
-    """Uncertain parameters of the model, which may be estimated.
-
-    Attributes:
-        torsion: 1/s^2, k / J22 of the thread.
-        damping: 1/s, c / J22 of the thread.
-        gain: true over modelled acceleration by the coils (dipole times field over inertia).
-    """
-
-    torsion: float = 0.0
-    damping: float = 0.0
-    gain: float = 1.0
-
-
-NOMINAL = Parameters()
+from knightcube.gnc.estimation.estimate import (
+    ATTITUDE,
+    DISTURBANCE,
+    PARAMETERS,
+    RATE,
+    SIZE,
+    FilterState,
+    Parameters,
+)
+from knightcube.gnc.estimation.rotation import (
+    Matrix,
+    Quaternion,
+    Vector,
+    compose,
+    cross,
+    exponential,
+    matrix,
+    skew,
+    times,
+    twist,
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """The action of the coils: dipole moment (body, A m^2) in a field (reference, T); 1 for each driven coil.
+    """Coils in a field: dipole moment (body axes, A m^2), field (reference axes, T), 1 for each driven coil.
 
-    Not `known` while the PWM chip does not respond to commands: any coil may then be driven.
+    `known` is false while the PWM chip does not respond to commands: any coil may then be driven.
     """
 
     dipole: Vector
@@ -60,14 +72,14 @@ class Accelerated(NamedTuple):
 class Linearised(NamedTuple):
     """Angular acceleration w' (rad/s^2) and its derivatives.
 
-    `by_turn` and `by_rate` (3, 3) are its derivatives by a small turn about the body's axes and by the rate;
-    `by_current` (3, 3) rad/s^2/A are those by the coils' currents, `by_parameters` (3, 3) those by torsion,
+    `by_attitude`, `by_rate` and `by_current` (3, 3) are the derivatives by a small rotation about the body
+    axes, by the rate and by the currents of the coils (rad/s^2/A); `by_parameters` (3, 3) those by torsion,
     damping and gain.
     """
 
     acceleration: Vector
     by_parameters: Matrix
-    by_turn: FloatArray
+    by_attitude: FloatArray
     by_rate: FloatArray
     by_current: FloatArray
 
@@ -79,10 +91,10 @@ class RigidBody:
     Attributes:
         inertia: (3, 3) kg m^2, body axes.
         dipole_per_ampere: n A of each coil, m^2.
-        field: (3,) T, reference axes; a command may give another.
-        suspended: on the thread, free to turn about body y only.
-        stiffness: k of the thread, N m/rad, nominal.
-        damping: c, N m s/rad, likewise.
+        field: (3,) T, reference axes, unless a command gives another field.
+        suspended: on the thread, free to rotate about body y only.
+        stiffness: nominal k of the thread, N m/rad.
+        damping: nominal c of the thread, N m s/rad.
     """
 
     inertia: FloatArray
@@ -96,7 +108,7 @@ class RigidBody:
     _inertia: Matrix = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Raise UsageError for constants that no body has."""
+        """Raise UsageError for constants that no body can have."""
         inertia = np.asarray(self.inertia, dtype=float)
         if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
             raise UsageError(f"inertia {inertia.tolist()} must be (3, 3) and finite")
@@ -109,7 +121,7 @@ class RigidBody:
             if not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"{name} is {value}: it must be finite and not negative")
         if not self.suspended and (self.stiffness or self.damping):
-            raise UsageError("a thread's stiffness and damping need a body that is suspended")
+            raise UsageError("stiffness and damping of a thread need a suspended body")
         response = np.linalg.inv(inertia)
         if self.suspended:
             response = np.diag([0.0, 1.0 / inertia[1, 1], 0.0])
@@ -133,39 +145,42 @@ class RigidBody:
         """The nominal parameters."""
         return Parameters(self.stiffness * self._response[1][1], self.damping * self._response[1][1])
 
-    def accelerate(
-        self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
-    ) -> Accelerated:
-        """Return the acceleration under `torquing` at attitude q."""
-        return self._accelerate(q, rate, parameters, torquing, times(matrix(q), torquing.field))
-
     def linearise(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, ahead: float
     ) -> Linearised:
         """Return the acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is taken at the rate `ahead` s later, which makes it second order for a body
-        that tumbles.
+        The gyroscopic torque is that of the rate `ahead` s later, which makes the midpoint step of a tumbling
+        body second order.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
+        acceleration, by_parameters = self.accelerate(q, rate, parameters, torquing)
         field_body = times(matrix(q), torquing.field)
-        acceleration, by_parameters = self._accelerate(q, rate, parameters, torquing, field_body)
-        parts = zip(_by_turn(torquing.dipole, field_body), self._by_rate(rate), skew(field_body), strict=True)
-        derivatives = self.response @ np.array([(*turn, *spin, *field) for turn, spin, field in parts])
-        by_turn, by_rate, by_field = derivatives[:, :3], derivatives[:, 3:6], derivatives[:, 6:]
+        (mx, my, mz), (bx, by, bz) = torquing.dipole, field_body
+        dot = mx * bx + my * by + mz * bz
+        # The derivative of m x B by a small rotation e of the body: m x (B x e) = B m.e - e m.B.
+        by_rotation = (
+            (bx * mx - dot, bx * my, bx * mz),
+            (by * mx, by * my - dot, by * mz),
+            (bz * mx, bz * my, bz * mz - dot),
+        )
+        parts = zip(by_rotation, self._by_rate(rate), skew(field_body), strict=True)
+        derivatives = self.response @ np.array([(*turned, *spun, *field) for turned, spun, field in parts])
+        by_attitude, by_rate, by_field = derivatives[:, :3], derivatives[:, 3:6], derivatives[:, 6:]
         torsion, damping, gain = parameters
-        by_turn *= gain
-        by_turn[1, 1] -= torsion
+        by_attitude *= gain
+        by_attitude[1, 1] -= torsion
         by_rate[1, 1] -= damping
         by_current = -gain * self.dipole_per_ampere * by_field
-        return Linearised(acceleration, by_parameters, by_turn, by_rate, by_current)
+        return Linearised(acceleration, by_parameters, by_attitude, by_rate, by_current)
 
-    def _accelerate(
-        self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, field_body: Vector
+    def accelerate(
+        self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
     ) -> Accelerated:
+        """Return the acceleration under `torquing` at attitude q."""
         torsion, damping, gain = parameters
-        cx, cy, cz = times(self._response, cross(torquing.dipole, field_body))
+        cx, cy, cz = times(self._response, cross(torquing.dipole, times(matrix(q), torquing.field)))
         fx, fy, fz = times(self._response, self._gyroscopic(rate))
         angle = twist(q) if self.suspended else 0.0
         thread = -torsion * angle - damping * rate[1]
@@ -187,17 +202,185 @@ class RigidBody:
         )
 
 
-def _by_turn(dipole: Vector, field_body: Vector) -> Matrix:
-    """Return the derivative of m x B by a small turn of the body: m x (B x turn) = B m.turn - turn m.B."""
-    (mx, my, mz), (bx, by, bz) = dipole, field_body
-    dot = mx * bx + my * by + mz * bz
-    return (
-        (bx * mx - dot, bx * my, bx * mz),
-        (by * mx, by * my - dot, by * mz),
-        (bz * mx, bz * my, bz * mz - dot),
-    )
-
-
 def _rows(array: FloatArray) -> Matrix:
     a, b, c = (tuple(row) for row in array.tolist())
     return a, b, c
+
+
+LONGEST_STEP = 0.025
+"""Default of the longest step, s: the period of the testbed's loop."""
+_UNKNOWN_FOR = 0.3
+"""Time (s) over which an unknown current has the same effect as the white noise that models it. The guardian
+has zeroed the coils of a hung loop by then."""
+
+
+class ProcessNoise(NamedTuple):
+    """Spectral densities of the process noise, and the largest current of a coil.
+
+    `current` is that of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (19,) those of the error
+    state, in the square of its units per s. `unknown_current` A is that of each coil while it is unknown.
+    """
+
+    current: float
+    rate: FloatArray
+    walks: FloatArray
+    unknown_current: float = 0.0
+
+
+def propagate(
+    body: RigidBody,
+    noise: ProcessNoise,
+    state: FilterState,
+    covariance: FloatArray,
+    torquing: Torquing,
+    duration: float,
+    longest_step: float = LONGEST_STEP,
+) -> tuple[FilterState, FloatArray]:
+    """Propagate over `duration` s under one torquing, in steps of at most `longest_step` s."""
+    steps = max(1, math.ceil(duration / longest_step - 1e-9))
+    dt = duration / steps
+    half = 0.5 * dt
+    for _ in range(steps):  # of the midpoint rule; kept attitudes do not change
+        wx, wy, wz = state.rate
+        middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
+        model = body.linearise(middle, state.rate, state.parameters, torquing, half)
+        ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
+        moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
+        covariance = _propagated_covariance(noise, covariance, state.rate, model, torquing, dt)
+        state = state._replace(
+            quaternion=compose(moved, state.quaternion), rate=(wx + dt * ax, wy + dt * ay, wz + dt * az)
+        )
+    return state, covariance
+
+
+def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
+    """Return the rows (6, 19) of attitude and rate of I + F dt + (F dt)^2 / 2; the other rows are those of I.
+
+    F is the dynamics of the error: rotation' = -w x rotation + rate error, and so on.
+    """
+    x, y, z = rate
+    flow = _FLOW.copy()
+    flow[ATTITUDE, ATTITUDE] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
+    flow[RATE, ATTITUDE] = model.by_attitude
+    flow[RATE, RATE] = model.by_rate
+    flow[RATE, PARAMETERS] = model.by_parameters
+    flow *= dt
+    # Only attitude and rate change, so the square of F needs only their columns.
+    half = flow[:, _MOTION] * 0.5
+    half += _IDENTITY
+    transition = np.asarray(half.dot(flow))
+    transition[:, _MOTION] += _IDENTITY
+    return transition
+
+
+def _propagated_covariance(
+    noise: ProcessNoise,
+    covariance: FloatArray,
+    rate: Vector,
+    model: Linearised,
+    torquing: Torquing,
+    dt: float,
+) -> FloatArray:
+    """Return the covariance after a step.
+
+    Only rows and columns of attitude and rate change, apart from random walks. The rest is copied, so that it
+    stays exactly symmetric.
+    """
+    transition = _transition(rate, model, dt)
+    moved = transition.dot(covariance[:SIZE])
+    among = moved[:, :SIZE].dot(transition.T)
+    # White angular acceleration over dt.
+    steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
+    weights = [noise.current * driven + steady for driven in torquing.driven]
+    density = noise.rate
+    if any(weights):
+        density = density + (model.by_current * np.array(weights)).dot(model.by_current.T)
+    of_attitude, of_both = dt**3 / 3.0, 0.5 * dt * dt
+    over = np.array((of_attitude, of_both, of_both, dt)).reshape(2, 1, 2, 1)
+    among += (over * density[:, np.newaxis]).reshape(6, 6)
+    after = covariance.copy()
+    after[_MOTION] = moved
+    after[:, _MOTION] = moved.T
+    after[_MOTION, _MOTION] = among
+    after.reshape(-1)[: SIZE * len(after) : len(after) + 1] += dt * noise.walks
+    return after
+
+
+_MOTION = slice(ATTITUDE.start, RATE.stop)
+_IDENTITY: FloatArray = np.eye(6)
+_FLOW: FloatArray = np.zeros((6, SIZE))
+_FLOW[ATTITUDE, RATE] = np.eye(3)
+_FLOW[RATE, DISTURBANCE] = np.eye(3)
+
+
+_FIRST, _SECOND = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
+"""Axes of the six products: xx, yy, zz, yz, zx, xy."""
+_DRAWS = 2000
+"""Number of random bodies that give the covariance of Q. With 1000 and 4000 bodies the six largest modes
+agree within 5 %."""
+_NEGLIGIBLE = 1e-6
+"""Variance of a mode, relative to the largest, below which the mode is omitted."""
+
+
+@dataclass(frozen=True, slots=True)
+class BodyErrors:
+    """Largest errors of the description of a body, each drawn uniformly.
+
+    Attributes:
+        moments: relative error of the principal moments of inertia.
+        axes: rotation of the principal axes about each body axis, rad.
+        gyro_scale: relative error of the gyro's scale factors.
+        gyro_alignment: misalignment of each gyro axis toward each other axis, rad.
+    """
+
+    moments: float = 0.1
+    axes: float = math.radians(5.0)
+    gyro_scale: float = 3e-3
+    gyro_alignment: float = 2e-3
+
+
+def rate_products(rates: FloatArray) -> FloatArray:
+    """Return the six products (n, 6) of rates (n, 3): xx, yy, zz, yz, zx, xy."""
+    return rates[:, _FIRST] * rates[:, _SECOND]
+
+
+def gyroscopic_coefficients(inertia: FloatArray) -> FloatArray:
+    """Return Q (..., 3, 6) of tensors (..., 3, 3): Q p(w) is the torque-free acceleration."""
+    return _folded(_quadratic(inertia))
+
+
+def coefficient_modes(inertia: FloatArray, errors: BodyErrors) -> FloatArray:
+    """Return changes (k, 3, 6) of Q whose sum, with independent weights of variance 1, spans the errors.
+
+    They are the principal components of Q over random bodies near an assumed `inertia` (3, 3), without
+    tensors that violate the triangle inequality. The draws have a fixed seed.
+    """
+    generator = np.random.default_rng(0)
+    moments, axes = np.linalg.eigh(inertia)
+    drawn = moments * (1.0 + errors.moments * generator.uniform(-1.0, 1.0, (_DRAWS, 3)))
+    drawn = drawn[2.0 * drawn.max(axis=1) < drawn.sum(axis=1)]
+    count = len(drawn)
+    rotations = from_rotation_vector(errors.axes * generator.uniform(-1.0, 1.0, (count, 3)))
+    principal = attitude_matrix(rotations) @ axes
+    tensors = np.einsum("nij,nj,nkj->nik", principal, drawn, principal)
+    gyro = errors.gyro_alignment * generator.uniform(-1.0, 1.0, (count, 3, 3))
+    gyro[:, range(3), range(3)] = 1.0 + errors.gyro_scale * generator.uniform(-1.0, 1.0, (count, 3))
+    back = np.linalg.inv(gyro)
+    measured = np.einsum("nil,nlmo,nmj,nok->nijk", gyro, _quadratic(tensors), back, back, optimize=True)
+    changes = (_folded(measured) - gyroscopic_coefficients(inertia)).reshape(count, 18)
+    variances, vectors = np.linalg.eigh(changes.T @ changes / count)
+    kept = variances > _NEGLIGIBLE * variances[-1]
+    return np.asarray((vectors[:, kept] * np.sqrt(variances[kept])).T.reshape(-1, 3, 6))
+
+
+def _quadratic(inertia: FloatArray) -> FloatArray:
+    """Return T (..., 3, 3, 3) of tensors (..., 3, 3), with the acceleration w'_i = T_ijk w_j w_k."""
+    crosses = cross_matrices(np.eye(3))
+    return np.asarray(-np.einsum("...il,jlm,...mk->...ijk", np.linalg.inv(inertia), crosses, inertia))
+
+
+def _folded(quadratic: FloatArray) -> FloatArray:
+    """Return the coefficients (..., 3, 6) of the products, of T (..., 3, 3, 3)."""
+    folded = quadratic[..., _FIRST, _SECOND] + quadratic[..., _SECOND, _FIRST]
+    folded[..., :3] *= 0.5
+    return np.asarray(folded)

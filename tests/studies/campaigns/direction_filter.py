@@ -21,9 +21,8 @@ from scipy.special import chdtri
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN, Estimate
-from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, Estimate
 from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,
@@ -179,7 +178,7 @@ class AttitudeDetermination:
         in_use = frozenset(name for name, then in self._taken_ns.items() if time_ns - then <= fresh_ns)
         estimate = self._filter.at(time_ns) if self._filter.started else None
         if estimate is not None:
-            sigma = np.sqrt(np.diag(estimate.covariance)[TURN])
+            sigma = np.sqrt(np.diag(estimate.covariance)[ATTITUDE])
             if float(np.max(sigma)) < self._settings.lost_sigma:
                 return Report(time_ns, _status(in_use), estimate, sigma, in_use)
             self._filter = self._new_filter()

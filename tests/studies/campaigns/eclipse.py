@@ -21,8 +21,7 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
-from knightcube.gnc.estimation.free_filter import FreeFilter
-from knightcube.gnc.estimation.free_motion import TURN
+from knightcube.gnc.estimation.free_filter import ATTITUDE, FreeFilter
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.eclipse_loop import CRAFT, LAST, SETTLED, fly_loop, judged
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, STAR_SIGMA, PointingFlight
@@ -99,7 +98,7 @@ class DarkFlight(PointingFlight):
         off = to_rotation_vector(multiply(self.flight.motion.quaternion, conjugate(found.quaternion)))
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
         share = float(np.linalg.norm(missing) / np.linalg.norm(truth.residual_dipole))
-        return off, np.sqrt(np.diag(found.covariance[TURN, TURN])), share
+        return off, np.sqrt(np.diag(found.covariance[ATTITUDE, ATTITUDE])), share
 
     def _see_stars(self, time: float) -> None:
         if time < self.dark:

@@ -19,7 +19,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.estimation.estimate import BIAS, TURN, Estimate
+from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, Estimate
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
@@ -184,7 +184,7 @@ def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tup
     """Return the attitude's error (3,) rad about the body's axes, and error^T P^-1 error of both."""
     turn = rotation_vector(multiply(attitude, conjugate(estimate.quaternion)))
     error = np.concatenate([turn, bias - estimate.bias])
-    pick = np.r_[TURN, BIAS]
+    pick = np.r_[ATTITUDE, BIAS]
     covariance = estimate.covariance[np.ix_(pick, pick)]
     scale = np.sqrt(np.diag(covariance))
     whitened = error / scale

@@ -30,9 +30,13 @@ from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
 from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw, damping_dipole
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
-from knightcube.gnc.estimation.free_filter import FreeFilter
-from knightcube.gnc.estimation.free_motion import GYRO, TURN, Around
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    ATTITUDE,
+    GYRO,
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+)
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from sim_hal.settings import Disturbances, TipOff
@@ -174,7 +178,7 @@ class PointingFlight:
             or since >= self._wanted.get("replan", REPLAN)
         )
 
-    def _command(self, time: float, around: Around) -> FloatArray:
+    def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
         """Return the dipole (3,) A m^2 until the end of the cycle."""
         found, flight = self._filter, self.flight
         law = self._wanted["law"]
@@ -223,7 +227,7 @@ class PointingFlight:
         turn = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(wanted)))
         error = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(found.quaternion)))
         both = np.concatenate([error, flight.gyro_bias - found.gyro_bias])
-        pick = np.r_[TURN, GYRO]
+        pick = np.r_[ATTITUDE, GYRO]
         nees = float(both @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], both)) / 6.0
         truth = flight.body.orbit_truth()
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
@@ -270,10 +274,10 @@ class PointingFlight:
             flight.limit * (CYCLE - PAUSE) / CYCLE,
         )
 
-    def _around(self, time: float) -> Around:
+    def _around(self, time: float) -> FilterEnvironment:
         ahead, at = self._ahead, np.array([time - self._ahead_begun + 0.5 * CYCLE])
         lit = float(ahead.sunlit_at(at)[0])
-        return Around(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
+        return FilterEnvironment(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
 
     def _field_at(self, time: float) -> FloatArray:
         """Return the model's field (3,) T of a time, ICRS."""

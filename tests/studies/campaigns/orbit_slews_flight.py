@@ -26,7 +26,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
@@ -131,7 +131,7 @@ class SlewFlight(PointingFlight):
         sizes = self._filter.torque_sizes
         return replace(table, sizes=sizes, torque_part=np.zeros((len(table.dipole), 3, len(sizes))))
 
-    def _command(self, time: float, around: Around) -> FloatArray:
+    def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
         if self._from is None or self._slews_by != "projected":
             return super()._command(time, around)
         assert self._about is not None

@@ -17,7 +17,7 @@ from knightcube.astro.quaternion import (
     multiply,
 )
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
-from knightcube.gnc.estimation.estimate import BIAS, TURN
+from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS
 from tests.studies.campaigns.direction_filter import (
     AttitudeDetermination,
     Report,
@@ -121,7 +121,7 @@ def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
             assert report.estimate is not None
             truth = sky.attitude(report.time_ns / SECOND)
             off = rotation_vector(multiply(truth, conjugate(report.estimate.quaternion)))
-            total += float(off @ np.linalg.solve(report.estimate.covariance[TURN, TURN], off))
+            total += float(off @ np.linalg.solve(report.estimate.covariance[ATTITUDE, ATTITUDE], off))
         low, high = chi2.ppf([0.0005, 0.9995], 3 * 24)
         assert low < total < high
 
@@ -189,7 +189,7 @@ def test_without_what_is_lost_it_goes_on_and_says_how_well(left: set[str], statu
         # Across the Sun it stays what it was, about it it drifts.
         assert report.estimate is not None
         about = attitude_matrix(report.estimate.quaternion) @ SUN
-        spread = report.estimate.covariance[TURN, TURN]
+        spread = report.estimate.covariance[ATTITUDE, ATTITUDE]
         along = float(about @ spread @ about)
         assert along > 20.0 * 0.5 * float(np.trace(spread) - along)
     assert np.max(np.degrees(report.sigma)) < 2.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from tests.studies.campaigns import eclipse
 from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE
@@ -54,7 +54,7 @@ class Driven(eclipse.DarkFlight):
     def _plan(self, time: float) -> None:
         pass
 
-    def _command(self, time: float, around: Around) -> FloatArray:
+    def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
         axis, back = divmod(int(time / CYCLE) // 2 % 6, 2)
         dipole = np.zeros(3)
         dipole[axis] = (0.09, -0.09)[back]

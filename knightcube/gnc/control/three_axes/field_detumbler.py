@@ -391,9 +391,13 @@ class FieldDetumbler:
         if little and along * along <= square * self._rest**2:
             return np.asarray(momentum / (square * SOON))
         if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
-            self._plan, self._planned_ns, self._planned_rotation = self._planned(now_ns), now_ns, found.turn
+            self._plan, self._planned_ns, self._planned_rotation = (
+                self._planned(now_ns),
+                now_ns,
+                found.rotation,
+            )
         # The plan is inertially fixed: rotate it into the present body axes.
-        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_rotation)))
+        since = attitude_matrix(multiply(found.rotation, conjugate(self._planned_rotation)))
         return np.asarray(since @ self._plan.costate)
 
     def _planned(self, now_ns: int) -> MomentumPlan:

@@ -24,8 +24,8 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.estimate import TURN, Knowledge
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.estimate import ATTITUDE, Knowledge
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.solar_cells import SolarStringModel
 from sim_hal.emulators.solar_cells import SolarCellsModel
@@ -62,9 +62,9 @@ class Lit:
         self.magnet: FloatArray = np.zeros(3)
         self.begin_ns = 0  # when stars begin the filter
 
-    def at(self, _: int) -> Around:
+    def at(self, _: int) -> FilterEnvironment:
         nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-        return Around(FIELD, POSITION, nothing, self._sunlit)
+        return FilterEnvironment(FIELD, POSITION, nothing, self._sunlit)
 
     def sun(self, _: int) -> FloatArray:
         return SUN
@@ -104,7 +104,7 @@ def test_sun_and_field_mostly_give_a_coarse_attitude_within_its_claims_and_witho
     assert len(known) >= 3
     for lit in known:
         found = lit.filter.at(lit.filter.measured_ns)
-        sigma = np.sqrt(np.diag(found.covariance)[TURN])
+        sigma = np.sqrt(np.diag(found.covariance)[ATTITUDE])
         assert angle_between(found.quaternion, lit.attitude) < 3.0 * np.linalg.norm(sigma)
 
 
@@ -127,7 +127,7 @@ def test_a_filter_that_began_after_a_reading_of_the_strings_is_kept() -> None:
     lit.fly(16)
     assert lit.filter.restarts == 1
     found = lit.filter.at(lit.filter.measured_ns)
-    assert np.sqrt(np.diag(found.covariance)[TURN]).max() < 0.02, "not that of the strings"
+    assert np.sqrt(np.diag(found.covariance)[ATTITUDE]).max() < 0.02, "not that of the strings"
 
 
 @pytest.mark.parametrize("rank", range(3))
@@ -140,7 +140,7 @@ def test_a_dead_string_misleads_no_estimate_beyond_its_claim(rank: int) -> None:
     for lit in known:
         found = lit.filter.at(lit.filter.measured_ns)
         off = to_rotation_vector(multiply(lit.attitude, conjugate(found.quaternion)))
-        assert off @ np.linalg.solve(found.covariance[TURN, TURN], off) < 5.0**2
+        assert off @ np.linalg.solve(found.covariance[ATTITUDE, ATTITUDE], off) < 5.0**2
     if rank == 0:
         assert all(any(lit.wrong) for lit in flights)
 

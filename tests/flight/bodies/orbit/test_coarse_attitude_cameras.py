@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import (
     normalise,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon_camera_job import HorizonCameraResult, MeasuredDirection
@@ -55,9 +55,9 @@ class Still:
         self.now_ns = 0
         self.sunlit = 1.0
 
-    def at(self, _: int) -> Around:
+    def at(self, _: int) -> FilterEnvironment:
         nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-        return Around(FIELD, POSITION, nothing, self.sunlit)
+        return FilterEnvironment(FIELD, POSITION, nothing, self.sunlit)
 
     def sun(self, _: int) -> FloatArray:
         return SUN

@@ -20,8 +20,8 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.estimate import RATE, TURN, Knowledge
-from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Knowledge
+from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 
 PERIOD_NS = SECOND_NS // 40
@@ -33,9 +33,9 @@ DIPOLE = 0.02
 """A m^2, about x."""
 
 
-def around(_: int) -> Around:
+def around(_: int) -> FilterEnvironment:
     nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-    return Around(FIELD, np.array([1e9, 0.0, 0.0]), nothing, 1.0)
+    return FilterEnvironment(FIELD, np.array([1e9, 0.0, 0.0]), nothing, 1.0)
 
 
 class Flown:
@@ -125,7 +125,7 @@ def test_stars_of_over_a_second_ago_are_applied_at_their_own_time(pulses: bool) 
     found = flown.filter.at(flown.time_ns)
     sigma = np.sqrt(np.diag(found.covariance))
     assert flown.filter.knowledge is Knowledge.FINE
-    assert flown.error() < 3.0 * np.linalg.norm(sigma[TURN])
+    assert flown.error() < 3.0 * np.linalg.norm(sigma[ATTITUDE])
     assert (np.abs(found.rate - flown.rate) < 4.0 * sigma[RATE]).all()
     assert found.bias == pytest.approx(BIAS, abs=5e-5)
     assert flown.filter.refused == 0
@@ -205,7 +205,7 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
     found = flown.filter.at(flown.time_ns)
 
     error = to_rotation_vector(multiply(found.quaternion, conjugate(flown.attitude)))
-    assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[TURN])).all()
+    assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[ATTITUDE])).all()
 
 
 def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim() -> None:

@@ -16,9 +16,15 @@ from flight.bodies.orbit.filter import (
 from flight.loop.state.content import Learned, StoredState
 from flight.loop.state.store import decode, encode
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
-from knightcube.gnc.estimation.free_motion import DIPOLE, GYRO, SLOW, SUNLIT
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    DIPOLE,
+    GYRO,
+    SLOW,
+    SUNLIT,
+    FreeFilter,
+    FreeFilterSettings,
+    SlowStates,
+)
 
 SETTINGS = FreeFilterSettings()
 START, WALK = SETTINGS.of_slow(0), SETTINGS.of_slow(1)

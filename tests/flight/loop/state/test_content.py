@@ -36,10 +36,8 @@ from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import PARAMETERS, Estimate
-from knightcube.gnc.estimation.filter_settings import slow_prior
-from knightcube.gnc.estimation.rigid_body import Parameters
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, slow_prior
+from knightcube.gnc.estimation.estimate import PARAMETERS, Estimate, Parameters
 from tests.flight.loop.state.disk import Disk
 from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, fly, follow
 from tests.manual_clock import ManualClock

@@ -13,9 +13,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_between, conjugate, from_rotation_vector, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import BIAS, PARAMETERS, RATE, TURN, Estimate
+from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, PARAMETERS, RATE, Estimate, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
-from knightcube.gnc.estimation.rigid_body import Parameters
 from tests.knightcube.gnc.estimation.flights import (
     FREE,
     RATE_COVARIANCE,
@@ -159,7 +158,7 @@ def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool)
     for cycle in (200, 240, 280, 319):
         estimate = filter_.at(cycle * CYCLE_NS)
         error = rotation_vector(multiply(flight.attitudes[cycle], conjugate(estimate.quaternion)))
-        sigma = np.sqrt(np.diag(estimate.covariance)[TURN])
+        sigma = np.sqrt(np.diag(estimate.covariance)[ATTITUDE])
         assert np.all(np.abs(error) <= 4.0 * sigma + 1e-15)
         assert estimate.measured_ns == 199 * CYCLE_NS
         sigmas.append(sigma[1])

@@ -12,11 +12,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.solvers import VectorObservation, weighted_fit
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
-from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN
-from knightcube.gnc.estimation.innovation import innovation
+from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, SIZE, FilterState
 from knightcube.gnc.estimation.measurements import DirectionMeasurement, FieldMeasurement, Measurement
-from knightcube.gnc.estimation.mekf import correct, normalised_square
-from knightcube.gnc.estimation.state import SIZE, State
+from knightcube.gnc.estimation.mekf import correct, innovation, normalised_square
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
 from tests.knightcube.gnc.estimation.test_mekf import STATE, moved
 from tests.support.consistency_worlds import CYCLE_NS
@@ -35,7 +33,7 @@ def direction(
     return DirectionMeasurement(time_ns, attitude_matrix(turned) @ reference, reference, SIGMA**2 * np.eye(3))
 
 
-def as_array(state: State) -> FloatArray:
+def as_array(state: FilterState) -> FloatArray:
     return np.array(state.quaternion)
 
 
@@ -77,8 +75,8 @@ def test_a_direction_says_nothing_of_the_turn_about_itself() -> None:
     state, narrowed = correct(STATE, covariance, found, normalised_square(found, covariance)[1])
     along = attitude_matrix(as_array(state)) @ REFERENCE
     np.testing.assert_allclose(along, seen.observed, atol=1e-6)
-    assert along @ narrowed[TURN, TURN] @ along == pytest.approx(1.0, abs=1e-3)
-    across = np.trace(narrowed[TURN, TURN]) - along @ narrowed[TURN, TURN] @ along
+    assert along @ narrowed[ATTITUDE, ATTITUDE] @ along == pytest.approx(1.0, abs=1e-3)
+    across = np.trace(narrowed[ATTITUDE, ATTITUDE]) - along @ narrowed[ATTITUDE, ATTITUDE] @ along
     assert across == pytest.approx(2.0 * SIGMA**2, rel=0.01)
 
 
@@ -112,7 +110,7 @@ def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
             state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
     fix = weighted_fit([VectorObservation(m.observed, m.reference, m.covariance) for m in seen])
     assert float(angle_between(as_array(state), fix.quaternion)) < 2e-2 * SIGMA
-    np.testing.assert_allclose(covariance[TURN, TURN], fix.covariance, atol=0.02 * SIGMA**2)
+    np.testing.assert_allclose(covariance[ATTITUDE, ATTITUDE], fix.covariance, atol=0.02 * SIGMA**2)
 
 
 @pytest.mark.parametrize("suspended", [True, False], ids=["suspended", "free"])

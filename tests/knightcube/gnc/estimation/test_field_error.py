@@ -17,9 +17,13 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.free_filter import LEAST_FIELD, FreeFilter
-from knightcube.gnc.estimation.free_motion import TURN, Around
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    ATTITUDE,
+    MINIMUM_FIELD_ERROR,
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+)
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 STEP, NOISE, STAR, GYRO = 2.0, 5e-8, 5e-5, 4e-5
@@ -43,7 +47,9 @@ class Sky:
             self.time += STEP
             turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * self.time, 0.0])))
             nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-            here = Around(turned.T @ np.array([1e-5, 2e-5, 3e-5]), np.array([7e9, 0.0, 0.0]), nothing, 0.0)
+            here = FilterEnvironment(
+                turned.T @ np.array([1e-5, 2e-5, 3e-5]), np.array([7e9, 0.0, 0.0]), nothing, 0.0
+            )
             drawn = self.rng.standard_normal((4, 3))
             self.error = kept * self.error + self.sigma * math.sqrt(1.0 - kept**2) * drawn[0]
             self.filter.advance(STEP, np.zeros(3), here)
@@ -58,7 +64,7 @@ class Sky:
 def test_its_size_is_learned_with_stars(sigma: float) -> None:
     sky = Sky(sigma, 4)
     sky.fly(6_000.0, stars=True)
-    assert 0.5 * sigma < sky.filter.field_error < 1.6 * sigma + 2.0 * LEAST_FIELD
+    assert 0.5 * sigma < sky.filter.field_error < 1.6 * sigma + 2.0 * MINIMUM_FIELD_ERROR
     assert sky.filter.refused == 0
 
 
@@ -89,7 +95,7 @@ def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> N
         sky.fly(3_000.0, stars=True)
         sky.fly(1_000.0, stars=False)
         off = to_rotation_vector(multiply(IDENTITY, conjugate(sky.filter.quaternion)))
-        covariance = sky.filter.covariance[TURN, TURN]
+        covariance = sky.filter.covariance[ATTITUDE, ATTITUDE]
         nees.append(float(off @ np.linalg.solve(covariance, off)) / 3.0)
         claims.append(math.sqrt(covariance.trace()))
     assert np.mean(nees) < 2.5, "99.9 % of a chi-square of 15 over 15"

@@ -17,9 +17,16 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.estimation.estimate import Knowledge
-from knightcube.gnc.estimation.free_filter import FreeFilter
-from knightcube.gnc.estimation.free_motion import DIPOLE, GYRO, RATE, STATES, TURN, Around
-from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    ATTITUDE,
+    DIPOLE,
+    GYRO,
+    RATE,
+    STATES,
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+)
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 STAR, GYRO_SIGMA = 5e-5, 5e-5
@@ -27,11 +34,11 @@ RESIDUAL, BIAS = np.array([6e-4, -3e-4, 4e-4]), np.array([4e-4, -5e-4, 3e-4])
 POSITION = np.array([6.878e6, 0.0, 0.0])
 
 
-def around(time: float) -> Around:
+def around(time: float) -> FilterEnvironment:
     """Return a field that turns by two turns in 95 min; no air, no light, a gradient of nothing."""
     turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * time, 0.0])))
     nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-    return Around(turned.T @ np.array([1e-5, 2e-5, 3e-5]), 1e3 * POSITION, nothing, 0.0)
+    return FilterEnvironment(turned.T @ np.array([1e-5, 2e-5, 3e-5]), 1e3 * POSITION, nothing, 0.0)
 
 
 def fly(seconds: int, seed: int, age: float = 0.0) -> tuple[FreeFilter, FloatArray, FloatArray]:
@@ -85,7 +92,7 @@ def test_late_attitudes_serve_as_well_as_timely_ones() -> None:
     timely, late = (fly(120, 3, age) for age in (0.0, 3.0))
     assert late[0].refused == 0
     assert angle_between(late[0].quaternion, late[1]) < 4.0 * STAR
-    sigmas = [np.sqrt(np.diag(found.covariance)[TURN]).max() for found, _, _ in (timely, late)]
+    sigmas = [np.sqrt(np.diag(found.covariance)[ATTITUDE]).max() for found, _, _ in (timely, late)]
     assert sigmas[1] == pytest.approx(sigmas[0], rel=0.2)
 
 

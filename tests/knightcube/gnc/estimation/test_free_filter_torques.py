@@ -16,9 +16,17 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
-from knightcube.gnc.estimation.free_motion import AXES, GYRO, RATE, TURN, Around
-from knightcube.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
+from knightcube.gnc.estimation.free_filter import (
+    ATTITUDE,
+    AXES,
+    GYRO,
+    PLAUSIBLE,
+    RATE,
+    FilterEnvironment,
+    FreeFilter,
+    FreeFilterSettings,
+    SlowStates,
+)
 
 INERTIA = np.diag([0.0066, 0.0333, 0.0333])
 BIAS = np.array([4e-5, -3e-5, 2e-5])
@@ -28,7 +36,7 @@ CYCLES = 40
 """Of the coils, a second."""
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 NOTHING = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-AROUND = Around(FIELD, np.array([6.878e9, 0.0, 0.0]), NOTHING, 0.0)
+AROUND = FilterEnvironment(FIELD, np.array([6.878e9, 0.0, 0.0]), NOTHING, 0.0)
 
 
 class Craft:
@@ -93,7 +101,7 @@ def test_a_turn_of_the_principal_axes_is_no_bias_of_the_gyros() -> None:
     assert found.refused == 0
     assert np.abs(error[GYRO]).max() < 1e-4, "a filter that knows no axes learns 1e-3"
     assert np.all(np.abs(error) < 4.5 * sigma[:9])
-    assert np.abs(AXES_TURN - found.axes_turn)[1:].max() < 0.002, (
+    assert np.abs(AXES_TURN - found.axes_rotation)[1:].max() < 0.002, (
         "about x, that of symmetry, nothing shows it"
     )
     assert sigma[AXES][1:].max() < 0.005
@@ -109,7 +117,7 @@ def test_currents_that_scatter_in_each_cycle_are_in_the_claim() -> None:
             craft = Craft(np.zeros(3), np.array([0.0, -1.1e-3, 0.0]), seed)
             found = started(craft, settings)
             fly(craft, found, 60, np.array([1e-4, 0.0, 1e-4]), noise)
-            pick = np.r_[TURN, RATE]
+            pick = np.r_[ATTITUDE, RATE]
             error = errors(found, craft)[:6]
             squares.append(error @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], error) / 6.0)
         nees[settings.coil_noise] = float(np.mean(squares))
@@ -134,7 +142,7 @@ def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
     """False directions had taught it. Kept as a guess, it led each new start astray until the next star."""
     craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
     taught, known = np.zeros(24), np.diag(settings.of_slow(0) ** 2)
-    taught[0], known[0, 0] = 2.0 * BELIEVED * settings.gyro[0], 1e-12
+    taught[0], known[0, 0] = 2.0 * PLAUSIBLE * settings.gyro[0], 1e-12
     found = FreeFilter(INERTIA, settings, SlowStates(taught, known))
     found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS)
     fly(craft, found, 10, np.zeros(3), 0.0)

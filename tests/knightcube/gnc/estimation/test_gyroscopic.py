@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.gyroscopic import (
+from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,
     gyroscopic_coefficients,

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_about_axis_y
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
 from knightcube.gnc.estimation.estimate import LATENCY, Estimate
-from knightcube.gnc.estimation.filter_settings import FilterSettings
-from knightcube.gnc.estimation.latency import LONGEST_LATENCY, motion
 from knightcube.gnc.estimation.measurements import RateMeasurement
+from knightcube.gnc.estimation.mekf import LONGEST_LATENCY, rate_change
 from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPENDED, Flight, fly
 from tests.support.consistency_worlds import CYCLE_NS
 
@@ -103,8 +102,8 @@ def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
     )
     covariance = np.zeros((16, 16))
     covariance[LATENCY, LATENCY] = 0.01**2
-    found = motion(off, on, (0.0, 0.0, 0.0), covariance)
+    found = rate_change(off, on, (0.0, 0.0, 0.0), covariance)
     step = on.acceleration[1]
     assert found.acceleration[1] == pytest.approx(0.5 * step)
     assert found.uncertainty[1, 1] == pytest.approx((0.01 * 0.5 * step) ** 2)
-    assert not motion(on, on, (0.0, 0.0, 0.0), covariance).uncertainty.any()
+    assert not rate_change(on, on, (0.0, 0.0, 0.0), covariance).uncertainty.any()

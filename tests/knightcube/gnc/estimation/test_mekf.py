@@ -9,22 +9,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.innovation import innovation
-from knightcube.gnc.estimation.latency import Motion
+from knightcube.gnc.estimation.estimate import SIZE, FilterState, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
-from knightcube.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
-from knightcube.gnc.estimation.propagation import ProcessNoise, propagate
-from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody, Torquing
-from knightcube.gnc.estimation.state import SIZE, State
-from knightcube.gnc.estimation.turn import compose, exponential, inverse, logarithm, skew
+from knightcube.gnc.estimation.mekf import (
+    RateChange,
+    correct,
+    innovation,
+    keep_attitude,
+    normalised_square,
+    release_attitude,
+)
+from knightcube.gnc.estimation.rigid_body import ProcessNoise, RigidBody, Torquing, propagate
+from knightcube.gnc.estimation.rotation import (
+    compose,
+    exponential,
+    inverse,
+    logarithm,
+    skew,
+)
 from tests.knightcube.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
 STILL = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(SIZE))
-STATE = State(
+STATE = FilterState(
     exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()
 )
 TORQUING = FREE.torquing(np.array([0.1, -0.08, 0.05]))
-HUNG = State(
+HUNG = FilterState(
     exponential(0.0, 0.4, 0.0), (0.0, -0.3, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.02, 0.0), Parameters(0.01, 2e-3)
 )
 ABOUT_THREAD = [1, 4, 7, 10, 12, 13, 14]
@@ -35,10 +45,10 @@ def walks_of(bias: float, disturbance: float) -> FloatArray:
     return np.repeat([0.0, bias, disturbance, 0.0], [6, 3, 3, SIZE - 12])
 
 
-def moved(state: State, error: FloatArray) -> State:
+def moved(state: FilterState, error: FloatArray) -> FilterState:
     """Return the state with an error put in."""
     e = error.tolist()
-    return State(
+    return FilterState(
         compose(exponential(*e[0:3]), state.quaternion),
         (state.rate[0] + e[3], state.rate[1] + e[4], state.rate[2] + e[5]),
         (state.bias[0] + e[6], state.bias[1] + e[7], state.bias[2] + e[8]),
@@ -50,7 +60,7 @@ def moved(state: State, error: FloatArray) -> State:
     )
 
 
-def difference(a: State, b: State) -> FloatArray:
+def difference(a: FilterState, b: FilterState) -> FloatArray:
     """Return the error (19,) of b, by which it is off a."""
     turn = logarithm(compose(a.quaternion, inverse(b.quaternion)))
     mine, theirs = (
@@ -91,14 +101,14 @@ def test_a_step_is_the_product_of_the_whole_matrices() -> None:
 
 
 def dense_step(
-    body: RigidBody, noise: ProcessNoise, state: State, torquing: Torquing, dt: float
+    body: RigidBody, noise: ProcessNoise, state: FilterState, torquing: Torquing, dt: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return transition and added noise (22, 22) of one step with one kept attitude, written out whole."""
     middle = compose(exponential(*(0.5 * dt * w for w in state.rate)), state.quaternion)
     model = body.linearise(middle, state.rate, state.parameters, torquing, 0.5 * dt)
     flow, added = np.zeros((22, 22)), np.zeros((22, 22))
     flow[0:3, 0:3], flow[0:3, 3:6] = -np.array(skew(state.rate)), np.eye(3)
-    flow[3:6, 0:3], flow[3:6, 3:6] = model.by_turn, model.by_rate
+    flow[3:6, 0:3], flow[3:6, 3:6] = model.by_attitude, model.by_rate
     flow[3:6, 9:12], flow[3:6, 12:15] = np.eye(3), model.by_parameters
     known = noise.current * np.diag(torquing.driven)
     unknown = (0.0 if torquing.known else 0.3 * noise.unknown_current**2) * np.eye(3)
@@ -114,7 +124,7 @@ def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
     draws, cycles, dt = 4000, 20, 0.025
     sigma, walk, bias_walk = 2e-3, 5e-4, 1e-5
     noise = ProcessNoise(sigma**2 * dt, np.zeros((3, 3)), walks_of(bias_walk**2, walk**2))
-    still = State((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, Parameters())
+    still = FilterState((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, Parameters())
     torquing = FREE.torquing(np.full(3, 1e-9))
     _, covariance = propagate(FREE, noise, still, np.zeros((SIZE, SIZE)), torquing, cycles * dt)
     per_ampere = FREE.linearise(still.quaternion, still.rate, Parameters(), torquing, 0.0).by_current
@@ -137,7 +147,7 @@ def test_the_rows_of_each_measurement_are_its_derivatives() -> None:
     attitude = AttitudeMeasurement(10**9, np.array(STATE.quaternion), TURN_COVARIANCE)
     rate = RateMeasurement(10**9, np.zeros(3), RATE_COVARIANCE)
     aged = (replace(attitude, latency=state.latency), replace(rate, latency=state.latency))
-    aging = Motion((0.02, -0.04, 0.03), np.zeros((3, 3)))
+    aging = RateChange((0.02, -0.04, 0.03), np.zeros((3, 3)))
     for measurement in (attitude, rate, exposure, *aged):
         rows = innovation(state, measurement, False, aging).rows
         step = 1e-6

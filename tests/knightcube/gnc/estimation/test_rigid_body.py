@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
-from knightcube.gnc.estimation.turn import Quaternion, Vector, compose, exponential
+from knightcube.gnc.estimation.estimate import Parameters
+from knightcube.gnc.estimation.rigid_body import RigidBody
+from knightcube.gnc.estimation.rotation import (
+    Quaternion,
+    Vector,
+    compose,
+    exponential,
+)
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.knightcube.gnc.estimation.flights import FREE
 from tests.support.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
@@ -58,7 +64,7 @@ def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
         bump = step * np.eye(3)[axis]
         turned = acceleration(body, compose(exponential(*bump), q), RATE, CURRENTS)
         back = acceleration(body, compose(exponential(*-bump), q), RATE, CURRENTS)
-        np.testing.assert_allclose(model.by_turn[:, axis], (turned - back) / (2 * step), atol=1e-8)
+        np.testing.assert_allclose(model.by_attitude[:, axis], (turned - back) / (2 * step), atol=1e-8)
         up, down = np.array(RATE) + bump, np.array(RATE) - bump
         faster = acceleration(body, q, (up[0], up[1], up[2]), CURRENTS)
         slower = acceleration(body, q, (down[0], down[1], down[2]), CURRENTS)

@@ -8,8 +8,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
-from knightcube.gnc.estimation.carried_sun import MEMORY
+from knightcube.gnc.control.three_axes.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
 
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
 INERTIA, LIMIT = np.array([1.10e-3, 1.05e-3, 0.99e-3]), 0.0959

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.estimation.residual_dipole import ResidualDipole
+from knightcube.gnc.control.three_axes.sun_acquisition import ResidualDipole
 
 INERTIA = np.array([1.10e-3, 1.05e-3, 0.99e-3])
 DIPOLE = np.array([6e-4, -5e-4, 7e-4])

@@ -1,7 +1,7 @@
-"""Rotations as tuples of floats: the algebra of `astro.quaternion` for code that runs often in a cycle.
+"""Rotations as tuples of floats: the algebra of `knightcube.astro.quaternion` for the control cycle.
 
-Same conventions (scalar last, A(compose(p, q)) = A(p) A(q)), compared with that module by a test; a numpy
-call on three or four numbers costs ten times the arithmetic.
+The conventions are the same (scalar last, A(compose(p, q)) = A(p) A(q)); a test compares the two modules. A
+numpy call on three or four numbers takes ten times as long as the arithmetic.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def exponential(x: float, y: float, z: float) -> Quaternion:
 
 
 def logarithm(q: Quaternion) -> Vector:
-    """Return the rotation vector of a unit quaternion, rad, the shorter way round."""
+    """Return the rotation vector of a unit quaternion, rad, of the shorter rotation."""
     x, y, z, w = q if q[3] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     sine = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 * math.atan2(sine, w) / sine if sine > 1e-9 else 2.0

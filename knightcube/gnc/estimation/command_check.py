@@ -1,14 +1,15 @@
-"""Decides from the gyro whether the coils carry the commanded currents.
+"""Checks with the gyro whether the coils carry the commanded currents.
 
 A command is an assumption, a measured rate is not. While a coil is broken the model predicts an acceleration
-that does not happen: the gyro's innovations, as large as their covariance in every healthy flight, leave it
-within one to a few samples. The currents are then unknown, from a little before, and the filter follows the
-gyro. A change of the rate that no coil current can cause is no reason: then the gyro itself is in doubt.
+that does not occur: the innovations of the gyro, which agree with their covariance in every healthy flight,
+exceed it within one to a few samples. The currents are then unknown, from a little earlier on, and the filter
+follows the gyro. A change of the rate that no coil current can cause is no reason: then the gyro may be
+faulty.
 
-The commands are trusted again when the rate follows them: over the last second a share g of the commanded
-change c of the rate is fitted to the gyro's samples, z = b + g c. The commands must have moved the body
-enough to fix g, g must be 1, and the residuals must be white. A body that is not driven proves nothing. A
-gyro with more noise than assumed raises the scale of its departures, not a doubt.
+The commands are trusted again when the rate follows them. Over the last second the share g of the commanded
+change c of the rate is fitted to the gyro samples, z = b + g c. The commands must have moved the body enough
+to determine g, g must be 1, and the residuals must be white. A body that is not driven proves nothing. More
+gyro noise than assumed raises the scale of the departures and not an alarm.
 """
 
 from __future__ import annotations
@@ -19,83 +20,81 @@ from collections import deque
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import FilterState
 from knightcube.gnc.estimation.measurements import RateMeasurement
-from knightcube.gnc.estimation.replay import Checkpoint, Model
-from knightcube.gnc.estimation.state import State
+from knightcube.gnc.estimation.replay import Checkpoint, PropagationModel
 
-_SURPRISE = {1: 5.5, 4: 5.5, 16: 7.5}
-"""By the number of samples in a row, the standard deviations of their mean departure that begin a doubt.
+_DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
+"""Largest mean departure, in its standard deviations, by the number of consecutive samples that are averaged.
 
 Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
-more samples the model's errors add up.
+more samples the errors of the model add up.
 """
 _BEFORE_NS = 500_000_000
-"""The currents are unknown from this long before the first sample of a departure.
+"""Time (ns) before the first sample of a departure from which the currents are unknown.
 
-What a weak fault did to the other states before it showed is undone.
+The effects of a weak fault on the other states before its detection are undone.
 """
-_MOST = 3.0
-"""Of the largest change: a reversed coil departs by two, and a sample's age is uncertain."""
+_MAXIMUM_CHANGE = 3.0
+"""Largest explained departure, as a multiple of the largest change of the rate by the coils: a reversed coil
+departs by two, and the age of a sample is uncertain."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
-"""s between samples, over which currents may have acted: a longer silence would explain any departure."""
+"""Bounds of the time (s) between samples over which currents may have acted: a longer gap would explain any
+departure."""
 _PROOF = 1.0
-"""s: the samples of this time prove the commands again."""
-_KNOWN_SHARE = 0.2
-"""Standard deviation of the fitted share below which the share proves something."""
+"""Duration (s) of the samples that confirm the commands again."""
+_SHARE_SIGMA = 0.2
+"""Largest standard deviation of the fitted share that proves something."""
 _WHITE = 0.5
-"""Least half mean square of the residuals' differences over their mean square: one for white noise (von
-Neumann 1941), near zero for a drift."""
+"""Least ratio of half the mean square of successive differences of the residuals to their mean square: one
+for white noise (von Neumann 1941), near zero for a drift."""
 _SCALE_OVER = 64.0
-"""Samples over which the scale of the departures is averaged."""
+"""Number of samples over which the scale of the departures is averaged."""
 _SHARE_ERROR = 0.15
-"""Error of the share that the model's own error of the coils' gain explains."""
+"""Error of the share that the error of the modelled coil gain explains."""
 
 
-class CommandDoubt:
-    """Judges the commands by the gyro's samples.
+class CommandCheck:
+    """Compares the gyro samples with the commands.
 
     Attributes:
-        active: whether the commanded currents may not flow.
-        ended_ns: when they were trusted again last.
+        active: whether the coils may carry other currents than commanded.
+        ended_ns: time at which the commands were last trusted again.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: PropagationModel) -> None:
         self.active = False
         self.ended_ns = 0
         self._model = model
         self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
-        self._departures: deque[tuple[int, list[float]]] = deque(maxlen=max(_SURPRISE))
+        self._departures: deque[tuple[int, list[float]]] = deque(maxlen=max(_DEPARTURES))
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._natural: FloatArray = np.zeros(1)
         self._commanded: FloatArray = np.zeros(1)
 
     def judge(self, newest: Checkpoint) -> int | None:
-        """Judge by the newest checkpoint, if it is of a rate and the body has coils.
+        """Return the time from which on the currents are unknown if the newest checkpoint raises the alarm.
 
-        Returns the time from which on the currents are unknown when a doubt begins, else None.
+        Otherwise, and for a checkpoint of another measurement than a rate, return None.
         """
         rate = newest.measurement
         if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
             return None
         if self.active:
-            self._weigh(newest.state, rate)
+            self._test_recovery(newest.state, rate)
             return None
-        return self._compare(newest)
-
-    def _compare(self, newest: Checkpoint) -> int | None:
-        """Test the departures from the model."""
-        assert newest.variance is not None  # only the first checkpoint has none, and it is not judged
+        assert newest.variance is not None  # only the first checkpoint, which is not judged, has none
         spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
         departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
-        most = _SURPRISE[1] * self._scale
-        if not all(abs(value) <= most for value in departure) and not self._explains(newest):
+        largest = _DEPARTURES[1] * self._scale
+        if not all(abs(value) <= largest for value in departure) and not self._explains(newest):
             return None
         self._departures.append((newest.time_ns, [value / self._scale for value in departure]))
-        size = min(sum(value * value for value in departure) / len(departure), _SURPRISE[1] ** 2)
+        size = min(sum(value * value for value in departure) / len(departure), _DEPARTURES[1] ** 2)
         self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
         recent = [value for _, value in reversed(self._departures)]
-        for count, limit in _SURPRISE.items():
+        for count, limit in _DEPARTURES.items():
             sums = map(sum, zip(*recent[:count], strict=True))
             if count <= len(recent) and any(abs(total) > limit * math.sqrt(count) for total in sums):
                 since_ns = self._departures[-count][0] - _BEFORE_NS
@@ -105,15 +104,19 @@ class CommandDoubt:
         return None
 
     def _explains(self, newest: Checkpoint) -> bool:
-        """Return whether coil currents can have caused a departure, beside the noise."""
+        """Return whether coil currents together with the noise can have caused a departure."""
         assert newest.variance is not None
         gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
-        most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
-        noise = _SURPRISE[1] * self._scale * np.sqrt(newest.variance.diagonal())
-        return bool((np.abs(newest.innovation) <= noise + _MOST * most).all())
+        # The largest change of the rate, rad/s, by unknown currents.
+        state, model, duration = newest.state, self._model, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP)
+        idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
+        change = model.noise.unknown_current * np.abs(idle.by_current).sum(axis=1) * duration
+        most = np.asarray(change[self._axes])
+        noise = _DEPARTURES[1] * self._scale * np.sqrt(newest.variance.diagonal())
+        return bool((np.abs(newest.innovation) <= noise + _MAXIMUM_CHANGE * most).all())
 
-    def _weigh(self, state: State, rate: RateMeasurement) -> None:
-        """Note a sample, and end the doubt when the rate follows the commands."""
+    def _test_recovery(self, state: FilterState, rate: RateMeasurement) -> None:
+        """Record a sample, and trust the commands again if the rate follows them."""
         before_ns = self._samples[-1][0] if self._samples else rate.time_ns
         commanded, natural = self._changes(state, before_ns, rate.time_ns)
         self._natural = self._natural + natural
@@ -127,12 +130,15 @@ class CommandDoubt:
                 return
 
     def _follows(self, variance: FloatArray) -> bool:
-        """Return whether the noted rates are b + c, with c the commanded changes; set the noise's scale."""
+        """Return whether the recorded rates are b + c, c the commanded changes.
+
+        Set the scale of the noise.
+        """
         _, rates, commanded = zip(*self._samples, strict=True)
         weight = 1.0 / np.sqrt(variance)
         z, c = ((np.array(values) - np.mean(values, axis=0)) * weight for values in (rates, commanded))
         information = float((c * c).sum())
-        if information * _KNOWN_SHARE**2 < 1.0:
+        if information * _SHARE_SIGMA**2 < 1.0:
             return False
         share = float((c * z).sum()) / information
         residual = z - share * c
@@ -148,15 +154,8 @@ class CommandDoubt:
         self._samples.clear()
         self._natural = self._commanded = np.zeros(1)
 
-    def _most_change(self, state: State, duration: float) -> FloatArray:
-        """Return the largest change of the rate, rad/s, that unknown currents can cause in `duration` s."""
-        model = self._model
-        idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
-        change = model.noise.unknown_current * np.abs(idle.by_current).sum(axis=1) * duration
-        return np.asarray(change[self._axes])
-
-    def _changes(self, state: State, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Return the model's change of the rate, rad/s, by the coils as commanded and by all else."""
+    def _changes(self, state: FilterState, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the modelled change of the rate, rad/s, by the commanded coils and by all other causes."""
         commanded, natural = np.zeros(3), np.zeros(3)
         for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
             found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
@@ -165,8 +164,8 @@ class CommandDoubt:
             natural += span_ns * 1e-9 * (np.array(found.acceleration) + state.disturbance - by_coils)
         return commanded[self._axes], natural[self._axes]
 
-    def _variance(self, state: State, rate: RateMeasurement) -> FloatArray:
-        """Return the variance of a sample, with that of the coils' noise in the middle of a proof."""
+    def _variance(self, state: FilterState, rate: RateMeasurement) -> FloatArray:
+        """Return the variance of a sample, including that of the coils' noise after half of `_PROOF`."""
         model = self._model
         idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
         by_coils = 0.5 * _PROOF * model.noise.current * (idle.by_current**2).sum(axis=1)
