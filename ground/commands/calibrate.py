@@ -13,10 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ground.calibration.calibration import PARAMETERS
-from ground.calibration.lens_fit import MatchedFrame
-from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
-from ground.calibration.terms import FixedTerms, LeftOut
+from ground.calibration import (
+    MIN_STARS,
+    PARAMETERS,
+    DeterminedLens,
+    MatchedFrame,
+    OmittedTerm,
+    calibrate_one_lens,
+    parameters_of,
+)
 from ground.commands.options import check_size, positive, write_new
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
@@ -30,154 +35,134 @@ from knightcube.vision.startracker.lost_in_space import IdentificationSettings
 from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 _ROUNDS = 3
-_LEAST_SIGMA_PX = 0.02
-# A lens is not fitted to pictures that show the sky as a mirror does.
+_MIN_SIGMA_PX = 0.02
+"""Smallest standard deviation of a star's position (px), for the errors that its covariance lacks."""
+# A lens is not fitted to mirrored pictures.
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
-    """A picture, its solution, and why it was left out; empty if it was not."""
+class SkyPicture:
+    """A picture, its solution, and the reason to exclude it, which may be empty."""
 
     path: Path
-    pixels: Image
     solution: FrameSolution
-    left_out: str = ""
-
-    @property
-    def used(self) -> bool:
-        """Whether the lens rests on it."""
-        return self.solution.fix is not None and not self.left_out
+    excluded: str = ""
 
     @property
     def reason(self) -> str:
-        """Why the lens does not rest on it."""
-        return self.left_out or self.solution.reason
+        """Reason why the picture is not used, empty if it is used."""
+        return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Calibrate a camera from pictures of the night sky: focal length, optical axis, radial distortion, "
-        "with their errors. All pictures must be of one camera at one focus; those that do not fit are left "
-        "out and named. Ten that put stars into the corners are worth more than a hundred that do not. "
-        "A term that the stars do not fix is left out of the lens and named. The camera file says how well "
-        f"the lens is known (`accuracy`); fewer than {LEAST_STARS} stars make none."
+        "Calibrate a camera from pictures of the night sky: focal length, optical axis and radial "
+        "distortion, with their errors. All pictures must be of one camera at one focus; pictures that do "
+        "not fit are excluded and named. Ten pictures with stars in the corners are worth more than a "
+        "hundred without. A term that the stars do not determine is left out of the lens and named. The camera file states the "
+        f"accuracy of the lens (`accuracy`); it needs at least {MIN_STARS} stars."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
     parser.add_argument("--fov", type=positive, metavar="DEG", help="rough field of view across the columns")
-    parser.add_argument("--out", type=Path, metavar="YAML", help="write the camera for --camera here")
+    parser.add_argument("--out", type=Path, metavar="YAML", help="write the camera for --camera to this file")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Solve, fit, print, write; exit status 1 when no picture is solved or too few stars for a camera."""
+    """Calibrate, print and write the camera; exit status 1 if no picture is solved or stars are too few."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
-    shape = frames[0][1].shape
-    sky = default_index()
-    pictures, selected = _calibrated(frames, *camera_of_field(options.fov, None, shape), sky)
-    if selected is None:
+    camera = camera_of_field(options.fov, None, frames[0][1].shape)
+    pictures, lens = _calibrated(frames, *camera, default_index())
+    if lens is None:
         for picture in pictures:
             sys.stderr.write(f"{picture.path}: {picture.reason}\n")
         return 1
-    facts = _facts(selected.terms, pictures)
-    text = json.dumps(facts, allow_nan=False) + "\n" if options.json else _text(selected.terms, pictures)
-    sys.stdout.write(text)
+    if options.json:
+        sys.stdout.write(json.dumps(_facts(lens, pictures), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(lens, pictures))
     if options.out is None:
         return 0
-    if problem := _problem(selected):
+    problem, stars = "", lens.calibration.stars
+    if stars < MIN_STARS:
+        problem = f"{stars} stars are too few for a camera, {MIN_STARS} are needed: give more pictures"
+    elif "focal_length" in lens.calibration.undetermined:
+        problem = "the stars do not determine the focal length: give more pictures"
+    if problem:
         sys.stderr.write(f"{options.out}: not written: {problem}\n")
         return 1
-    _write(options.out, selected.terms)
+    write_new(options.out, _camera_section(lens))
     if not options.json:
         sys.stdout.write(f"\nwritten: {options.out}, for --camera of `flight solve` and `flight rate`\n")
     return 0
 
 
-def _calibrated(
-    frames: Sequence[tuple[Path, Image]], camera: CameraModel, scale: tuple[float, float], sky: SkyIndex
-) -> tuple[list[Picture], Selected | None]:
-    """Return the pictures, each with its solution or why it was left out, and the lens; None without one."""
-    model, selected, pictures = camera, None, []
-    for round_number in range(_ROUNDS):
-        # The better the lens, the more stars in the corners match.
-        pictures = _solve(frames, model, scale, sky, round_number)
-        solved = [number for number, picture in enumerate(pictures) if picture.solution.fix is not None]
-        if not solved:
-            return pictures, None
-        solutions = [pictures[number].solution for number in solved]
-        focal_lengths = np.array([solution.camera.focal_length for solution in solutions])
-        sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
-        middle = int(np.argsort(focal_lengths)[len(solved) // 2])
-        begun = solutions[middle].camera if selected is None else model
-        selected = calibrate_one_lens(
-            [_matches(solution, sky) for solution in solutions], begun, focal_lengths, sigmas
-        )
-        for number, reason in selected.left_out.items():
-            pictures[solved[number]] = replace(pictures[solved[number]], left_out=reason)
-        model, scale = selected.calibration.lens, (0.999, 1.001)
-    return pictures, selected
-
-
 def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
+    """Return the pictures, which must be of one size."""
     frames = [(path, read_image(path)) for path in paths]
     first = frames[0]
     for path, pixels in frames:
         check_size(path, pixels)
         if pixels.shape != first[1].shape:
             sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (pixels, first[1])]
-            raise UsageError(f"{path}: {sizes[0]} pixels, but {first[0]} has {sizes[1]}: give one camera's")
+            raise UsageError(
+                f"{path}: {sizes[0]} pixels, but {first[0]} has {sizes[1]}: give pictures of one camera"
+            )
     return frames
 
 
-def _solve(
-    frames: Sequence[tuple[Path, Image]],
-    camera: CameraModel,
-    scale: tuple[float, float],
-    sky: SkyIndex,
-    round_number: int,
-) -> list[Picture]:
-    pictures = []
-    for number, (path, pixels) in enumerate(frames, start=1):
-        if sys.stderr.isatty():
-            sys.stderr.write(f"\rround {round_number + 1} of {_ROUNDS}: picture {number} of {len(frames)} ")
-            sys.stderr.flush()
-        pictures.append(Picture(path, pixels, solve_frame(pixels, camera, scale, 1.0, sky, _SETTINGS)))
-    if sys.stderr.isatty():
-        sys.stderr.write("\n")
-    return pictures
+def _calibrated(
+    frames: Sequence[tuple[Path, Image]], camera: CameraModel, scale: tuple[float, float], sky: SkyIndex
+) -> tuple[list[SkyPicture], DeterminedLens | None]:
+    """Return the pictures with their solutions and the lens, which is None if no picture is solved."""
+    model, lens, pictures = camera, None, []
+    for round_number in range(_ROUNDS):
+        # The better the lens, the more stars in the corners match.
+        pictures = []
+        for number, (path, pixels) in enumerate(frames, start=1):
+            if sys.stderr.isatty():
+                end = "\n" if number == len(frames) else ""
+                counts = f"round {round_number + 1} of {_ROUNDS}: picture {number} of {len(frames)}"
+                sys.stderr.write(f"\r{counts} {end}")
+                sys.stderr.flush()
+            pictures.append(SkyPicture(path, solve_frame(pixels, model, scale, 1.0, sky, _SETTINGS)))
+        solved = [number for number, picture in enumerate(pictures) if picture.solution.fix is not None]
+        if not solved:
+            return pictures, None
+        solutions = [pictures[number].solution for number in solved]
+        focal_lengths = np.array([solution.camera.focal_length for solution in solutions])
+        sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
+        median = int(np.argsort(focal_lengths)[len(solved) // 2])
+        begun = solutions[median].camera if lens is None else model
+        matches = [_matches(solution, sky) for solution in solutions]
+        lens, excluded = calibrate_one_lens(matches, begun, focal_lengths, sigmas)
+        for number, reason in excluded.items():
+            pictures[solved[number]] = replace(pictures[solved[number]], excluded=reason)
+        model, scale = lens.calibration.lens, (0.999, 1.001)
+    return pictures, lens
 
 
 def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
     matched = solution.matched
-    variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _LEAST_SIGMA_PX**2
-    return MatchedFrame(
-        solution.points[matched], np.sqrt(variance), sky.stars.direction[solution.star[matched]]
-    )
+    variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _MIN_SIGMA_PX**2
+    directions = sky.stars.direction[solution.star[matched]]
+    return MatchedFrame(solution.points[matched], np.sqrt(variance), directions)
 
 
-def _problem(selected: Selected) -> str:
-    """Return why the lens is none to write down, empty where it is one."""
-    if selected.stars < LEAST_STARS:
-        few = f"{selected.stars} stars are too few for a camera, {LEAST_STARS} are needed"
-        return f"{few}: give more pictures"
-    if "focal_length" in selected.calibration.undetermined:
-        return "the stars do not fix the focal length: give more pictures"
-    return ""
-
-
-def _facts(terms: FixedTerms, pictures: Sequence[Picture]) -> dict[str, Any]:
-    found = terms.calibration
+def _facts(lens: DeterminedLens, pictures: Sequence[SkyPicture]) -> dict[str, Any]:
+    found = lens.calibration
     return {
         **found.lens.to_mapping(),
         "sigma": found.sigma,
         "undetermined": list(found.undetermined),
-        "terms_left_out": {name: asdict(gone) for name, gone in terms.left_out.items()},
-        "accuracy": terms.accuracy,
+        "terms_left_out": {name: asdict(term) for name, term in lens.omitted.items()},
+        "accuracy": lens.accuracy,
         "rms_px_before": found.rms_before,
         "rms_px_after": found.rms_after,
         "chi_square": found.chi_square,
@@ -195,75 +180,77 @@ def _facts(terms: FixedTerms, pictures: Sequence[Picture]) -> dict[str, Any]:
     }
 
 
-def _text(terms: FixedTerms, pictures: Sequence[Picture]) -> str:
-    found = terms.calibration
-    lens, sigma = found.lens, found.sigma
-    solved = [picture for picture in pictures if picture.used]
-    stars = sum(len(picture.solution.matched) for picture in solved)
-    values = dict(zip(PARAMETERS, (lens.focal_length, *lens.centre, lens.k1, lens.k2), strict=True))
+def _text(lens: DeterminedLens, pictures: Sequence[SkyPicture]) -> str:
+    found = lens.calibration
+    used = [picture for picture in pictures if not picture.reason]
+    stars = sum(len(picture.solution.matched) for picture in used)
     lines = [
-        f"{picture.path}: {'left out' if picture.left_out else 'not solved'}: {picture.reason}"
+        f"{picture.path}: {'excluded' if picture.excluded else 'not solved'}: {picture.reason}"
         for picture in pictures
-        if not picture.used
+        if picture.reason
     ]
-    lines.append(f"pictures:     {len(solved)} of {len(pictures)} used, {stars} stars")
-    for name, value in values.items():
+    lines.append(f"pictures:     {len(used)} of {len(pictures)} used, {stars} stars")
+    for name, value in zip(PARAMETERS, parameters_of(found.lens), strict=True):
         digits = 5 if name in ("k1", "k2") else 2
-        if name.partition("_")[0] not in terms.left_out:
-            lines.append(f"{name + ':':13s} {value:.{digits}f} +- {sigma[name]:.{digits}f}")
-    lines += [_left_out(name, gone) for name, gone in terms.left_out.items()]
-    fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
-    lines.append(f"field:        {fov:.4f} deg across, without the distortion")
-    lines.append(f"accuracy:     {_accuracy(terms)}")
-    lines.append(
-        f"residual:     {found.rms_before:.3f} px rms without these terms, {found.rms_after:.3f} with"
+        if name.partition("_")[0] not in lens.omitted:
+            lines.append(f"{name + ':':13s} {value:.{digits}f} +- {found.sigma[name]:.{digits}f}")
+    lines += [_omitted(name, term) for name, term in lens.omitted.items()]
+    accuracy = [
+        f"{label} {lens.accuracy[key] * scale:.{digits}f} {unit}"
+        if key in lens.accuracy
+        else f"{label} not determined"
+        for key, label, scale, digits, unit in (
+            ("focal_length", "focal length", 1e2, 4, "%"),
+            ("centre", "centre", 1.0, 2, "px"),
+            ("distortion", "distortion at a corner", 1e2, 4, "%"),
+        )
+    ]
+    before, after = found.rms_before, found.rms_after
+    return "\n".join(
+        [
+            *lines,
+            f"field:        {_field_of_view(lens):.4f} deg across the columns, without the distortion",
+            f"accuracy:     {', '.join(accuracy)}",
+            f"residual:     {before:.3f} px rms with the assumed lens, {after:.3f} with the calibrated one",
+            f"chi-square:   {found.chi_square:.0f} for {found.degrees} degrees of freedom,"
+            f" {found.rejected_count} matches rejected\n",
+        ]
     )
-    lines.append(
-        f"chi-square:   {found.chi_square:.0f} of {found.degrees} degrees of freedom,"
-        f" {found.rejected_count} matches not believed"
-    )
-    return "\n".join(lines) + "\n"
 
 
-def _left_out(name: str, gone: LeftOut) -> str:
+def _omitted(name: str, term: OmittedTerm) -> str:
     digits = 2 if name == "centre" else 5
     fitted = ", ".join(
         f"{value:.{digits}f} +- {sigma:.{digits}f}"
-        for value, sigma in zip(gone.values, gone.sigmas, strict=True)
+        for value, sigma in zip(term.values, term.sigmas, strict=True)
     )
-    assumed = "the middle of the picture" if name == "centre" else "none"
+    assumed = "the image centre" if name == "centre" else "zero"
     return f"{name + ':':13s} left out, not determined by the stars ({fitted}): {assumed} is assumed"
 
 
-def _accuracy(terms: FixedTerms) -> str:
-    places = {"focal_length": ("focal length", 1e2, 4, " %"), "centre": ("centre", 1.0, 2, " px")}
-    places["distortion"] = ("distortion at a corner", 1e2, 4, " %")
-    return ", ".join(
-        f"{label} {terms.accuracy[key] * scale:.{digits}f}{unit}"
-        if key in terms.accuracy
-        else f"{label} not known"
-        for key, (label, scale, digits, unit) in places.items()
-    )
+def _field_of_view(lens: DeterminedLens) -> float:
+    """Return the field of view across the columns without the distortion, deg."""
+    found = lens.calibration.lens
+    return 2.0 * math.degrees(math.atan(0.5 * found.columns / found.focal_length))
 
 
-def _write(path: Path, terms: FixedTerms) -> None:
-    """Write the camera as a section that `--camera` reads and a configuration may take over."""
-    lens, gone = terms.calibration.lens, terms.left_out
-    fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
-    assumed = "      # the middle: the stars do not fix it" if "centre" in gone else ""
+def _camera_section(terms: DeterminedLens) -> str:
+    """Return the section `camera`, which `--camera` and configurations read."""
+    lens, omitted = terms.calibration.lens, terms.omitted
+    assumed = "      # the image centre: the stars do not determine it" if "centre" in omitted else ""
     lines = [
         "# Made by `python -m flight calibrate`.",
         "camera:",
         f"  columns: {lens.columns}",
         f"  rows: {lens.rows}",
-        f"  field_of_view_deg: {fov:.6f}",
+        f"  field_of_view_deg: {_field_of_view(terms):.6f}",
         "  lens:                       # px; the pixel (x, y) on the axis; radial distortion of tangents",
         f"    focal_length: {lens.focal_length:.4f}",
         f"    centre: [{lens.centre[0]:.4f}, {lens.centre[1]:.4f}]{assumed}",
-        *(f"    {name}: {getattr(lens, name):.8f}" for name in ("k1", "k2") if name not in gone),
-        "  accuracy:                   # standard deviations: shares of themselves, px for the centre",
+        *(f"    {name}: {getattr(lens, name):.8f}" for name in ("k1", "k2") if name not in omitted),
+        "  accuracy:                   # standard deviations: relative, and px for the centre",
         *(f"    {name}: {value:.3g}" for name, value in terms.accuracy.items()),
     ]
-    if gone:
-        lines.append(f"  # The stars do not fix {', '.join(gone)}: left out.")
-    write_new(path, "\n".join(lines) + "\n")
+    if omitted:
+        lines.append(f"  # The stars do not determine {', '.join(omitted)}: left out.")
+    return "\n".join(lines) + "\n"

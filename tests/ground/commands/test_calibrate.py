@@ -48,7 +48,7 @@ def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path]
     assert "left out, not determined by the stars" in line
     text = out.read_text()
     assert "k2:" not in text
-    assert "# The stars do not fix k2" in text
+    assert "# The stars do not determine k2" in text
     assert load_camera(out).lens.k2 == 0.0  # type: ignore[union-attr]  # it has just been written
 
 

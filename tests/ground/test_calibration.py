@@ -1,13 +1,29 @@
-"""The calibration of a lens: against lenses that were drawn, and against what the data cannot tell."""
+"""The calibration of a lens: drawn lenses are found, and undetermined terms are named and left out."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ground.calibration.calibration import PARAMETERS, Calibration, LensPrior, calibrate
-from ground.calibration.lens_fit import CalibrationError, Fit, MatchedFrame, parameters_of, residuals, step
+from ground.calibration import (
+    PARAMETERS,
+    Calibration,
+    CalibrationError,
+    DeterminedLens,
+    LensFit,
+    LensPrior,
+    MatchedFrame,
+    calibrate,
+    calibrate_determined,
+    lens_accuracy,
+    parameters_of,
+    residuals,
+    step,
+)
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
 from knightcube.vision.camera.lens import Lens, Pinhole
@@ -171,10 +187,10 @@ def test_the_derivatives_are_those_of_the_projection() -> None:
     for scale in (1e-3, 1e-4):
         start = exact + scale * np.array([100.0, 50.0, -50.0, 0.3, 0.3])
         turned = normalise(attitudes + scale * 0.1 * rng.normal(size=attitudes.shape))
-        after = step(frames, Fit(start, turned), [np.ones(20)] * 2, none, none).fit
+        after = step(frames, LensFit(start, turned), [np.ones(20)] * 2, none, none).fit
         left = np.abs(after.parameters - exact) / np.array([100.0, 50.0, 50.0, 0.3, 0.3])
         assert np.max(left) < 20.0 * scale**2
-        assert np.max(np.abs(residuals(frames[0], Fit(exact, attitudes), 0))) < 6.0
+        assert np.max(np.abs(residuals(frames[0], LensFit(exact, attitudes), 0))) < 6.0
 
 
 def test_frames_that_are_none_are_refused() -> None:
@@ -194,7 +210,7 @@ def test_frames_that_are_none_are_refused() -> None:
     with pytest.raises(CalibrationError, match="must be positive"):
         calibrate([good], _begun(), LensPrior(centre=0.0))
     few = MatchedFrame(points[:3], sigma[:3], directions[:3])
-    with pytest.raises(CalibrationError, match=r"give a prior|nothing to judge"):
+    with pytest.raises(CalibrationError, match=r"give a prior|too few to check"):
         calibrate([few], _begun(), _OPEN)
 
 
@@ -215,3 +231,84 @@ def test_each_sigma_has_its_parameters_name() -> None:
     found = calibrate(_frames(rng, _lens(rng, _begun()), 4, 20)[0], _begun())
     assert tuple(found.sigma) == PARAMETERS
     assert found.sigma["k2"] == pytest.approx(np.sqrt(found.covariance[4, 4]))
+
+
+def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, float]:
+    """Return the error of each key of `camera.accuracy`, as the schema describes it."""
+    lens = found.calibration.lens
+    square = (math.hypot(*begun.centre) / lens.focal_length) ** 2
+    corner = [
+        one.focal_length / lens.focal_length * (1.0 + square * (one.k1 + square * one.k2))
+        for one in (lens, truth)
+    ]
+    off: FloatArray = np.array(lens.centre) - truth.centre
+    return {
+        "focal_length": lens.focal_length / truth.focal_length - 1.0,
+        "centre": float(np.linalg.norm(off) / math.sqrt(2.0)),
+        "distortion": corner[0] - corner[1],
+    }
+
+
+@pytest.mark.parametrize(("field_deg", "count", "stars"), [(20.0, 1, 40), (12.0, 1, 15), (20.0, 3, 20)])
+def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: int, stars: int) -> None:
+    """Terms that were left out count: what they would have changed is part of the error claimed."""
+    rng, begun = np.random.default_rng(61), _begun(field_deg)
+    ratios: dict[str, list[float]] = {"focal_length": [], "centre": [], "distortion": []}
+    for _ in range(12):
+        truth = _lens(rng, begun)
+        found = calibrate_determined(_frames(rng, truth, count, stars)[0], begun)
+        errors = _errors(found, truth, begun)
+        for name, sigma in found.accuracy.items():
+            ratios[name].append(errors[name] / sigma)
+    for name, values in ratios.items():
+        assert len(values) >= 8, name
+        assert 0.3 < np.sqrt(np.mean(np.square(values))) < 1.9, name
+
+
+def test_a_term_that_the_stars_do_not_fix_is_none_of_the_lens_whatever_the_fit_makes_of_it() -> None:
+    """The case of the field: a narrow picture whose k2 comes out at half its prior, and means nothing."""
+    rng, begun = np.random.default_rng(62), _begun(6.0)
+    for _ in range(5):
+        truth = _lens(rng, begun)
+        found = calibrate_determined(_frames(rng, truth, 2, 20)[0], begun)
+        gone = found.omitted["k2"]
+        assert found.calibration.lens.k2 == pytest.approx(0.0, abs=1e-6)
+        assert gone.sigmas[0] > 1.0
+        for name, left in found.omitted.items():
+            assert name == "centre" or left.sigmas[0] > min(0.5, abs(left.values[0])), name
+        assert "centre" not in found.accuracy or "centre" not in found.omitted
+
+
+def test_terms_that_the_stars_fix_all_stay() -> None:
+    rng, begun = np.random.default_rng(63), _begun(40.0)
+    truth = Lens(1024, 1024, 1.01 * begun.focal_length, (520.0, 505.0), -0.2, 0.08)
+    found = calibrate_determined(_frames(rng, truth, 6, 40)[0], begun)
+    assert found.omitted == {}
+    assert found.calibration.lens.k2 == pytest.approx(0.08, abs=0.01)
+    assert set(found.accuracy) == {"focal_length", "centre", "distortion"}
+
+
+def test_a_lens_without_distortion_is_given_none_and_the_axis_of_one_narrow_frame_is_the_middle() -> None:
+    rng, begun = np.random.default_rng(64), _begun(3.0)
+    found = calibrate_determined(_frames(rng, Lens.of(begun), 1, 15, noise=0.3)[0], begun)
+    assert set(found.omitted) == {"k1", "k2", "centre"}
+    lens = found.calibration.lens
+    assert (*lens.centre, lens.k1, lens.k2) == pytest.approx((511.5, 511.5, 0.0, 0.0), abs=2e-3)
+    assert "centre" not in found.accuracy, "nobody knows more of the axis than before"
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.45, True), (0.55, False)])
+def test_the_distortion_is_stated_if_the_stars_halve_what_the_prior_leaves_open(
+    share: float, known: bool
+) -> None:
+    """The displacement of a corner by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
+    lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
+    corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)
+    covariance = np.diag([0.0, 4.0, 4.0, (share * corner / 0.25) ** 2, 0.0])
+    whole = Calibration(lens, covariance, (), np.zeros((1, 4)), (np.ones(9, bool),), 1.0, 1, 0.2, 0.1)
+    accuracy = lens_accuracy(whole, whole, {})
+    assert accuracy["focal_length"] == 0.0
+    assert accuracy["centre"] == pytest.approx(2.0)
+    assert accuracy.get("distortion") == (pytest.approx(share * corner) if known else None)
+    shorter = replace(whole, lens=replace(lens, focal_length=lens.focal_length / 1.01))
+    assert lens_accuracy(whole, shorter, {})["focal_length"] == pytest.approx(0.01), "of the omitted terms"

@@ -1,1 +1,0 @@
-"""A camera's lens from solved frames."""
