@@ -61,8 +61,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Calibrate a camera from pictures of the night sky: focal length, optical axis and radial "
         "distortion, with their errors. All pictures must be of one camera at one focus; pictures that do "
         "not fit are excluded and named. Ten pictures with stars in the corners are worth more than a "
-        "hundred without. A term that the stars do not determine is left out of the lens and named. The camera file states the "
-        f"accuracy of the lens (`accuracy`); it needs at least {MIN_STARS} stars."
+        "hundred without. A term that the stars do not determine is left out of the lens and named. The "
+        f"camera file states the accuracy of the lens (`accuracy`); it needs at least {MIN_STARS} stars."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -121,7 +121,8 @@ def _calibrated(
     frames: Sequence[tuple[Path, Image]], camera: CameraModel, scale: tuple[float, float], sky: SkyIndex
 ) -> tuple[list[SkyPicture], DeterminedLens | None]:
     """Return the pictures with their solutions and the lens, which is None if no picture is solved."""
-    model, lens, pictures = camera, None, []
+    model, lens = camera, None
+    pictures: list[SkyPicture] = []
     for round_number in range(_ROUNDS):
         # The better the lens, the more stars in the corners match.
         pictures = []

@@ -1,4 +1,4 @@
-"""`flight identify`: the body's constants from a short flight, as a piece of configuration."""
+"""`flight identify`: constants of the body from a short flight, as a section of the configuration."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, write_new
-from ground.identification.constants import NAMES, UNITS, Constants
-from ground.identification.fit import PlantFit, fit
-from ground.identification.fragment import fragment
-from ground.identification.preparation import (
+from ground.identification.fit import NAMES, UNITS, PlantFit, fit
+from ground.identification.record import Record, read_record
+from ground.identification.scale import (
     DURATION,
-    beliefs_of,
-    believed_constants,
+    AbsolutePlant,
+    absolute,
     config_text,
+    configured_constants,
     excitation_config,
     noise_of,
+    plant_text,
+    prior_of,
 )
-from ground.identification.record import Record, read_record
-from ground.identification.scale import AbsolutePlant, absolute
 from ground.telemetry import read_run
 from knightcube.errors import UsageError
 
@@ -44,7 +44,7 @@ _ABSOLUTE_UNITS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Identified:
-    """All that came out, and where it came from."""
+    """Results of an identification and their origin."""
 
     folder: Path
     config: TestbedConfig
@@ -54,17 +54,18 @@ class _Identified:
 
     @property
     def fragment(self) -> str:
-        return fragment(self.plant, self.config.plant.coil_turns, str(self.folder))
+        """Section `plant` of the configuration."""
+        return plant_text(self.plant, self.config.plant.coil_turns, str(self.folder))
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Identify torque constant, thread stiffness and damping from a short flight: pulses of the coil on x "
-        "and free swings, on the testbed or simulated, by the same loop as any flight. Or from the folder of "
-        "an earlier flight. Motion shows the ratios to the inertia only; the scale comes from the "
-        "configuration (its `identification` section gives the errors of inertia, dipole and field) and "
-        "from the magnetometer; the result states the share of each. The coils end at zero."
+        "Identify torque constant, thread stiffness and damping from a short flight with pulses of the "
+        "coil on x and free swings, on the testbed or simulated, or from the folder of an earlier flight. "
+        "The motion determines the ratios to the inertia only. The scale comes from the configuration, "
+        "whose section `identification` gives the errors of inertia, dipole and field, and from the "
+        "magnetometer; the result states the contribution of each. The coils are off at the end."
     )
     parser.epilog = (
         "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
@@ -73,16 +74,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "source",
         type=config_path,
         metavar="CONFIG",
-        help="YAML file, carried name such as testbed, or the folder of a run",
+        help="YAML file, installed name such as testbed, or the folder of a run",
     )
-    parser.add_argument("--out", type=Path, metavar="YAML", help="write the `plant` section here")
+    parser.add_argument("--out", type=Path, metavar="YAML", help="write the section `plant` to this file")
     parser.add_argument(
         "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"
     )
     parser.add_argument(
-        "--duration", type=positive, metavar="S", help=f"seconds to fly (default {DURATION:g})"
+        "--duration", type=positive, metavar="S", help=f"duration of the flight, s (default {DURATION:g})"
     )
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="another seed of the simulation")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )
@@ -92,10 +93,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly unless that is done, fit, print, write."""
+    """Fly unless a run is given, fit, print and write."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
-    folder = _flown(options) if options.source.is_dir() else _fly(options)
+    folder = Path(options.source)
+    if folder.is_dir():
+        for name in ("run", "duration", "seed", "realtime"):
+            if getattr(options, name):
+                raise UsageError(
+                    f"--{name}: {options.source} is the folder of a flight, give a configuration"
+                )
+    else:
+        folder = _fly(options)
     made = _identify(folder)
     if options.out is not None:
         write_new(options.out, made.fragment)
@@ -113,17 +122,9 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _flown(options: argparse.Namespace) -> Path:
-    """Return the folder of a flight that is done; what asks for another one is refused."""
-    for name in ("run", "duration", "seed", "realtime"):
-        if getattr(options, name):
-            raise UsageError(f"--{name}: {options.source} is a flight that is flown already")
-    return Path(options.source)
-
-
 def _fly(options: argparse.Namespace) -> Path:
-    """Fly the excitation; return the folder of the run."""
-    from flight.app.flight import fly  # noqa: PLC0415 - only who flies needs devices
+    """Fly the excitation and return the folder of the run."""
+    from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
     from flight.app.run_folder import default_folder  # noqa: PLC0415
 
     config = excitation_config(configuration.load_testbed(options.source), options.duration or DURATION)
@@ -137,20 +138,21 @@ def _fly(options: argparse.Namespace) -> Path:
     if with_line:
         sys.stderr.write("\r\x1b[K")
     if result.interrupted:
-        sys.stderr.write(f"flight: {result.reason}: identified from what was flown\n")
+        sys.stderr.write(f"flight: {result.reason}: the identification uses the part that was flown\n")
     if result.log_error:
         sys.stderr.write(f"flight: {result.log_error}\n")
     return result.folder
 
 
 def _identify(folder: Path) -> _Identified:
+    """Fit the flight in a folder."""
     config = configuration.load_testbed(folder / "config.yaml")
     record = read_record(read_run(folder), config.coils.stale_after)
     with_line = sys.stderr.isatty()
     found = fit(record, noise_of(config), _show_round if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
-    return _Identified(folder, config, record, found, absolute(found, beliefs_of(config), record.field))
+    return _Identified(folder, config, record, found, absolute(found, prior_of(config), record.field))
 
 
 def _show_round(count: int, step: float) -> None:
@@ -164,9 +166,9 @@ def _facts(made: _Identified) -> dict[str, Any]:
         name: {"value": getattr(found.constants, name), "sigma": found.sigma(name), "unit": UNITS[name]}
         for name in NAMES
     }
-    rests = plant.rests_on()
+    sources = plant.sources()
     scaled = {
-        name: {**asdict(getattr(plant, name)), "unit": unit, "rests_on": rests[name]}
+        name: {**asdict(getattr(plant, name)), "unit": unit, "rests_on": sources[name]}
         for name, unit in _ABSOLUTE_UNITS.items()
     }
     return {
@@ -185,50 +187,31 @@ def _facts(made: _Identified) -> dict[str, Any]:
 
 
 def _text(made: _Identified) -> str:
-    found, plant, record = made.found, made.plant, made.record
-    before = believed_constants(made.config)
+    found, plant, record, field = made.found, made.plant, made.record, made.record.field
+    before, sources, noise = configured_constants(made.config), plant.sources(), found.noise
     lines = [
         f"flight: {made.folder}, {len(record.time)} samples in {record.time[-1] - record.time[0]:.0f} s, "
         f"{len(found.innovations.restarts)} restarts of the filter",
         "",
         "from the motion, per inertia:",
-        *(_motion_line(name, found, before) for name in NAMES),
-        "",
-        "with the scale, which motion does not show:",
     ]
-    rests = plant.rests_on()
+    for name in NAMES:
+        value = f"{getattr(found.constants, name):+12.5e} +- {found.sigma(name):.1e} {UNITS[name]}"
+        lines.append(f"  {name + ':':18s}{value}, configured {getattr(before, name):.4g}")
+    lines += ["", "with the scale, which the motion does not determine:"]
     for name, unit in _ABSOLUTE_UNITS.items():
-        known = getattr(plant, name)
-        label, size = name.replace("_", " ") + ":", f"{known.value:12.5e} +- {known.sigma:.1e} {unit}"
-        lines.append(f"  {label:18s}{size:34s} {rests[name]}")
-    lines += ["", _field_line(made), _noise_line(found)]
-    return "\n".join(lines) + "\n"
-
-
-def _motion_line(name: str, found: PlantFit, before: Constants) -> str:
-    value, sigma = getattr(found.constants, name), found.sigma(name)
-    found_text = f"{value:+12.5e} +- {sigma:.1e} {UNITS[name]}"
-    return f"  {name + ':':18s}{found_text}, configured {getattr(before, name):.4g}"
-
-
-def _field_line(made: _Identified) -> str:
-    field, known = made.record.field, made.config.identification
+        scaled = getattr(plant, name)
+        label, value = name.replace("_", " ") + ":", f"{scaled.value:12.5e} +- {scaled.sigma:.1e} {unit}"
+        lines.append(f"  {label:18s}{value:34s} {sources[name]}")
     if field is None:
-        return "field:  not measured, the coils were never off long enough: as configured"
-    return (
-        f"field:  {1e4 * field.magnitude:.4f} gauss by the magnetometer, with a scale error of "
-        f"{100.0 * known.magnetometer_error:g} %"
-    )
-
-
-def _noise_line(found: PlantFit) -> str:
-    noise, test = found.noise, found.whiteness
-    verdict = (
-        "innovations are white"
-        if test.passed
-        else "innovations are NOT white: errors widened to the scatter of the record's parts"
-    )
-    return (
+        lines += ["", "field:  not measured because the coils were never off long enough: as configured"]
+    else:
+        error = 100.0 * made.config.identification.magnetometer_error
+        measured = f"{1e4 * field.magnitude:.4f} gauss from the magnetometer"
+        lines += ["", f"field:  {measured}, with a scale error of {error:g} %"]
+    verdict = "are white" if found.whiteness.passed else "are NOT white: the errors are increased accordingly"
+    lines.append(
         f"noise:  current {1e3 * noise.current:.2f} mA, angle {1e3 * noise.angle:.2f} mrad, "
-        f"rate {1e6 * noise.rate:.0f} urad/s; {verdict}"
+        f"rate {1e6 * noise.rate:.0f} urad/s; the innovations {verdict}"
     )
+    return "\n".join(lines) + "\n"

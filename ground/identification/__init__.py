@@ -1,7 +1,7 @@
-"""Identification: the constants of the body on its thread, from a short flight made for that.
+"""Identification of the body on its thread from a short flight.
 
-    excitation (flown by the loop) -> flight log -> record -> fit -> absolute scale -> configuration fragment
+    excitation (flown by the loop) -> flight log -> record -> fit -> absolute scale -> `plant` section
 
-Motion under a known current shows ratios to the inertia only. `scale` says what the configuration and the
-magnetometer must add, and how much of each constant rests on them.
+Motion under a known current determines ratios to the inertia only. `scale` adds prior values from the
+configuration and the magnetometer, and states the contribution of each.
 """

@@ -1,50 +1,269 @@
-"""The constants that explain a record best: Gauss-Newton on the innovations' likelihood, noise included.
+"""Maximum-likelihood fit of the constants of motion to a record, by Gauss-Newton, with the noise levels.
 
-Constants and noise levels are found in turn (their information matrices do not mix): the constants from the
-whitened innovations, the noise by Fisher scoring. Priors are wide and only keep apart what a dull record
-leaves open: the delay is some 20 ms, the noise levels are known to a factor of three.
+The motion per inertia is theta'' = g I cos(theta) - kappa theta - delta theta' + d, with each change of the
+current delayed by tau; theta and theta' + b are measured (Sease 2013, 5.4, with the thread). The actual
+current differs from the commanded one: an active coil adds process noise, an inactive one does not. The
+predictor is therefore the extended Kalman filter of the two states (prediction-error method; Ljung 1999,
+System Identification, 7.2 and 10.2); an output-error fit would treat the accumulated noise as signal. Between
+events the state is propagated by its Taylor series with an error of a ten-thousandth of the noise. The
+derivatives follow the filter with its gains held constant, which leaves the expected gradient at zero.
 
-The covariance is the inverse of the information. It holds where the innovations are white, which is tested
-(Ljung and Box 1978). Where they are not - the unit's own attitude filter, a draught - each deviation is what
-the scatter of the score over stretches of the record says (the sandwich estimate, Huber 1967), if larger.
+Constants and noise levels are estimated alternately, because their information matrices do not mix: the
+constants from the whitened innovations, the noise by Fisher scoring. The priors are wide and matter only for
+records that do not determine a value: the delay is about 20 ms, the noise levels are known to a factor of 3.
+Events that no noise explains, such as the release, a jolt or an outlier, restart the filter.
+
+The covariance is the inverse of the information if the innovations are white (test of Ljung and Box 1978).
+Otherwise each standard deviation is that of the sandwich estimate (Huber 1967) over segments of the record,
+if that is larger. Causes are the attitude filter of the inertial unit, or air currents.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.special import gammaincc
 
-from ground.identification.constants import NAMES, Constants, Noise
-from ground.identification.innovations import Innovations, innovations
-from ground.identification.record import IdentificationError, Record
-from knightcube.astro.arrays import FloatArray
+from ground.identification.record import IdentificationError, Record, Timeline
+from knightcube.astro.arrays import FloatArray, IntArray
 
-PRIOR_SIGMA = Constants(
-    gain=math.inf, torsion=math.inf, damping=math.inf, disturbance=1.0, bias=0.1, delay=0.02
-)
+
+@dataclass(frozen=True, slots=True)
+class MotionConstants:
+    """Constants of the motion, each divided by the inertia.
+
+    Attributes:
+        gain: g = n A B / J, rad/s^2/A.
+        torsion: kappa = k / J, 1/s^2.
+        damping: delta = c / J, 1/s.
+        disturbance: d, rad/s^2, which includes the rest angle theta_0 of the thread as kappa theta_0.
+        bias: gyro bias b, rad/s.
+        delay: tau, s, from the cycle that wrote a current to its effect.
+    """
+
+    gain: float
+    torsion: float
+    damping: float
+    disturbance: float = 0.0
+    bias: float = 0.0
+    delay: float = 0.0
+
+    def to_array(self) -> FloatArray:
+        """Return the constants (6,) in order of the fields."""
+        return np.array([getattr(self, name) for name in NAMES])
+
+    @classmethod
+    def of(cls, values: FloatArray) -> MotionConstants:
+        """Return the constants from an array (6,)."""
+        return cls(*(float(value) for value in values))
+
+
+NAMES = tuple(field.name for field in fields(MotionConstants))
+UNITS = dict(zip(NAMES, ("rad/s^2/A", "1/s^2", "1/s", "rad/s^2", "rad/s", "s"), strict=True))
+_BIAS, _DELAY = NAMES.index("bias"), NAMES.index("delay")
+
+_PRIOR_SIGMA = np.array([math.inf, math.inf, math.inf, 1.0, 0.1, 0.02])
+"""Prior standard deviations of the constants around zero."""
 _NOISE_PRIOR = math.log(3.0)
-_LONGEST_DELAY = 0.1
+"""Prior standard deviation of the logarithms of the noise levels."""
+_MAX_DELAY = 0.1
 _CONVERGED = 0.01
-_ROUNDS = 25
+"""Largest step, in standard deviations, at which the fit has converged."""
+_MAX_ROUNDS = 25
 _NOISE_STEP = 0.02
-_NOISE_SETTLED = 0.01
-_GATES = (30.0, 8.0)  # in believed, then in found standard deviations
-_MOST_RESTARTS = 0.02
+_NOISE_CONVERGED = 0.01
+_GATES = (30.0, 8.0)
+"""Gates of the innovations: in assumed, then in estimated standard deviations."""
+_MAX_RESTARTS = 0.02
+"""Largest fraction of samples at which the filter may restart."""
 _LAGS = 20
-_STRETCHES = 40
-_SUSPICIOUS = 1e-3
-_LEAST_KNOWN = 0.25
+"""Lags of the whiteness test."""
+_SEGMENTS = 40
+"""Segments of the record for the sandwich estimate."""
+_MIN_PROBABILITY = 1e-3
+"""Probability below which the innovations are not white."""
+_MAX_GAIN_ERROR = 0.25
+"""Largest relative standard deviation of the gain."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """Standard deviations of the current in an active coil, A, of the angle, rad, and of the rate, rad/s."""
+
+    current: float
+    angle: float
+    rate: float
+
+    def to_logarithms(self) -> FloatArray:
+        """Return the logarithms (3,)."""
+        return np.log([self.current, self.angle, self.rate])
+
+    @classmethod
+    def of_logarithms(cls, values: FloatArray) -> MotionNoise:
+        """Return the noise from its logarithms (3,)."""
+        return cls(*(float(value) for value in np.exp(values)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovations:
+    """Innovations of one pass over a record of n samples, of which the first starts the filter.
+
+    Attributes:
+        error: measured minus predicted angle and rate (n - 1, 2).
+        covariance: their covariances (n - 1, 2, 2).
+        gradient: derivatives (n - 1, 2, 6) of the prediction by the constants; (0, 2, 6) without gradient.
+        taken: indices (n - 1,) of the samples.
+        restarts: indices of the samples at which the filter restarted, which have no innovation.
+    """
+
+    error: FloatArray
+    covariance: FloatArray
+    gradient: FloatArray
+    taken: IntArray
+    restarts: frozenset[int]
+
+    def whiten(self, vectors: FloatArray) -> FloatArray:
+        """Return `vectors` (n - 1, 2, k) multiplied by the inverse Cholesky factors of the covariances."""
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(self.covariance), vectors))
+
+    @property
+    def whitened(self) -> FloatArray:
+        """Whitened innovations (n - 1, 2), of unit variance if the model is correct."""
+        return self.whiten(self.error[..., None])[..., 0]
+
+
+def innovations(
+    record: Record,
+    constants: MotionConstants,
+    noise: MotionNoise,
+    restarts: frozenset[int] = frozenset(),
+    gate: float = math.inf,
+    with_gradient: bool = True,
+) -> Innovations:
+    """Run the filter over a record and return the innovations.
+
+    The filter restarts at the samples `restarts` and if an innovation exceeds `gate` standard deviations.
+    """
+    angle, rate = record.angle.tolist(), record.rate.tolist()
+    predictor = _Predictor(constants, noise, record.period, with_gradient)
+    predictor.start(angle[0], rate[0])
+    made = []
+    restarted = set(restarts)
+    timeline = Timeline.of(record, constants.delay)
+    columns = (timeline.span, timeline.current, timeline.variance, timeline.sample, timeline.jump)
+    for span, current, variance, sample, jump in zip(*(column.tolist() for column in columns), strict=True):
+        if span > 0.0:
+            predictor.propagate(span, current, variance)
+        if sample >= 0:
+            if sample in restarted or predictor.distance(angle[sample], rate[sample]) > gate:
+                restarted.add(sample)
+                predictor.start(angle[sample], rate[sample])
+            else:
+                gradient = predictor.gradient() if with_gradient else ()
+                made.append((*predictor.update(angle[sample], rate[sample]), gradient, sample))
+        if jump and with_gradient:
+            predictor.note_switch(jump)
+    errors, covariances, gradients, taken = zip(*made, strict=True)
+    return Innovations(
+        np.array(errors),
+        np.array(covariances).reshape(-1, 2, 2),
+        np.array(gradients if with_gradient else ()).reshape(-1, 2, len(NAMES)),
+        np.array(taken),
+        frozenset(restarted),
+    )
+
+
+class _Predictor:
+    """Extended Kalman filter of angle and rate, with the derivatives of the state by the constants."""
+
+    def __init__(
+        self, constants: MotionConstants, noise: MotionNoise, period: float, with_gradient: bool
+    ) -> None:
+        self._constants = constants
+        self._walk = (constants.gain * noise.current) ** 2 * period
+        self._r_angle, self._r_rate = noise.angle**2, noise.rate**2
+        self._with_gradient = with_gradient
+        self._bias_row = np.zeros(len(NAMES))
+        self._bias_row[_BIAS] = 1.0
+
+    def start(self, angle: float, rate: float) -> None:
+        """Start, or restart, from a sample."""
+        self._angle, self._rate = angle, rate - self._constants.bias
+        self._paa, self._pab, self._pbb = self._r_angle, 0.0, self._r_rate
+        self._by_angle, self._by_rate = np.zeros(len(NAMES)), -self._bias_row
+
+    def distance(self, angle: float, rate: float) -> float:
+        """Return the larger of the normalised innovations of angle and rate."""
+        by_angle = (angle - self._angle) ** 2 / (self._paa + self._r_angle)
+        by_rate = (rate - self._rate - self._constants.bias) ** 2 / (self._pbb + self._r_rate)
+        return math.sqrt(max(by_angle, by_rate))
+
+    def propagate(self, span: float, current: float, variance: float) -> None:
+        """Propagate the state by `span` s under `current` A, whose relative variance is `variance`."""
+        c, angle, rate = self._constants, self._angle, self._rate
+        cosine = math.cos(angle)
+        acceleration = c.gain * current * cosine - c.torsion * angle - c.damping * rate + c.disturbance
+        slope = -c.gain * current * math.sin(angle) - c.torsion
+        jerk = slope * rate - c.damping * acceleration
+        half = 0.5 * span * span
+        f11, f12 = 1.0 + half * slope, span - half * c.damping
+        f21, f22 = slope * f12, 1.0 - span * c.damping + half * (slope + c.damping * c.damping)
+        if self._with_gradient:
+            forcing = np.array([current * cosine, -angle, -rate, 1.0, 0.0, 0.0])
+            self._by_angle, self._by_rate = (
+                f11 * self._by_angle + f12 * self._by_rate + half * forcing,
+                f21 * self._by_angle + f22 * self._by_rate + f12 * forcing,
+            )
+        self._angle = angle + span * rate + half * (acceleration + span * jerk / 3.0)
+        self._rate = rate + span * acceleration + half * jerk
+        q = self._walk * variance * cosine * cosine
+        a1, a2 = f11 * self._paa + f12 * self._pab, f11 * self._pab + f12 * self._pbb
+        b1, b2 = f21 * self._paa + f22 * self._pab, f21 * self._pab + f22 * self._pbb
+        self._paa = a1 * f11 + a2 * f12 + q * span * half * (2.0 / 3.0)
+        self._pab = a1 * f21 + a2 * f22 + q * half
+        self._pbb = b1 * f21 + b2 * f22 + q * span
+
+    def gradient(self) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives (6,) of the predicted angle and of the predicted gyro reading."""
+        return self._by_angle, self._by_rate + self._bias_row
+
+    def update(
+        self, angle: float, rate: float
+    ) -> tuple[tuple[float, float], tuple[float, float, float, float]]:
+        """Update the state with a sample and return the innovation and its covariance."""
+        error = angle - self._angle, rate - self._rate - self._constants.bias
+        paa, pab, pbb = self._paa, self._pab, self._pbb
+        saa, sbb = paa + self._r_angle, pbb + self._r_rate
+        determinant = saa * sbb - pab * pab
+        kaa, kab = (paa * sbb - pab * pab) / determinant, (pab * saa - paa * pab) / determinant
+        kba, kbb = (pab * sbb - pbb * pab) / determinant, (pbb * saa - pab * pab) / determinant
+        if self._with_gradient:
+            by_angle, by_rate = self.gradient()
+            self._by_angle = self._by_angle - kaa * by_angle - kab * by_rate
+            self._by_rate = self._by_rate - kba * by_angle - kbb * by_rate
+        self._angle += kaa * error[0] + kab * error[1]
+        self._rate += kba * error[0] + kbb * error[1]
+        self._paa = (1.0 - kaa) * paa - kab * pab
+        self._pab = (1.0 - kaa) * pab - kab * pbb
+        self._pbb = (1.0 - kbb) * pbb - kba * pab
+        return error, (saa, pab, pab, sbb)
+
+    def note_switch(self, jump: float) -> None:
+        """Add the derivative by the delay: a later switch would have let the old current act longer."""
+        self._by_rate = self._by_rate.copy()
+        self._by_rate[_DELAY] -= self._constants.gain * math.cos(self._angle) * jump
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whiteness:
-    """The test of the innovations: variance in units of the expected, and how probable their correlation is.
+    """Whiteness test of the innovations of angle and rate.
 
-    Each of angle and rate; `probability` is that of a correlation over 20 lags as strong, were they white.
+    Attributes:
+        variance: variance of the whitened innovations.
+        probability: probability of an equally strong correlation over 20 lags of white innovations.
     """
 
     variance: tuple[float, float]
@@ -52,78 +271,84 @@ class Whiteness:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing speaks against white innovations."""
-        return min(self.probability) > _SUSPICIOUS
+        """Whether the innovations may be white."""
+        return min(self.probability) > _MIN_PROBABILITY
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlantFit:
-    """The constants, `covariance` (6, 6) in their order, the noise found, the innovations and their test."""
+    """Fitted constants with their covariance (6, 6), the noise levels, the innovations and their test."""
 
-    constants: Constants
+    constants: MotionConstants
     covariance: FloatArray
-    noise: Noise
+    noise: MotionNoise
     innovations: Innovations
     whiteness: Whiteness
 
     def sigma(self, name: str) -> float:
-        """Return the standard deviation of the constant of that name."""
+        """Return the standard deviation of a constant by its name."""
         index = NAMES.index(name)
         return math.sqrt(float(self.covariance[index, index]))
 
 
-def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | None = None) -> PlantFit:
-    """Fit the constants to `record`; `noise` is its assumed noise.
+def fit(record: Record, noise: MotionNoise, progress: Callable[[int, float], None] | None = None) -> PlantFit:
+    """Fit the constants to a record.
 
-    `progress` is called with the number of each round and its step in standard deviations. Raises
-    IdentificationError when the record does not determine the torque constant, or nothing explains it.
+    Args:
+        record: the record.
+        noise: assumed noise.
+        progress: called with the number of each round and its step in standard deviations.
+
+    Raises IdentificationError if the record does not determine the torque constant, or no constants fit.
     """
     if not np.any(record.current):
-        raise IdentificationError("the coil on x was never driven: nothing in this flight shows its torque")
+        raise IdentificationError("the coil on x was never driven: the flight does not show its torque")
     try:
         return _fitted(record, noise, progress)
     except (ValueError, OverflowError) as error:
-        # What a prediction without bounds ends in: the cosine of infinity, a covariance that is none.
-        raise IdentificationError("no constants explain this flight: their prediction runs away") from error
+        # A diverging prediction ends in the cosine of infinity or an indefinite covariance.
+        raise IdentificationError("no constants explain this flight: the prediction diverges") from error
 
 
-def _fitted(record: Record, noise: Noise, progress: Callable[[int, float], None] | None) -> PlantFit:
-    constants, believed, share, before = first_guess(record), noise, 1.0, np.zeros(len(NAMES))
+def _fitted(record: Record, noise: MotionNoise, progress: Callable[[int, float], None] | None) -> PlantFit:
+    constants, assumed, share, before = first_guess(record), noise, 1.0, np.zeros(len(NAMES))
     restarts: frozenset[int] = frozenset()
     gates = list(_GATES)
-    for count in range(_ROUNDS):
+    for count in range(_MAX_ROUNDS):
         passed = innovations(record, constants, noise, restarts)
         step, information = _step(passed, constants)
-        # The delay has a kink wherever a switch passes over a sample: where steps turn back, go half as far.
+        # The likelihood has a kink in the delay at each sample: steps that reverse are halved.
         share *= 0.5 if step @ information @ before < 0.0 and count > 3 else 1.0
         before = step
         step = share * step
         largest = float(np.max(np.abs(step) * np.sqrt(np.diag(information))))
-        constants = _moved(constants, step)
+        values = constants.to_array() + step
+        values[_DELAY] = min(max(values[_DELAY], -_MAX_DELAY), _MAX_DELAY)
+        constants = MotionConstants.of(values)
         if progress is not None:
             progress(count, largest)
         if largest > 3.0 and count < 2:
             continue
         if len(gates) == len(_GATES):
-            restarts = _gone_over(record, constants, noise, restarts, gates.pop(0))
-        likelier = _noise(record, constants, noise, believed, restarts)
-        settled = float(np.max(np.abs(likelier.to_logarithms() - noise.to_logarithms()))) < _NOISE_SETTLED
+            restarts = _gated(record, constants, noise, restarts, gates.pop(0))
+        likelier = _noise(record, constants, noise, assumed, restarts)
+        settled = float(np.max(np.abs(likelier.to_logarithms() - noise.to_logarithms()))) < _NOISE_CONVERGED
         noise = likelier
         if settled and largest < _CONVERGED:
-            seen = _gone_over(record, constants, noise, restarts, gates.pop(0)) if gates else restarts
-            if seen == restarts:
+            gated = _gated(record, constants, noise, restarts, gates.pop(0)) if gates else restarts
+            if gated == restarts:
                 return _finished(record, constants, noise, restarts)
-            restarts = seen
+            restarts = gated
     raise IdentificationError(
-        f"no constants explain this flight: after {_ROUNDS} rounds the last step was still "
+        f"no constants explain this flight: the step of round {_MAX_ROUNDS} was still "
         f"{largest:.2g} standard deviations"
     )
 
 
-def first_guess(record: Record) -> Constants:
-    """Return gain, torsion, damping and disturbance by regression of the rate's change over each second.
+def first_guess(record: Record) -> MotionConstants:
+    """Return gain, torsion, damping and disturbance by regression of the change of rate in each second.
 
-    Of noise it knows nothing, but it needs no start.
+    The regression ignores the noise and needs no initial values.
     """
     spans = np.diff(record.time)
     at = np.searchsorted(record.switch_time, record.time[:-1], side="right")
@@ -136,67 +361,61 @@ def first_guess(record: Record) -> Constants:
     edges = np.unique(np.searchsorted(record.time, np.arange(record.time[0], record.time[-1])))[1:]
     changes = np.diff(record.rate[edges])
     found = np.linalg.lstsq(np.diff(sums[:, edges - 1], axis=1).T, changes, rcond=None)[0]
-    return Constants(*(float(value) for value in found))
+    return MotionConstants(*(float(value) for value in found))
 
 
-def _gone_over(
-    record: Record, constants: Constants, noise: Noise, restarts: frozenset[int], gate: float
+def _gated(
+    record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int], gate: float
 ) -> frozenset[int]:
-    """Return `restarts` and where else no noise explains what happened. Raises IdentificationError."""
+    """Return `restarts` and the samples beyond the gate. Raises IdentificationError if there are too many."""
     passed = innovations(record, constants, noise, restarts, gate, with_gradient=False)
-    if len(passed.restarts) > _MOST_RESTARTS * len(record.time):
+    if len(passed.restarts) > _MAX_RESTARTS * len(record.time):
         raise IdentificationError(
-            f"no constants explain this flight: {len(passed.restarts)} of {len(record.time)} samples are "
-            f"more than {gate:g} standard deviations from what the motion before them says"
+            f"no constants explain this flight: {len(passed.restarts)} of {len(record.time)} samples differ "
+            f"by more than {gate:g} standard deviations from the predicted motion"
         )
     return passed.restarts
 
 
-def _finished(record: Record, constants: Constants, noise: Noise, restarts: frozenset[int]) -> PlantFit:
+def _finished(
+    record: Record, constants: MotionConstants, noise: MotionNoise, restarts: frozenset[int]
+) -> PlantFit:
+    """Return the fit with its covariance. Raises IdentificationError if the gain is uncertain or negative."""
     passed = innovations(record, constants, noise, restarts)
-    _, information = _step(passed, constants)
-    covariance = _inverse(information)
+    covariance = _inverse(_step(passed, constants)[1])
     whiteness = _whiteness(passed.whitened)
     if not whiteness.passed:
-        covariance = _widened(covariance, passed)
+        scores = np.einsum("nik,ni->nk", passed.whiten(passed.gradient), passed.whitened)
+        segments = np.array([np.sum(part, axis=0) for part in np.array_split(scores, _SEGMENTS)])
+        sandwich = covariance @ (segments.T @ segments) @ covariance
+        wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0))
+        covariance = np.asarray(covariance * np.outer(wider, wider))
     made = PlantFit(constants, covariance, noise, passed, whiteness)
     sigma = made.sigma("gain")
-    if sigma > _LEAST_KNOWN * abs(constants.gain):
+    gain = f"{constants.gain:.3g} +- {sigma:.2g} rad/s^2/A"
+    if sigma > _MAX_GAIN_ERROR * abs(constants.gain):
         raise IdentificationError(
-            f"this flight leaves the torque constant open ({constants.gain:.3g} +- {sigma:.2g} rad/s^2/A): "
-            "it needs more current, or more time"
+            f"this flight does not determine the torque constant ({gain}): it needs more current or more time"
         )
     if constants.gain < 0.0:
         raise IdentificationError(
-            f"the coil on x turns the body the other way ({constants.gain:.3g} +- {sigma:.2g} rad/s^2/A): "
-            "look at `coils.signs` and at the direction of the field"
+            f"the coil on x rotates the body in the opposite direction ({gain}): "
+            "check `coils.signs` and the direction of the field"
         )
     return made
 
 
-def _step(passed: Innovations, constants: Constants) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step (6,) and the information (6, 6) that it rests on."""
+def _step(passed: Innovations, constants: MotionConstants) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss-Newton step (6,) and the information (6, 6)."""
     j = passed.whiten(passed.gradient).reshape(-1, len(NAMES))
-    prior = PRIOR_SIGMA.to_array() ** -2.0
+    prior = _PRIOR_SIGMA**-2.0
     information = j.T @ j + np.diag(prior)
-    right = j.T @ passed.whitened.reshape(-1) - np.where(prior > 0.0, prior * _off_prior(constants), 0.0)
+    right = j.T @ passed.whitened.reshape(-1) - np.where(prior > 0.0, prior * constants.to_array(), 0.0)
     return _inverse(information) @ right, information
 
 
-def _off_prior(constants: Constants) -> FloatArray:
-    off = constants.to_array()
-    off[:3] = 0.0
-    return off
-
-
-def _moved(constants: Constants, step: FloatArray) -> Constants:
-    values = constants.to_array() + step
-    values[-1] = min(max(values[-1], -_LONGEST_DELAY), _LONGEST_DELAY)
-    return Constants.of(values)
-
-
 def _inverse(information: FloatArray) -> FloatArray:
-    """Return the inverse of a symmetric matrix whose units differ widely. Raises IdentificationError."""
+    """Return the inverse of a symmetric matrix with widely different units. Raises IdentificationError."""
     scale = 1.0 / np.sqrt(np.diag(information))
     correlation = information * np.outer(scale, scale)
     if not np.all(np.isfinite(correlation)) or np.linalg.cond(correlation) > 1e12:
@@ -205,25 +424,30 @@ def _inverse(information: FloatArray) -> FloatArray:
 
 
 def _noise(
-    record: Record, constants: Constants, noise: Noise, believed: Noise, restarts: frozenset[int]
-) -> Noise:
-    """Return noise levels one step of Fisher scoring nearer to the likeliest."""
+    record: Record,
+    constants: MotionConstants,
+    noise: MotionNoise,
+    assumed: MotionNoise,
+    restarts: frozenset[int],
+) -> MotionNoise:
+    """Return the noise levels after one step of Fisher scoring."""
     at = noise.to_logarithms()
     here = innovations(record, constants, noise, restarts, with_gradient=False)
     inverse = np.linalg.inv(here.covariance)
     weighted = np.einsum("nij,nj->ni", inverse, here.error)
-    error_by, covariance_by = [], []
+    error_by, relative, score = [], [], []
     for index in range(len(at)):
         moved = at.copy()
         moved[index] += _NOISE_STEP
-        there = innovations(record, constants, Noise.of_logarithms(moved), restarts, with_gradient=False)
+        there = innovations(
+            record, constants, MotionNoise.of_logarithms(moved), restarts, with_gradient=False
+        )
         error_by.append((there.error - here.error) / _NOISE_STEP)
-        covariance_by.append((there.covariance - here.covariance) / _NOISE_STEP)
-    score, relative = [], [inverse @ change for change in covariance_by]
-    for error, change, ratio in zip(error_by, covariance_by, relative, strict=True):
+        change = (there.covariance - here.covariance) / _NOISE_STEP
+        relative.append(inverse @ change)
         quadratic = np.einsum("ni,nij,nj->", weighted, change, weighted)
-        trace = np.einsum("nii->", ratio)
-        score.append(0.5 * (quadratic - trace) - np.sum(weighted * error))
+        trace = np.einsum("nii->", relative[-1])
+        score.append(0.5 * (quadratic - trace) - np.sum(weighted * error_by[-1]))
     information = np.array(
         [
             [
@@ -234,28 +458,18 @@ def _noise(
             for i in range(len(at))
         ]
     )
-    right = np.array(score) - (at - believed.to_logarithms()) / _NOISE_PRIOR**2
+    right = np.array(score) - (at - assumed.to_logarithms()) / _NOISE_PRIOR**2
     step = np.linalg.solve(information + np.eye(len(at)) / _NOISE_PRIOR**2, right)
-    return Noise.of_logarithms(at + np.clip(step, -1.0, 1.0))
+    return MotionNoise.of_logarithms(at + np.clip(step, -1.0, 1.0))
 
 
 def _whiteness(whitened: FloatArray) -> Whiteness:
-    """Test each column of (n, 2) by Ljung and Box."""
+    """Apply the test of Ljung and Box to each column of innovations (n, 2)."""
     count = len(whitened)
     variance = np.mean(whitened**2, axis=0)
     lags = np.arange(1, _LAGS + 1)
-    correlation = np.array([np.sum(whitened[lag:] * whitened[:-lag], axis=0) for lag in lags.tolist()]) / (
-        count * variance
-    )
+    products = np.array([np.sum(whitened[lag:] * whitened[:-lag], axis=0) for lag in lags.tolist()])
+    correlation = products / (count * variance)
     q = count * (count + 2.0) * np.sum(correlation**2 / (count - lags)[:, None], axis=0)
     angle, rate = gammaincc(0.5 * _LAGS, 0.5 * q).tolist()
     return Whiteness((float(variance[0]), float(variance[1])), (angle, rate))
-
-
-def _widened(covariance: FloatArray, passed: Innovations) -> FloatArray:
-    """Return `covariance` with the deviations that the score's scatter over stretches asks for, if larger."""
-    scores = np.einsum("nik,ni->nk", passed.whiten(passed.gradient), passed.whitened)
-    stretches = np.array([np.sum(part, axis=0) for part in np.array_split(scores, _STRETCHES)])
-    sandwich = covariance @ (stretches.T @ stretches) @ covariance
-    wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(covariance), 1.0))
-    return np.asarray(covariance * np.outer(wider, wider))

@@ -1,9 +1,9 @@
-"""What a flight log says for identification: the turn about the thread and the currents, never the truth.
+"""Signals of a flight log for identification: rotation about the thread and currents, without the truth log.
 
-Attitude and rate are the unit's own samples, at the times of its own clock: a busy host notes some late. The
-currents are those on the wire (limited and quantised), each from the cycle that asked for it until the next
-one's; a wire that is written in a thread of its own shows them a cycle later. The field is the magnetometer's
-while all coils are off, since a coil that is on lies beside the magnetometer.
+Attitude and rate are the samples of the inertial unit at the times of its own clock, because a busy host
+timestamps some samples late. The currents are the commanded ones, limited and quantised, each from the cycle
+that requested it until the next; a coil driver with its own thread reports them a cycle later. The field is
+measured while all coils are off, because an active coil disturbs the magnetometer.
 """
 
 from __future__ import annotations
@@ -14,19 +14,27 @@ import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import Run
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.errors import FlightError, UsageError
 
-LEAST_SAMPLES = 200
+MIN_SAMPLES = 200
+MAX_STEP = 0.025
+"""Longest step between two events of a timeline (s)."""
 _AT_LIMIT = 0.97
-_RESOLUTION = 1.0e-4  # A; a count of the PWM chip is some 4e-5 A
-_SETTLED_FIELD = 0.5  # s after the coils went off until the field is taken
-_LONGEST_GAP = 60.0  # s between two samples
-_LARGEST = {
+"""Fraction of a coil's limit from which the actual current may differ from the commanded one."""
+_RESOLUTION = 1.0e-4
+"""Difference (A) above which two currents are different; one count of the PWM chip is about 4e-5 A."""
+_SETTLED_FIELD = 0.5
+"""Time after the coils were switched off before the field is measured (s)."""
+_MAX_GAP = 60.0
+"""Longest time between two samples (s)."""
+_CLIPPED_VARIANCE = 100.0
+"""Factor of the current's variance at the limit, where its mean is not known."""
+_MAX_VALUES = {
     "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
     "control": {"current_command": 10.0, "current_written": 10.0},
 }
-"""Beyond which, in SI units, a value was not written by a flight."""
+"""Largest values, in SI units, that a flight can record."""
 
 
 class IdentificationError(FlightError):
@@ -34,8 +42,8 @@ class IdentificationError(FlightError):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FieldMeasurement:
-    """The horizontal field in T, from `samples` samples while the coils were off, and its scatter's error."""
+class HorizontalField:
+    """Measured horizontal field, T, its standard deviation from the scatter, T, and the number of samples."""
 
     magnitude: float
     sigma: float
@@ -44,17 +52,17 @@ class FieldMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """The signals of one flight.
+    """Signals of one flight.
 
     Attributes:
-        time: (n,) s of each sample, increasing.
-        angle: (n,) rad, turn about the thread, without jumps.
-        rate: (n,) rad/s.
-        switch_time: (m,) s from which on each current stands.
-        current: (m,) A in the coil on body x.
-        clipped: (m,) at the coil's limit, where the true current is not the one on the wire.
-        period: s between control cycles.
-        field: what the magnetometer measured; None when the coils were never off.
+        time: increasing times (n,) of the samples, s.
+        angle: continuous rotation (n,) about the thread, rad.
+        rate: gyro reading (n,) about the thread, rad/s.
+        switch_time: times (m,) from which each current flows, s.
+        current: currents (m,) in the coil on body x, A.
+        clipped: whether (m,) a current is at the coil's limit and may differ from the commanded one.
+        period: control period, s.
+        field: measured field; None if the coils were never off.
     """
 
     time: FloatArray
@@ -64,42 +72,42 @@ class Record:
     current: FloatArray
     clipped: BoolArray
     period: float
-    field: FieldMeasurement | None
+    field: HorizontalField | None
 
 
 def read_record(run: Run, stale_after: float) -> Record:
     """Return the record of a run.
 
     Without commands for `stale_after` s the driver lets the coils fall to zero. Raises UsageError for a run
-    in which another coil was driven too, IdentificationError for a run that is too short, or whose log holds
-    values that no flight writes.
+    in which another coil was driven too, IdentificationError for a run that is too short or whose log is
+    damaged.
     """
     control, imu, label = run["control"], run["imu"], run["run"]
-    if len(control) < 2 or len(imu) < LEAST_SAMPLES or not len(label):
+    if len(control) < 2 or len(imu) < MIN_SAMPLES or not len(label):
         raise IdentificationError(
-            f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: too short a flight"
+            f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: the flight is too short"
         )
     _refuse_impossible(run, label)
-    written = control["current_written"].astype(float)
-    if np.any(written[:, 1:]):
-        raise UsageError(f"{run.folder}: coils y or z were driven: identification knows the one on x only")
+    if np.any(control["current_written"][:, 1:].astype(float)):
+        raise UsageError(
+            f"{run.folder}: coils y or z were driven; identification needs a flight with coil x only"
+        )
     time = _sample_times(imu)
     once = np.append(True, np.diff(np.maximum.accumulate(time)) > 0.0)
     time, imu = time[once], imu[once]
     gap = float(np.max(np.diff(time), initial=0.0))
-    if len(time) < LEAST_SAMPLES or gap > _LONGEST_GAP:
+    if len(time) < MIN_SAMPLES or gap > _MAX_GAP:
         raise IdentificationError(
-            f"{run.folder}: {len(time)} samples in order of time, the longest gap {gap:.3g} s: "
-            f"{LEAST_SAMPLES} are needed, and none longer than {_LONGEST_GAP:g} s"
+            f"{run.folder}: {len(time)} samples in order of time with a longest gap of {gap:.3g} s; "
+            f"identification needs {MIN_SAMPLES} samples and no gap above {_MAX_GAP:g} s"
         )
     quaternion = imu["quaternion"].astype(float)
-    turn = 2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3])
     saturation = float(label["supply_voltage"][0] / label["coil_resistance"][0, 0])
     limit = min(float(label["current_limit"][0]), saturation)
-    switch_time, current, clipped = _with_stale_ends(control, stale_after, limit)
+    switch_time, current, clipped = _currents(control, stale_after, limit)
     return Record(
         time=time,
-        angle=np.unwrap(turn),
+        angle=np.unwrap(2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3])),
         rate=imu["rate"][:, 1].astype(float),
         switch_time=switch_time,
         current=current,
@@ -110,8 +118,8 @@ def read_record(run: Run, stale_after: float) -> Record:
 
 
 def _refuse_impossible(run: Run, label: PacketArray) -> None:
-    """Raise IdentificationError for values that no flight writes, NaN among them: they are damage."""
-    for packet, fields in _LARGEST.items():
+    """Raise IdentificationError for values, including NaN, that only a damaged log contains."""
+    for packet, fields in _MAX_VALUES.items():
         for name, largest in fields.items():
             values = run[packet][name].reshape(len(run[packet]), -1)
             bad = np.argwhere(~(np.abs(values) <= largest))
@@ -127,35 +135,31 @@ def _refuse_impossible(run: Run, label: PacketArray) -> None:
 
 
 def _sample_times(imu: PacketArray) -> FloatArray:
-    """Return the times (n,) s of the samples: the unit's clock, laid along the earliest of the host's notes.
+    """Return the times (n,), s, of the samples: the unit's clock, fitted to the earliest host timestamps.
 
-    Where the unit's clock does not run on (it was restarted), the host's time stamps are used.
+    The host timestamps are used if the unit's clock was restarted.
     """
     host, unit = imu["sample_time_ns"] * 1e-9, imu["device_time_ns"] * 1e-9
     unit = unit - unit[0]
     if np.any(np.diff(unit) <= 0.0):
         return np.asarray(host)
-    stretches = np.array_split(np.arange(len(host)), max(2, len(host) // LEAST_SAMPLES))
-    earliest = [part[np.argmin((host - unit)[part])] for part in stretches]
+    segments = np.array_split(np.arange(len(host)), max(2, len(host) // MIN_SAMPLES))
+    earliest = [segment[np.argmin((host - unit)[segment])] for segment in segments]
     drift = np.polynomial.Polynomial.fit(unit[earliest], (host - unit)[earliest], 1)
     return np.asarray(unit + drift(unit))
 
 
-def _currents(control: PacketArray) -> FloatArray:
-    """Return the current (m,) A that each cycle brought onto the wire, seen at once or a cycle later."""
-    asked = control["current_command"][:, 0].astype(float)
-    written = control["current_written"][:, 0].astype(float)
-    late = np.append(written[1:], written[-1])
-    is_late = (np.abs(written - asked) > _RESOLUTION) & (np.abs(late - asked) <= _RESOLUTION)
-    return np.asarray(np.where(is_late, late, written))
-
-
-def _with_stale_ends(
+def _currents(
     control: PacketArray, stale_after: float, limit: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return times, currents and whether at the `limit`, with a zero where commands failed to come."""
+    """Return switch times, currents and whether they are at the `limit`, with a zero after stale commands."""
     time = control["time_ns"] * 1e-9
-    current = _currents(control)
+    requested, written = (
+        control[name][:, 0].astype(float) for name in ("current_command", "current_written")
+    )
+    late = np.append(written[1:], written[-1])  # a driver with its own thread reports a cycle later
+    is_late = (np.abs(written - requested) > _RESOLUTION) & (np.abs(late - requested) <= _RESOLUTION)
+    current = np.asarray(np.where(is_late, late, written))
     clipped = np.abs(current) > _AT_LIMIT * limit
     gaps = np.flatnonzero(np.diff(time) > stale_after)
     return (
@@ -167,10 +171,10 @@ def _with_stale_ends(
 
 def _field(
     time: FloatArray, field: FloatArray, switch_time: FloatArray, current: FloatArray
-) -> FieldMeasurement | None:
-    """Return the mean horizontal field over the samples with the coils off; y lies along the thread."""
+) -> HorizontalField | None:
+    """Return the mean horizontal field over the samples with the coils off; y is along the thread."""
     on = np.flatnonzero(current)
-    since = np.full(len(switch_time), -np.inf)  # when the coil was last on, as seen from each switch
+    since = np.full(len(switch_time), -np.inf)  # end of the last active current before each switch
     if len(on):
         newest = np.searchsorted(on, np.arange(len(switch_time)), side="right") - 1
         ends = np.append(switch_time[1:], np.inf)
@@ -181,7 +185,51 @@ def _field(
     if np.count_nonzero(off) < 20:
         return None
     magnitude = np.hypot(field[off, 0], field[off, 2])
-    count = len(magnitude)
-    return FieldMeasurement(
-        float(np.mean(magnitude)), float(np.std(magnitude, ddof=1) / np.sqrt(count)), count
-    )
+    sigma = float(np.std(magnitude, ddof=1) / np.sqrt(len(magnitude)))
+    return HorizontalField(float(np.mean(magnitude)), sigma, len(magnitude))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timeline:
+    """Events of a record in order of time: steps under a constant current that end in a sample or a switch.
+
+    Attributes:
+        span: time (k,) since the previous event, s.
+        current: current (k,) during that time, A.
+        variance: its variance (k,) relative to that of an active coil; zero while the coil is off.
+        sample: index (k,) of the sample at the event, -1 for none.
+        jump: change (k,) of the current at the event, A.
+    """
+
+    span: FloatArray
+    current: FloatArray
+    variance: FloatArray
+    sample: IntArray
+    jump: FloatArray
+
+    @classmethod
+    def of(cls, record: Record, delay: float) -> Timeline:
+        """Return the events from the first sample to the last, with each switch delayed by `delay` s.
+
+        The current before the first switch is zero. Long intervals between samples are divided.
+        """
+        switch = record.switch_time + delay
+        inside = (switch > record.time[0]) & (switch < record.time[-1])
+        gaps = np.diff(record.time)
+        cuts = [
+            np.linspace(record.time[i], record.time[i + 1], int(gaps[i] / MAX_STEP) + 2)[1:-1]
+            for i in np.flatnonzero(gaps > 1.5 * MAX_STEP).tolist()
+        ]
+        divided = np.concatenate([np.empty(0), *cuts])
+        times = np.concatenate([record.time[1:], switch[inside], divided])
+        samples = len(record.time) - 1
+        sample = np.append(np.arange(1, samples + 1), np.full(len(times) - samples, -1))
+        jump = np.zeros(len(times))
+        jump[samples : len(times) - len(divided)] = np.diff(record.current, prepend=0.0)[inside]
+        order = np.lexsort((sample < 0, times))  # at one instant first the sample, then the switch
+        times = times[order]
+        flowing = np.searchsorted(switch, times, side="left")  # the switch at the event itself comes after
+        current = np.append(0.0, record.current)[flowing]
+        clipped = np.append(False, record.clipped)[flowing]
+        variance = np.where(current == 0.0, 0.0, np.where(clipped, _CLIPPED_VARIANCE, 1.0))
+        return cls(np.diff(times, prepend=record.time[0]), current, variance, sample[order], jump[order])

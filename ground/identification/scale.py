@@ -1,30 +1,36 @@
-"""From constants per inertia to inertia, torque constant, stiffness and damping.
+"""Inertia, torque constant, stiffness and damping from the constants per inertia.
 
-Motion under a known current shows g = n A B / J, k / J and c / J, never J itself: a body of twice the inertia
-in twice the field on twice the thread moves alike. The scale comes from prior values of the inertia and of
-the dipole per ampere n A, each with its error, and from the field, by prior and by magnetometer.
-The prior is Gaussian in the logarithms; g ties the three together (a measurement without error of
-ln n A + ln B - ln J - ln g = 0, all of them uncertain). Each is drawn towards what the other two say of it.
+Motion under a known current determines g = n A B / J, k / J and c / J, but not J itself: a body with twice
+the inertia in twice the field on a thread twice as stiff moves alike. The scale comes from prior values of
+the inertia and of the dipole per ampere, n A, and from the field by its prior and the magnetometer. The prior
+is Gaussian in the logarithms. The gain ties the three together as a measurement without error of ln n A + ln
+B - ln J - ln g = 0, which corrects each of them by what the other two imply.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
-from ground.identification.constants import NAMES
-from ground.identification.fit import PlantFit
-from ground.identification.record import FieldMeasurement
+from flight.schema import reader as configuration
+from flight.schema.document import to_yaml
+from flight.schema.testbed import Plant, Step, TestbedConfig
+from ground.identification.fit import NAMES, MotionConstants, MotionNoise, PlantFit
+from ground.identification.record import HorizontalField
 from knightcube.astro.arrays import FloatArray
 
+DURATION = 200.0
+"""Usual duration of the flight (s): each manoeuvre once in either direction, with pauses."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
-_TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])  # on ln J, ln n A, ln B, ln g, kappa, delta
+_TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])
+"""Coefficients of ln J, ln n A, ln B, ln g, kappa and delta in the constraint."""
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class PriorValue:
     """A value and its relative standard deviation."""
 
     value: float
@@ -32,28 +38,28 @@ class Belief:
 
 
 @dataclass(frozen=True, slots=True)
-class Beliefs:
-    """The values known before the flight, with their errors.
+class PlantPrior:
+    """Values known before the flight.
 
     Attributes:
         inertia: kg m^2.
-        dipole: n A, m^2, of the coil on x per ampere that is commanded.
+        dipole: n A of the coil on x per commanded ampere, m^2.
         field: T.
-        magnetometer_error: relative standard deviation of the magnetometer's scale.
+        magnetometer_error: relative standard deviation of the magnetometer's scale factor.
     """
 
-    inertia: Belief
-    dipole: Belief
-    field: Belief
+    inertia: PriorValue
+    dipole: PriorValue
+    field: PriorValue
     magnetometer_error: float
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """A value, its standard deviation, and the part of it that the flight's motion did not add.
+class ScaledValue:
+    """A value, its standard deviation, and the contribution of its own prior.
 
-    `own_prior` is the derivative of the value's logarithm by that of what was known of this very quantity
-    without the motion: 1 where that added nothing. None where nothing was known.
+    `own_prior` is the derivative of the value's logarithm by the logarithm of its prior: 1 if the motion
+    added nothing. None if the value has no prior.
     """
 
     value: float
@@ -63,57 +69,54 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsolutePlant:
-    """The constants of `knightcube.gnc.guidance.one_axis.plant` with their errors.
+    """Constants of `knightcube.gnc.guidance.one_axis.plant` with their errors.
 
     Attributes:
-        inertia, dipole, field: kg m^2, m^2, T.
+        inertia: kg m^2.
+        dipole: n A per commanded ampere, m^2.
+        field: T.
         torque_constant: n A B, N m/A.
-        stiffness, damping: N m/rad, N m s/rad.
-        field_measured: by the magnetometer; otherwise believed only.
-        covariance: (6, 6) of (ln inertia, ln dipole, ln field, ln gain, torsion, damping), gain, torsion and
-            damping being those of the fit.
+        stiffness: N m/rad.
+        damping: N m s/rad.
+        field_measured: whether the magnetometer contributed to the field.
+        covariance: covariance (6, 6) of ln inertia, ln dipole, ln field, ln gain, torsion and damping; the
+            last three are those of the fit.
     """
 
-    inertia: Known
-    dipole: Known
-    field: Known
-    torque_constant: Known
-    stiffness: Known
-    damping: Known
+    inertia: ScaledValue
+    dipole: ScaledValue
+    field: ScaledValue
+    torque_constant: ScaledValue
+    stiffness: ScaledValue
+    damping: ScaledValue
     field_measured: bool
     covariance: FloatArray
 
-    def rests_on(self) -> dict[str, str]:
-        """Return the sources of each constant, by name."""
-        prior = "believed before"
-        field = "magnetometer and belief" if self.field_measured else prior
-
-        def divided(known: Known, own: str, others: str) -> str:
-            share = 100.0 * (known.own_prior or 0.0)
-            return f"{share:.0f} % {own}, {100.0 - share:.0f} % {others} by the motion"
-
-        ratio = "the motion, times the inertia"
-        return {
-            "inertia": divided(self.inertia, prior, "dipole and field"),
-            "dipole": divided(self.dipole, prior, "inertia and field"),
-            "field": divided(self.field, field, "inertia and dipole"),
-            "torque_constant": ratio,
-            "stiffness": ratio,
-            "damping": ratio,
-        }
+    def sources(self) -> dict[str, str]:
+        """Return the sources of each constant, by its name."""
+        ratio = "from the motion, multiplied by the inertia"
+        found = {"torque_constant": ratio, "stiffness": ratio, "damping": ratio}
+        prior = "magnetometer and prior" if self.field_measured else "prior"
+        for name, own, others in (
+            ("inertia", "prior", "dipole and field"),
+            ("dipole", "prior", "inertia and field"),
+            ("field", prior, "inertia and dipole"),
+        ):
+            share = 100.0 * (getattr(self, name).own_prior or 0.0)
+            found[name] = f"{share:.0f} % {own}, {100.0 - share:.0f} % {others} with the motion"
+        return found
 
 
-def absolute(found: PlantFit, beliefs: Beliefs, measured: FieldMeasurement | None) -> AbsolutePlant:
-    """Return the plant that fit, beliefs and the measured field make together."""
-    field = _field(beliefs, measured)
-    before = beliefs.inertia, beliefs.dipole, field
-    constants = found.constants
+def absolute(found: PlantFit, prior: PlantPrior, measured: HorizontalField | None) -> AbsolutePlant:
+    """Return the plant from a fit, prior values and the measured field."""
+    values = prior.inertia, prior.dipole, _field(prior, measured)
+    fitted = found.constants
     mean = np.array(
-        [*(math.log(b.value) for b in before), math.log(constants.gain), constants.torsion, constants.damping]
+        [*(math.log(one.value) for one in values), math.log(fitted.gain), fitted.torsion, fitted.damping]
     )
-    per_unit = np.array([1.0 / constants.gain, 1.0, 1.0])
+    per_unit = np.array([1.0 / fitted.gain, 1.0, 1.0])
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.diag([b.error**2 for b in before])
+    covariance[:3, :3] = np.diag([one.error**2 for one in values])
     covariance[3:, 3:] = found.covariance[np.ix_(_MOTION, _MOTION)] * np.outer(per_unit, per_unit)
     spread = float(_TIE @ covariance @ _TIE)
     correction = covariance @ _TIE / spread
@@ -123,31 +126,110 @@ def absolute(found: PlantFit, beliefs: Beliefs, measured: FieldMeasurement | Non
     inertia, dipole, strength = (float(value) for value in np.exp(mean[:3]))
     torsion, damping = float(mean[4]), float(mean[5])
     sigma = [math.sqrt(float(covariance[i, i])) for i in range(3)]
+
+    def scaled(value: float, gradient: dict[int, float]) -> ScaledValue:
+        by = np.zeros(len(covariance))
+        by[list(gradient)] = list(gradient.values())
+        return ScaledValue(value, math.sqrt(float(by @ covariance @ by)))
+
     return AbsolutePlant(
-        inertia=Known(inertia, inertia * sigma[0], shares[0]),
-        dipole=Known(dipole, dipole * sigma[1], shares[1]),
-        field=Known(strength, strength * sigma[2], shares[2]),
-        torque_constant=_known(dipole * strength, covariance, {1: dipole * strength, 2: dipole * strength}),
-        stiffness=_known(inertia * torsion, covariance, {0: inertia * torsion, 4: inertia}),
-        damping=_known(inertia * damping, covariance, {0: inertia * damping, 5: inertia}),
+        inertia=ScaledValue(inertia, inertia * sigma[0], shares[0]),
+        dipole=ScaledValue(dipole, dipole * sigma[1], shares[1]),
+        field=ScaledValue(strength, strength * sigma[2], shares[2]),
+        torque_constant=scaled(dipole * strength, {1: dipole * strength, 2: dipole * strength}),
+        stiffness=scaled(inertia * torsion, {0: inertia * torsion, 4: inertia}),
+        damping=scaled(inertia * damping, {0: inertia * damping, 5: inertia}),
         field_measured=measured is not None,
         covariance=covariance,
     )
 
 
-def _field(beliefs: Beliefs, measured: FieldMeasurement | None) -> Belief:
-    """Return the field by belief and magnetometer together."""
-    believed = beliefs.field
+def _field(prior: PlantPrior, measured: HorizontalField | None) -> PriorValue:
+    """Return the field from its prior and the magnetometer."""
+    own = prior.field
     if measured is None or measured.magnitude <= 0.0:
-        return believed
-    error = math.hypot(beliefs.magnetometer_error, measured.sigma / measured.magnitude)
-    weights = np.array([believed.error, error]) ** -2.0
-    logarithm = weights @ np.log([believed.value, measured.magnitude]) / np.sum(weights)
-    return Belief(float(np.exp(logarithm)), float(np.sum(weights) ** -0.5))
+        return own
+    error = math.hypot(prior.magnetometer_error, measured.sigma / measured.magnitude)
+    weights = np.array([own.error, error]) ** -2.0
+    logarithm = weights @ np.log([own.value, measured.magnitude]) / np.sum(weights)
+    return PriorValue(float(np.exp(logarithm)), float(np.sum(weights) ** -0.5))
 
 
-def _known(value: float, covariance: FloatArray, gradient: dict[int, float]) -> Known:
-    by = np.zeros(len(covariance))
-    for index, derivative in gradient.items():
-        by[index] = derivative
-    return Known(value, math.sqrt(float(by @ covariance @ by)))
+def excitation_config(config: TestbedConfig, duration: float) -> TestbedConfig:
+    """Return `config` with `duration` s of the excitation instead of its steps, without camera and paths."""
+    return configuration.replace(
+        config,
+        name=f"identify {config.name}"[:64],
+        camera=None,
+        guidance=configuration.replace(config.guidance, strategy="step"),
+        control=configuration.replace(config.control, tracker="excitation"),
+        steps=(Step(at=0.0, q2=0.0),),
+        duration=duration,
+    )
+
+
+def config_text(config: TestbedConfig) -> str:
+    """Return a configuration as text for `flight.schema.reader`."""
+    return to_yaml(msgspec.to_builtins(config))
+
+
+def prior_of(config: TestbedConfig) -> PlantPrior:
+    """Return the prior values of a configuration with their errors."""
+    plant, known = config.plant, config.identification
+    return PlantPrior(
+        inertia=PriorValue(plant.inertia, known.inertia_error),
+        dipole=PriorValue(plant.coil_turns * plant.coil_area, known.dipole_error),
+        field=PriorValue(plant.field, known.field_error),
+        magnetometer_error=known.magnetometer_error,
+    )
+
+
+def configured_constants(config: TestbedConfig) -> MotionConstants:
+    """Return the constants per inertia of a configuration."""
+    plant = config.plant
+    gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
+    stiffness, damping = plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia
+    return MotionConstants(gain, stiffness, damping)
+
+
+def noise_of(config: TestbedConfig) -> MotionNoise:
+    """Return the noise of a configuration, from which a fit starts."""
+    unit = config.inertial_unit
+    return MotionNoise(max(config.estimation.current_noise, 1e-4), unit.angle_noise, unit.rate_noise)
+
+
+def plant_section(plant: AbsolutePlant, coil_turns: int) -> Plant:
+    """Return the section `plant` of a configuration. Negative stiffness and damping become zero."""
+    return Plant(
+        inertia=plant.inertia.value,
+        coil_turns=coil_turns,
+        coil_area=plant.dipole.value / coil_turns,
+        field=plant.field.value,
+        thread_stiffness=max(plant.stiffness.value, 0.0),
+        thread_damping=max(plant.damping.value, 0.0),
+    )
+
+
+def plant_text(plant: AbsolutePlant, coil_turns: int, origin: str) -> str:
+    """Return the section `plant` as YAML text with uncertainties and sources; `origin` names the flight."""
+    section, sources = plant_section(plant, coil_turns), plant.sources()
+    area = replace(plant.dipole, sigma=plant.dipole.sigma / coil_turns)
+    text = [f"# Made by `python -m flight identify` from {origin}; +- is 1 sigma.", "plant:"]
+    for name, found, unit, source in (
+        ("inertia", plant.inertia, "kg m^2", sources["inertia"]),
+        ("coil_turns", None, "", ""),
+        ("coil_area", area, "m^2", sources["dipole"]),
+        ("field", plant.field, "T", sources["field"]),
+        ("thread_stiffness", plant.stiffness, "N m/rad", sources["stiffness"]),
+        ("thread_damping", plant.damping, "N m s/rad", sources["damping"]),
+    ):
+        value = getattr(section, name)
+        if found is None:
+            number, comment = str(value), "from the configuration"
+        elif found.value < 0.0:
+            number = f"{value:.6e}"
+            comment = f"{unit}: the fit gives {found.value:.2g} +- {found.sigma:.2g}, set to zero"
+        else:
+            number, comment = f"{value:.6e}", f"{unit} +- {found.sigma:.2g}: {source}"
+        text.append(f"  {name + ': ' + number:34s}# {comment}")
+    return "\n".join(text) + "\n"

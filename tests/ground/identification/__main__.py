@@ -11,8 +11,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ground.identification.fit import fit
-from ground.identification.preparation import beliefs_of, noise_of
-from ground.identification.scale import absolute
+from ground.identification.scale import absolute, noise_of, prior_of
 from tests.ground.identification.worlds import believed, drawn, fly_bare, fly_stack, motion_error, scale_error
 
 
@@ -39,7 +38,7 @@ def main() -> int:
         found = fit(record, noise)
         error = motion_error(world, found.constants)
         motion.append((error, found.covariance[:3, :3]))
-        plant = absolute(found, beliefs_of(config), record.field)
+        plant = absolute(found, prior_of(config), record.field)
         # One of the six is a combination of the others: the first three and the last two are left.
         keep = [0, 1, 2, 4, 5]
         scaled.append((scale_error(world, plant)[keep], plant.covariance[np.ix_(keep, keep)]))

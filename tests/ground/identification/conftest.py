@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ground.identification.fit import PlantFit, fit
-from ground.identification.preparation import noise_of
 from ground.identification.record import Record
+from ground.identification.scale import noise_of
 from tests.ground.identification.worlds import World, believed, drawn, fly_bare
 
 Identified = tuple[World, Record, PlantFit]

@@ -11,10 +11,9 @@ import numpy as np
 from flight.bodies.testbed.thread import plant_of
 from flight.schema import reader as configuration
 from flight.schema.testbed import Identification, TestbedConfig
-from ground.identification.constants import Constants
-from ground.identification.preparation import excitation_config
-from ground.identification.record import FieldMeasurement, Record, read_record
-from ground.identification.scale import AbsolutePlant
+from ground.identification.fit import MotionConstants
+from ground.identification.record import HorizontalField, Record, read_record
+from ground.identification.scale import AbsolutePlant, excitation_config
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
 from knightcube.gnc.guidance.one_axis.path import PathSample
@@ -41,9 +40,9 @@ class World:
     seed: int = 1
 
     @property
-    def constants(self) -> Constants:
+    def constants(self) -> MotionConstants:
         """The constants per inertia."""
-        return Constants(
+        return MotionConstants(
             gain=self.dipole * self.field / self.inertia,
             torsion=self.stiffness / self.inertia,
             damping=self.damping / self.inertia,
@@ -137,11 +136,11 @@ def fly_bare(
         current=current,
         clipped=np.zeros(count, dtype=bool),
         period=PERIOD,
-        field=FieldMeasurement(world.field * world.magnetometer, 0.0, count),
+        field=HorizontalField(world.field * world.magnetometer, 0.0, count),
     )
 
 
-def motion_error(world: World, constants: Constants) -> FloatArray:
+def motion_error(world: World, constants: MotionConstants) -> FloatArray:
     """Return found less true gain, torsion and damping (3,)."""
     return np.asarray(constants.to_array() - world.constants.to_array())[:3]
 
