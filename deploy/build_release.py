@@ -85,7 +85,7 @@ class Build:
 
     def _test(self, python: Path) -> None:
         """Import, ask for the version, and fly ten seconds in lock-step."""
-        self._run([python, "-c", "import flight.app.flight, flight.loop.executive.worker"])
+        self._run([python, "-c", "import flight.app.flight, flight.loop.worker"])
         self._run([python, "-m", "flight", "--version"])
         with tempfile.TemporaryDirectory() as folder:
             words = ["run", self._source / "config/step_demo.yaml", "--duration", SELF_TEST_S]

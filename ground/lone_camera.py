@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from flight.app.accepted_config import requested_config
-from flight.app.devices import linux_camera
-from flight.app.request import RunRequest
-from flight.app.simulated import simulated_camera
+from flight.app.devices import linux_camera, simulated_camera
+from flight.app.run import RunRequest
 from flight.schema.devices import Camera
 from flight.schema.errors import ConfigError
 from hal.buses.clock import SystemClock

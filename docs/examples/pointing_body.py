@@ -23,18 +23,26 @@ import numpy as np
 
 from flight.bodies.testbed.body import (
     TestbedEstimation,
-    brake_of,
+    detumbling_law,
     dipole_per_ampere,
     surrounding_field,
 )
-from flight.bodies.testbed.thread import plant_of
+from flight.bodies.testbed.guidance import plant_of
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
-from flight.loop.body import COMMANDED, KEPT, Body, BodyControl, BodyKind, CoilCommand, ControlOutput, Target
-from flight.loop.executive.executive import Cycle
-from flight.loop.executive.jobs import JobResult
-from flight.loop.services import Services
-from flight.loop.state.content import Learned
+from flight.loop.body import (
+    COMMANDED,
+    KEPT,
+    BodyControl,
+    BodyKind,
+    CoilCommand,
+    ControlOutput,
+    FlightBody,
+    Target,
+)
+from flight.loop.executive import Cycle, JobResult
+from flight.loop.facts import Services
+from flight.loop.state import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import read_run
@@ -270,13 +278,13 @@ class PointingControl(BodyControl):
         self.paths = self.planner = direct
         self.targets = Attitudes(config, direct)
         self.tracker = CrossProductTracker(config, surrounding_field(config))
-        self.brake = brake_of(config, plant_of(config))
+        self.brake = detumbling_law(config, plant_of(config))
 
 
-def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     """Return the body of a configuration, with what an earlier boot learned."""
     config = as_testbed(config)
-    return Body(TestbedEstimation(config, learned), PointingControl(config), View(services))
+    return FlightBody(TestbedEstimation(config, learned), PointingControl(config), View(services))
 
 
 def plan(job: Any) -> Any:

@@ -22,10 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.app.request import RunRequest
-from flight.app.simulated import corrupted_text
-from flight.loop.state.keeper import service_folder
-from flight.loop.state.store import LARGEST_FILE, LinuxFiles, replace_file
+from flight.app.devices import corrupted_text
+from flight.app.run import RunRequest
+from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_folder
 from flight.schema import reader as configuration
 from flight.schema.document import checked_length, no_such_file, read_text
 from flight.schema.errors import ConfigError, UnreadConfigError

@@ -10,33 +10,31 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.app.devices import Devices
 from flight.link.commands.channel import Channel
 from flight.link.telemetry.log import Recorder
-from flight.loop.body import PLANNER, Body, BodyKind, Planner
-from flight.loop.executive.jobs import JobRunner, Worker
-from flight.loop.fdir.facts import EventLog, Facts, Streams, streams_of
-from flight.loop.fdir.supervision import WorkerWatch
+from flight.loop import horizon_cameras as horizon_task
+from flight.loop import imaging as imaging_task
+from flight.loop.body import PLANNER, BodyKind, FlightBody, Planner
+from flight.loop.commanding import CommandedTasks, CommandTask, ParameterTable, ParameterUsers
+from flight.loop.control_cycle import LoopTasks
+from flight.loop.executive import JobRunner, Worker
+from flight.loop.facts import EventLog, Facts, Services, Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
-from flight.loop.services import Devices, Services
-from flight.loop.state.content import Learned
-from flight.loop.state.keeper import StateKeeper
-from flight.loop.tasks import imaging as imaging_task
-from flight.loop.tasks import wide_imaging as wide_task
-from flight.loop.tasks.commanding import CommandedTasks, Commanding, ParameterTable, ParameterUsers
-from flight.loop.tasks.control_cycle import LoopTasks
-from flight.loop.tasks.frame_measurements import ImagingSettings
-from flight.loop.tasks.health import (
+from flight.loop.health import (
     HealthInputs,
     HealthWatch,
     Housekeeping,
     HousekeepingInputs,
     PerformanceObserver,
+    WorkerWatch,
 )
-from flight.loop.tasks.imaging import Imaging, ObjectTracks
-from flight.loop.tasks.mode_control import ModeControl, ModeSettings
-from flight.loop.tasks.navigation import Navigation, NavigationSettings, Positioning, SunSensing
-from flight.loop.tasks.steering import CoilDrive, CoilDriveSettings, Steering
-from flight.loop.tasks.wide_imaging import WideImaging, WideSettings
+from flight.loop.horizon_cameras import HorizonCameraSettings, HorizonCameraTask
+from flight.loop.imaging import Imaging, ImagingSettings, ObjectTracks
+from flight.loop.modes import ModeControl, ModeSettings
+from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
+from flight.loop.state import Learned, StateKeeper
+from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
 from flight.schema.devices import ObjectTracking as TrackingSection
@@ -84,7 +82,7 @@ def navigation_settings(config: Config) -> NavigationSettings:
     )
 
 
-def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> ImagingSettings:
+def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> ImagingSettings:
     """Return the settings of imaging; `frames` is the folder of frames that are kept."""
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
@@ -111,11 +109,11 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
     )
 
 
-def wide_settings(cameras: Sequence[WideCamera]) -> WideSettings:
+def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSettings:
     """Return the times of the wide cameras, those of the most frequent one for all."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
-    return WideSettings(
+    return HorizonCameraSettings(
         [round(camera.exposure * SECOND_NS) for camera in cameras],
         period_ns - SECOND_NS // 2,  # run once a second, which may come late
         fine_ns - SECOND_NS // 2,
@@ -159,7 +157,7 @@ def _saturation(camera: Camera) -> float:
     return camera.saturation or float(2**camera.bits - 1)
 
 
-def _estimator(camera: Camera, body: Body) -> LikelihoodSettings | StreakEstimator:
+def _estimator(camera: Camera, body: FlightBody) -> LikelihoodSettings | StreakEstimator:
     """Return the configured estimator of streaks. Raises ConfigError for one that the body does not have."""
     if camera.estimator == "likelihood":
         return replace(likelihood_settings(camera), saturation=_saturation(camera))
@@ -179,19 +177,19 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     if config.camera is not None:
         made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     if config.wide_cameras:
-        made.append(Worker(wide_task.WORKER, horizon_camera_job.run, vision_latency_ns, vision_timeout_ns))
+        made.append(Worker(horizon_task.WORKER, horizon_camera_job.run, vision_latency_ns, vision_timeout_ns))
     return made
 
 
 def worker_watches(
-    limits: Executive, planner: Planner, imaging: Imaging | None, wide: WideImaging | None
+    limits: Executive, planner: Planner, imaging: Imaging | None, wide: HorizonCameraTask | None
 ) -> list[WorkerWatch]:
     """Return the watch over each worker, with twice the timeout of the runner as its patience."""
     busy = [(PLANNER, planner.busy_since_ns, limits.planner_timeout)]
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, limits.vision_timeout))
     if wide is not None:
-        busy.append((wide_task.WORKER, wide.busy_since_ns, limits.vision_timeout))
+        busy.append((horizon_task.WORKER, wide.busy_since_ns, limits.vision_timeout))
     return [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
 
 
@@ -239,7 +237,7 @@ def _tasks(
     config: Config,
     opened: Opened,
     services: Services,
-    body: Body,
+    body: FlightBody,
     keeper: StateKeeper | None,
     stop: Callable[[str], None],
 ) -> LoopTasks:
@@ -264,7 +262,7 @@ def _tasks(
         config, ParameterUsers((modes.adopt, drive.adopt), health.adopt), keeper, services
     )
     obeying = CommandedTasks(modes, drive, parameters)
-    commanding = Commanding(obeying, timeline, opened.channels, services) if commanded else None
+    commanding = CommandTask(obeying, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
     return LoopTasks(
@@ -283,13 +281,15 @@ def _tasks(
     )
 
 
-def _drive(config: Config, devices: Devices, body: Body, services: Services) -> CoilDrive:
+def _drive(config: Config, devices: Devices, body: FlightBody, services: Services) -> CoilDrive:
     limits = np.full(3, config.coils.current_limit)
     settings = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
-    return CoilDrive(devices.coils, devices.power, body.estimation.coil_watch, settings, services)
+    return CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, settings, services)
 
 
-def _positioning(config: Config, devices: Devices, body: Body, services: Services) -> Positioning | None:
+def _positioning(
+    config: Config, devices: Devices, body: FlightBody, services: Services
+) -> Positioning | None:
     if config.gps is None or devices.gps is None:
         return None
     return Positioning(
@@ -297,7 +297,7 @@ def _positioning(config: Config, devices: Devices, body: Body, services: Service
     )
 
 
-def _sun(config: Config, devices: Devices, body: Body, services: Services) -> SunSensing | None:
+def _sun(config: Config, devices: Devices, body: FlightBody, services: Services) -> SunSensing | None:
     if config.solar_strings is None or devices.strings is None:
         return None
     return SunSensing(
@@ -305,14 +305,16 @@ def _sun(config: Config, devices: Devices, body: Body, services: Services) -> Su
     )
 
 
-def _wide(config: Config, devices: Devices, body: Body, services: Services) -> WideImaging | None:
+def _wide(config: Config, devices: Devices, body: FlightBody, services: Services) -> HorizonCameraTask | None:
     if not config.wide_cameras or not devices.wide or body.estimation.wide is None:
         return None
-    return WideImaging(devices.wide, body.estimation.wide, wide_settings(config.wide_cameras), services)
+    return HorizonCameraTask(
+        devices.wide, body.estimation.wide, horizon_camera_settings(config.wide_cameras), services
+    )
 
 
 def _imaging(
-    config: Config, opened: Opened, navigation: Navigation, body: Body, services: Services
+    config: Config, opened: Opened, navigation: Navigation, body: FlightBody, services: Services
 ) -> Imaging | None:
     camera, source = config.camera, opened.devices.camera
     if camera is None or source is None:

@@ -1,18 +1,32 @@
-"""Opens Linux's wires (serial port, I2C bus, camera), and the configured devices on the wires of a rig."""
+"""Opens the wires (Linux's or the simulator's), and the configured devices on them.
+
+`sim_hal.rig` is the only module of the simulator that the flight application imports, and only for a
+simulated flight: on board none of it is imported.
+"""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flight.app.run import RunRequest
+from flight.schema.sections import Config
+from hal.interfaces.wires import Rig
+from knightcube.astro.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from sim_hal.rig import PosedCamera, SimulationRequest
 import os
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
 
 import numpy as np
 
-from flight.loop.services import Devices
-from flight.loop.state.keeper import state_folder
+from flight.loop.state import state_folder
 from flight.schema.devices import AravisDevice, Camera, V4l2Device
 from flight.schema.errors import ConfigError
 from flight.schema.orbit_devices import WideCamera
-from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
 from hal.buses.serial_port import PySerialPort
@@ -26,11 +40,80 @@ from hal.drivers.pca9685 import Pca9685, switch_off
 from hal.drivers.ublox import UbloxReceiver
 from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
-from hal.interfaces.devices import FrameSource
+from hal.interfaces.devices import (
+    FrameSource,
+    GpsReceiver,
+    InertialUnit,
+    PowerMonitor,
+    SolarStrings,
+    TorqueCoils,
+)
 from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.guardian import CoilReach
-from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
+from hal.interfaces.wires import SECOND_NS, Clock, Wires
 from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
+
+
+def fault_catalogue() -> tuple[str, str]:
+    """Return how faults of a simulation are written, and a list of all."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.fault_catalogue()
+
+
+def corrupted_text(request: RunRequest, text: str) -> str:
+    """Return a configuration as the requested faults corrupt it; unchanged where none does."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.corrupted_text(request.faults, text, request.seed)
+
+
+def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
+    """Return the faults of a flight as they are written, the configuration's first."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.injected_faults(_simulation_request(request, text))
+
+
+def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
+    """Open the emulated devices of a configuration, with the request's faults. Raises UsageError."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.open_rig(_simulation_request(request, text), config, stack)
+
+
+def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatArray) -> PosedCamera:
+    """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
+    from sim_hal import rig  # noqa: PLC0415
+
+    return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config, rate)
+
+
+def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
+    from sim_hal.rig import SimulationRequest  # noqa: PLC0415
+
+    return SimulationRequest(
+        request.config_path,
+        text,
+        request.out,
+        request.realtime,
+        request.seed,
+        request.devices,
+        request.faults,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Devices:
+    """The open devices; all but unit and coils are optional, those of an orbit come last."""
+
+    unit: InertialUnit
+    coils: TorqueCoils
+    power: PowerMonitor | None
+    camera: FrameSource | None
+    gps: GpsReceiver | None = None
+    strings: SolarStrings | None = None
+    wide: tuple[FrameSource, ...] = ()
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:

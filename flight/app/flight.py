@@ -1,32 +1,107 @@
-"""A flight from its request to its result. The coils are at zero when `fly` returns or raises."""
+"""A flight from its request to its result. The coils are at zero when `fly` returns or raises.
+
+`open_flight` opens logs, guardian, devices, workers and channels on a rig, in this order.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from shutil import rmtree
 
 from flight.app.accepted_config import Chosen, FlownConfig, accepted_config, requested_config
-from flight.app.devices import check_settings, linux_rig
-from flight.app.opening import open_flight
-from flight.app.request import RunRequest, RunResult
-from flight.app.run_folder import begin_folder
+from flight.app.composition import Opened, build_loop, workers
+from flight.app.devices import check_settings, injected_faults, linux_rig, open_devices, simulated_rig
+from flight.app.run import RunRequest, RunResult, begin_folder, open_log
 from flight.app.service import EndingSignals, FlownRelease, StartRetry, retried_start
-from flight.app.simulated import injected_faults, simulated_rig
+from flight.app.supervision import start_guardian, supervise
 from flight.link import events
-from flight.link.telemetry.log import FlightLog
-from flight.loop.flight_loop import FlightLoop
-from flight.loop.flight_status import FlightProgress, RunLabel
-from flight.loop.state.keeper import service_folder
+from flight.link.commands.channel import Channel, open_udp, open_unix
+from flight.link.telemetry.log import FlightLog, Recorder
+from flight.loop.executive import JobResult, JobRunner, LockStepRunner
+from flight.loop.flight_loop import FlightLoop, FlightProgress, RunLabel, Supervisors, nothing
+from flight.loop.health import Board
+from flight.loop.state import open_state, service_folder
+from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
 from flight.schema.document import read_text
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
+from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig
 from knightcube.errors import UsageError
+from knightcube.vision.camera import images
+from knightcube.vision.startracker.index.build import ensure_default_index
+
+
+def open_flight(
+    config: Config,
+    rig: Rig,
+    folder: Path,
+    stack: ExitStack,
+    *,
+    patient: bool = False,
+    earlier: Sequence[Path] = (),
+) -> tuple[FlightLoop, FlightLog]:
+    """Open logs, devices and workers; return the loop, ready to run, and its log.
+
+    `stack` closes everything in the opposite order, the coils at zero. Raises DeviceError for a device that
+    does not answer; a `patient` flight waits in BOOT for devices and for a disk that cannot be written.
+    `earlier` are folders of earlier runs, which show an old state.
+    """
+    flight_log = open_log(folder, "flight", rig, config, stack, patient)
+    performance_log = open_log(folder, "performance", rig, config, stack, patient)
+    # Closed after the devices, with the coils at zero; opened last, so that a boot counts once it flies.
+    after_coils = stack.enter_context(ExitStack())
+    guardian = start_guardian(rig, stack)
+    devices = open_devices(config, rig, stack, patient)
+    tracker = config.camera.star_tracker if config.camera is not None else None
+    if tracker is not None and tracker.index is None:
+        ensure_default_index()
+    elif tracker is not None and not patient and not Path(tracker.index or "").is_file():
+        raise ConfigError("camera.star_tracker.index", f"is {tracker.index!r}: there is no such file")
+    jobs = _open_jobs(config, rig, stack, worker_cores() if patient else frozenset())
+    recorder = Recorder(flight_log, performance_log)
+    feed, beat = nothing, nothing
+    if guardian is not None:
+        guardian.wait_ready(patient=patient)
+        supervision = supervise(guardian, rig.clock, recorder, stack)
+        feed, beat = supervision.feed, supervision.beat
+    channels = _open_channels(config, stack)
+    keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
+    frames = folder / images.KEPT_FRAMES_FOLDER
+    opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
+    board = Board(folder) if rig.realtime else None
+    loop = build_loop(config, opened, Supervisors(beat, keeper, board))
+    return loop, flight_log
+
+
+def _open_jobs(config: Config, rig: Rig, stack: ExitStack, cores: Set[int]) -> JobRunner:
+    specs = workers(config, *rig.latency)
+    made = specs if rig.host is None else rig.host.workers(specs)
+    runner: JobRunner = (
+        ProcessRunner(rig.clock, made, cores) if rig.realtime else LockStepRunner(rig.clock, made)
+    )
+    stack.callback(runner.close)
+    return runner if rig.host is None else rig.host.jobs(runner, specs, JobResult)
+
+
+def _open_channels(config: Config, stack: ExitStack) -> list[Channel]:
+    """Open the configured command channels."""
+    channels: list[Channel] = []
+    if config.commands.socket is not None:
+        channels.append(open_unix(Path(config.commands.socket)))
+    if config.commands.udp is not None:
+        channels.append(open_udp(config.commands.udp))
+    for channel in channels:
+        stack.callback(channel.close)
+    return channels
+
 
 _GRID_NS = 25_000_000
 

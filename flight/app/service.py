@@ -28,8 +28,7 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from flight.loop.flight_loop import FlightLoop
-from flight.loop.state.keeper import service_folder
-from flight.loop.state.store import LinuxFiles, replace_file
+from flight.loop.state import LinuxFiles, replace_file, service_folder
 from flight.schema.errors import UnreadConfigError
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import ServiceManager

@@ -13,11 +13,10 @@ from enum import IntEnum
 from typing import Any, Protocol
 
 from flight.link.modes import Mode
-from flight.loop.executive.executive import Cycle
-from flight.loop.executive.jobs import JobResult
-from flight.loop.fdir.coil_watch import CoilWatch
-from flight.loop.services import Services
-from flight.loop.state.content import Learned, learned_of
+from flight.loop.coil_monitor import CoilMonitor
+from flight.loop.executive import Cycle, JobResult
+from flight.loop.facts import Services
+from flight.loop.state import Learned, learned_of
 from flight.schema.sections import Config
 from hal.interfaces.devices import CoilState, Frame, GpsReading, ImuReading, StringReading
 from knightcube.astro.arrays import FloatArray, IntArray
@@ -174,7 +173,7 @@ class Filter(Protocol):
         """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
 
 
-class Feed(Protocol):
+class ReadingFeed(Protocol):
     """Gives the filter the quantities of a reading that have a meaning for this body."""
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
@@ -184,7 +183,7 @@ class Feed(Protocol):
         """Start the filter from an attitude of the stars, without an estimate; return whether it did."""
 
 
-class Brake(Protocol):
+class WindowedLaw(Protocol):
     """Brakes a tumble by magnetometer and gyro, in windows in which the coils pause."""
 
     def begin(self, now_ns: int) -> None:
@@ -216,7 +215,7 @@ class Tracker(Protocol):
         """Forget integrated errors: the coils were off, or the estimate was lost."""
 
 
-class Paths(Protocol):
+class FlownPaths(Protocol):
     """The path being flown."""
 
     def sample(self, now_ns: int) -> Any | None:
@@ -260,7 +259,7 @@ class Planner(Protocol):
         """Return how many plans were accepted and refused since the start."""
 
 
-class Targets(Protocol):
+class BodyTargets(Protocol):
     """The body's targets, and the distance from them."""
 
     def configured(self, mission_time_ns: int) -> Target:
@@ -304,7 +303,7 @@ class BodyView(Protocol):
         """Return target and attitude as text, for the progress line."""
 
 
-class WideCameraUse(Protocol):
+class HorizonCameraUse(Protocol):
     """The use of the wide cameras' frames by a body."""
 
     @property
@@ -327,16 +326,16 @@ class BodyEstimation(Protocol):
     Attributes:
         filter: estimates attitude, rate and the body's parameters.
         feed: passes the readings of the inertial unit to the filter.
-        coil_watch: compares commanded currents with the supply current and the motion.
+        coil_monitor: compares commanded currents with the supply current and the motion.
         learned_problems: why parameters that an earlier boot learned were rejected.
         wide: makes jobs of the wide cameras' frames and accepts the results; None: they are not used.
     """
 
     filter: Filter
-    feed: Feed
-    coil_watch: CoilWatch
+    feed: ReadingFeed
+    coil_monitor: CoilMonitor
     learned_problems: list[str]
-    wide: WideCameraUse | None = None
+    wide: HorizonCameraUse | None = None
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the magnetic field (3,) T in body axes at an estimate, for the reallocation of currents."""
@@ -391,12 +390,12 @@ class BodyControl(Protocol):
     modes: frozenset[Mode]
     dipole_per_ampere: float
     free_axis: FloatArray | None
-    targets: Targets
+    targets: BodyTargets
     planner: Planner
-    paths: Paths
+    paths: FlownPaths
     tracker: Tracker
-    brake: Brake
-    sun_acquisition: Brake | None = None
+    brake: WindowedLaw
+    sun_acquisition: WindowedLaw | None = None
 
     def follows_objects(self) -> bool:
         """Return whether an object is searched for or followed, so that no frame is skipped."""
@@ -412,7 +411,7 @@ class BodyControl(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class FlightBody:
     """A body ready to fly.
 
     Attributes:
@@ -435,4 +434,4 @@ class BodyKind:
     """
 
     plan: Callable[[Any], Any] | None
-    make: Callable[[Config, Services, Mapping[str, Learned]], Body]
+    make: Callable[[Config, Services, Mapping[str, Learned]], FlightBody]

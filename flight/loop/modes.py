@@ -1,17 +1,34 @@
-"""The state machine of the satellite's modes: triggers, transition table and machine.
+"""Modes: the state machine of the satellite, and the task that turns commands into transitions.
 
 The table holds the result of every trigger in every mode. `TriggerAnswer.STAY` is for a trigger without
 effect in that mode, `TriggerAnswer.REFUSE` for a command that is refused.
+
+`AttitudeWatch` observes the attitude and the spin of a body that must acquire its attitude, `PointingWatch`
+the rate and the pointing error of a steered body. `HoldTimer` measures how long a condition has held without
+interruption. Entering a mode never waits for an estimate: a hold takes its attitude from the first cycle with
+an estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from flight.link.modes import Mode
-from knightcube.errors import FlightError
+from flight.link import events
+from flight.link.events import EventKind, Reaction
+from flight.link.modes import ORBITAL, POINTING, STEERING, Mode
+from flight.link.telemetry.definitions import MODE
+from flight.loop import facts
+from flight.loop.body import BodyTargets, FlightBody, Target
+from flight.loop.facts import Facts, Services
+from flight.loop.steering import Steering
+from flight.schema.errors import ConfigError
+from flight.schema.sections import Modes
+from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
 
 
 class Trigger(Enum):
@@ -250,3 +267,421 @@ class ModeMachine:
         change = ModeChange(self.mode, after, trigger)
         self.mode, self.since_ns = after, now_ns
         return change
+
+
+class HoldTimer:
+    """Detects that a condition has held for a given time."""
+
+    def __init__(self, seconds: float) -> None:
+        self._needed_ns = round(seconds * 1e9)
+        self._since_ns: int | None = None
+
+    def require(self, seconds: float) -> None:
+        """Ask for another time from now on."""
+        self._needed_ns = round(seconds * 1e9)
+
+    def update(self, holds: bool, now_ns: int) -> bool:
+        """Update whether the condition holds now; return whether the condition has held for long enough."""
+        if not holds:
+            self._since_ns = None
+            return False
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        return now_ns - self._since_ns >= self._needed_ns
+
+    def reset(self) -> None:
+        """Start from zero."""
+        self._since_ns = None
+
+
+class AttitudeWatch:
+    """Finds the triggers between acquisition and pointing, and when SAFE has to brake the body.
+
+    Attributes:
+        follows: the mode that follows the acquisition; None where the body rests.
+        detumbles: whether a body in SAFE is detumbled.
+        acquires_sun: whether a body in SAFE turns to the Sun.
+    """
+
+    def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
+        """`low_rate` rad/s for `low_for` s ends the braking."""
+        self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
+        self.detumbles = self.acquires_sun = False
+        self._fast, self._low = settings.tumble_rate, low_rate
+        self._known = HoldTimer(settings.known_for)
+        self._lost = HoldTimer(settings.lost_for)
+        self._spins = HoldTimer(settings.known_for)
+        self._slow = HoldTimer(low_for)
+
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._fast = settings.tumble_rate
+        self._lost.require(settings.lost_for)
+        for timer in (self._known, self._spins):
+            timer.require(settings.known_for)
+
+    def reset(self) -> None:
+        """Begin again: another mode is entered."""
+        self.detumbles = self.acquires_sun = False
+        for timer in (self._known, self._lost, self._spins, self._slow):
+            timer.reset()
+
+    def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
+        """Return the trigger that is due; `known`: whether there is an attitude to steer by."""
+        if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
+            return KNOWN[self.follows]
+        if mode in POINTING and self._lost.update(not known, now_ns):
+            return Trigger.LOST
+        return None
+
+    def watch_safe(
+        self,
+        rate: float,
+        barred: bool,
+        detumble: Callable[[int], None],
+        acquire_sun: Callable[[int], None],
+        now_ns: int,
+    ) -> None:
+        """Detumble a body in SAFE that turns fast until it is slow; otherwise turn it to the Sun.
+
+        Neither while `barred` by a latched fault. `detumble` and `acquire_sun` are called when either begins.
+        """
+        if self.detumbles:
+            self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
+        elif self._spins.update(rate > self._fast and not barred, now_ns):
+            self._slow.reset()
+            self.detumbles = True
+            detumble(now_ns)
+        acquires_sun = not (barred or self.detumbles)
+        if acquires_sun and not self.acquires_sun:
+            acquire_sun(now_ns)
+        self.acquires_sun = acquires_sun
+
+
+class PointingWatch:
+    """Updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
+
+    def __init__(self, settings: Modes, targets: BodyTargets, facts_: Facts) -> None:
+        self._settings = settings
+        self._targets = targets
+        self._facts = facts_
+        self._off = HoldTimer(settings.hold_patience)
+
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._settings = settings
+        self._off.require(settings.hold_patience)
+
+    def reset(self) -> None:
+        """Restart the timer of the pointing error: another mode is entered."""
+        self._off.reset()
+
+    def watch_rate(self, rate: float, now_ns: int) -> None:
+        """Update TUMBLING from a rate, rad/s, not negative."""
+        limit = self._settings.tumble_rate
+        self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
+
+    def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
+        """Update both facts from the pointing error `off`, rad; return the error, 0 where `off` is None.
+
+        `off` is None while there is no attitude to be reached yet.
+        """
+        settings = self._settings
+        self.watch_rate(self._targets.speed(estimate), now_ns)
+        error = 0.0 if off is None else off
+        impossible = self._off.update(error > settings.hold_error, now_ns)
+        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
+        self._facts.update(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        return error
+
+
+SAFING_REACTIONS = {
+    Reaction.SAFE: Trigger.REACT_SAFE,
+    Reaction.DETUMBLE: Trigger.REACT_DETUMBLE,
+    Reaction.HOLD: Trigger.REACT_HOLD,
+}
+"""The trigger of each reaction that may change the mode."""
+
+
+def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
+    """Return the modes in which a reaction has an effect: all, for a reaction that changes no mode."""
+    trigger = SAFING_REACTIONS.get(reaction)
+    if trigger is None:
+        return frozenset(Mode)
+    return frozenset(mode for mode, row in TRANSITIONS.items() if isinstance(row[trigger], Mode))
+
+
+@dataclass(frozen=True, slots=True)
+class ModeSettings:
+    """Bounds of the modes.
+
+    Attributes:
+        low_rate, low_for: rad/s and s: a rate below `low_rate` for `low_for` ends detumbling.
+        stop: ends the flight after the running cycle, with a reason.
+    """
+
+    modes: Modes
+    low_rate: float
+    low_for: float
+    stop: Callable[[str], None]
+
+
+class ModeControl:
+    """Owns the state machine, and the targets that are not configured.
+
+    Longer than 200 lines because commands, reactions and achievements all act on the one mode and its target.
+
+    Attributes:
+        restart: why the process should be restarted; empty when it should not.
+        wanted: the target of a hold, a slew, the Sun, or a command to point; None in other modes.
+    """
+
+    def __init__(
+        self, settings: ModeSettings, body: FlightBody, steering: Steering, services: Services
+    ) -> None:
+        """Take the tasks that modes act on.
+
+        Raises FlightError for a fact whose reaction has no effect, ConfigError for an initial mode that the
+        body does not have.
+        """
+        facts.check(facts.FACTS, modes_moved_by)
+        self._settings = settings.modes
+        self._stop = settings.stop
+        self._machine = ModeMachine()
+        self._targets = body.control.targets
+        self._paths = body.control.paths
+        self._view = body.view
+        self._steering = steering
+        self._facts = services.facts
+        self._recorder = services.recorder
+        self._events = services.events
+        self._low_rate = settings.low_rate
+        self._modes = body.control.modes
+        self._initial = Mode.named(settings.modes.initial)
+        if self._initial not in body.control.modes:
+            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {_starts(body)}")
+        self._crashed, self._too_many_crashes = 0, False
+        self._commands = 0
+        self._measured_ns = 0
+        self._slow = HoldTimer(settings.low_for)
+        self._arrived = HoldTimer(settings.modes.arrived_for)
+        self._pointing = PointingWatch(settings.modes, body.control.targets, services.facts)
+        self._attitude = AttitudeWatch(settings.modes, settings.low_rate, settings.low_for)
+        self.restart = ""
+        self.wanted: Target | None = None
+        self._pointed: Target | None = None
+        services.events.react_by(self.react)
+
+    @property
+    def mode(self) -> Mode:
+        """The mode."""
+        return self._machine.mode
+
+    @property
+    def since_ns(self) -> int:
+        """When it was entered."""
+        return self._machine.since_ns
+
+    @property
+    def flies_steps(self) -> bool:
+        """Whether the configured steps are flown, or will be once the devices give good data."""
+        booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
+        return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
+
+    @property
+    def detumbles(self) -> bool:
+        """Whether the body is to be braked: in DETUMBLE, and in SAFE while it spins."""
+        return self.mode is Mode.DETUMBLE or self._attitude.detumbles
+
+    @property
+    def acquires_sun(self) -> bool:
+        """Whether the body is to turn to the Sun without an attitude: in SAFE, once it is slow."""
+        return self._attitude.acquires_sun
+
+    def target(self, mission_time_ns: int) -> Target | None:
+        """Return the target in force at a mission time; None in a mode without one."""
+        configured = self.flies_steps or (self.mode is Mode.POINT and self.wanted is None)
+        return self._targets.configured(mission_time_ns) if configured else self.wanted
+
+    def adopt(self, modes: Modes) -> None:
+        """Go on with other bounds."""
+        self._settings = modes
+        self._arrived.require(modes.arrived_for)
+        self._pointing.adopt(modes)
+        self._attitude.adopt(modes)
+
+    def begin(self, now_ns: int, unclean_recent: int) -> None:
+        """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
+        self._machine.since_ns = self._measured_ns = now_ns
+        self._crashed = unclean_recent
+        self._too_many_crashes = unclean_recent >= self._settings.crash_limit
+        self._record(Mode.BOOT, "begin", "", now_ns)
+
+    def step(
+        self,
+        estimate: Estimate | None,
+        rate: float | None,
+        overdue: float | None,
+        coils_answer: bool,
+        now_ns: int,
+    ) -> Mode:
+        """Check the conditions of the present mode; return the mode to act in.
+
+        `rate` rad/s is the magnitude of the newest body rate measured in this cycle, None without one;
+        `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
+        the body is on its way.
+        """
+        # A body that acquires its attitude needs no estimate: a measured rate is enough.
+        measured = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
+        self._measured_ns = now_ns if measured else self._measured_ns
+        if self.mode is Mode.BOOT:
+            self._boot(measured and coils_answer, now_ns)
+        blind = (now_ns - self._measured_ns) * 1e-9
+        text = f"no estimate for {blind:.0f} s"
+        self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
+        if self.mode is Mode.DETUMBLE and rate is not None:
+            self._brake(estimate, rate, now_ns)
+        elif self.mode in ORBITAL and rate is not None:
+            self._pointing.watch_rate(rate, now_ns)
+        elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
+            barred, steering = bool(_barred(self._facts)), self._steering
+            self._attitude.watch_safe(
+                rate, barred, steering.begin_detumbling, steering.begin_sun_acquisition, now_ns
+            )
+        if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
+            self._fire(trigger, "", now_ns)
+        if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
+            self._keep(estimate, now_ns)
+        elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
+            self._pointing.watch(estimate, overdue, now_ns)
+        return self.mode
+
+    def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
+        """Execute a command; return why it is refused, empty when done.
+
+        SLEW needs `wanted`, its argument; POINT without one returns to the configured targets.
+        """
+        trigger = COMMANDS.get(mode)
+        if trigger is None or mode not in self._modes:
+            return f"{mode.label} cannot be commanded" + (" of this body" if trigger else "")
+        answer = self._machine.answer(trigger)
+        if answer is TriggerAnswer.REFUSE:
+            return f"not while in {self.mode.label}"
+        if answer is TriggerAnswer.STAY and mode not in POINTING:
+            return ""
+        if self.mode is Mode.SAFE and (barred := _barred(self._facts)):
+            return barred
+        target = None
+        if mode is Mode.SLEW or wanted is not None:
+            try:
+                target = self._targets.commanded(math.nan if wanted is None else wanted, self._commands + 1)
+            except UsageError as error:
+                return str(error)
+            self._commands += 1
+        if mode in POINTING:
+            self._attitude.follows = mode
+        if mode is Mode.POINT:
+            self._pointed = target
+        elif target is not None:
+            self.wanted = target
+        self._fire(trigger, "" if target is None else f"to {target.law.text}", now_ns)
+        return ""
+
+    def react(self, kind: EventKind, time_ns: int, text: str) -> None:
+        """Carry out the reaction of an event: the reactor of the event log."""
+        reaction = kind.reaction
+        if reaction is Reaction.COILS_OFF:
+            self._steering.zero()
+        elif reaction is Reaction.ISOLATE:
+            self._steering.isolate()
+        elif reaction is Reaction.RESTART:
+            self.restart = f"{kind.name}: {text}"
+            self._stop(f"restart wanted: {self.restart}")
+        elif reaction in SAFING_REACTIONS:
+            self._fire(SAFING_REACTIONS[reaction], kind.name, time_ns)
+
+    def _boot(self, good: bool, now_ns: int) -> None:
+        waited = (now_ns - self._machine.since_ns) * 1e-9
+        if self._too_many_crashes:
+            text = f"{self._crashed} unclean shutdowns within {self._settings.crash_window:g} s of operation"
+            self._events.report(events.CRASHED_OFTEN, now_ns, text)
+            self._fire(Trigger.START_SAFE, text, now_ns)
+        elif good:
+            self._fire(STARTS[self._initial], "", now_ns)
+        else:
+            late = waited > self._settings.boot_patience
+            self._facts.update(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
+
+    def _brake(self, estimate: Estimate | None, rate: float, now_ns: int) -> None:
+        """Check whether detumbling is over."""
+        # Where the coils have no authority no hold is possible: wait until the body has turned further.
+        holds = Mode.HOLD in self._modes
+        within = not holds or (estimate is not None and self._targets.can_hold(estimate))
+        if self._slow.update(rate < self._low_rate and within, now_ns):
+            over = Trigger.DETUMBLED if holds else Trigger.SLOWED
+            self._fire(over, f"below {self._low_rate:g} rad/s", now_ns)
+
+    def _keep(self, estimate: Estimate, now_ns: int) -> None:
+        """Check the progress of a hold or a slew."""
+        settings = self._settings
+        if self.wanted is None:
+            self.wanted = self._targets.hold_here(estimate, now_ns)
+        error = self._pointing.watch(estimate, self._targets.error(estimate, self.wanted), now_ns)
+        slewing = (now_ns - self._machine.since_ns) * 1e-9
+        near = error < settings.arrived_angle and self._targets.speed(estimate) < settings.arrived_rate
+        if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
+            self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
+        text = f"{error:.3f} rad off after {slewing:.0f} s"
+        self._facts.update(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
+
+    def _fire(self, trigger: Trigger, reason: str, now_ns: int) -> None:
+        change = self._machine.fire(trigger, now_ns)
+        if change is not None:
+            self._enter(change, reason, now_ns)
+
+    def _enter(self, change: ModeChange, reason: str, now_ns: int) -> None:
+        """Enter a mode: reset timers, release an old path, zero the coils of a mode without steering."""
+        self._facts.enter(change.after)
+        for timer in (self._slow, self._arrived, self._pointing, self._attitude):
+            timer.reset()
+        if change.before not in STEERING | {Mode.BOOT}:
+            self._paths.release()  # an old path does not start at the body's attitude
+        if change.after is Mode.DETUMBLE:
+            self._steering.begin_detumbling(now_ns)
+        if change.after is Mode.SUN:
+            self.wanted = self._targets.commanded(SUN, 0)
+        elif change.after is Mode.POINT:
+            self.wanted = self._pointed
+        elif change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
+            self.wanted = None
+        if change.after not in STEERING:
+            self._steering.zero()
+        self._record(change.before, change.trigger.value, reason, now_ns)
+        if change.before is not Mode.BOOT:
+            because = f": {reason}" if reason else ""
+            text = f"{change.before.label} -> {change.after.label}, {change.trigger.value}{because}"
+            self._events.report(events.MODE, now_ns, text)
+
+    def _record(self, before: Mode, trigger: str, reason: str, now_ns: int) -> None:
+        self._recorder.record(
+            MODE,
+            now_ns,
+            before=int(before),
+            mode=int(self.mode),
+            trigger=trigger,
+            reason=reason,
+            **self._view.mode_fields(self.wanted),
+        )
+
+
+def _barred(known: Facts) -> str:
+    """Return why SAFE may not be left: latched facts that are not cleared; empty when it may."""
+    held = [
+        fact.begins.name for fact in known.held() if fact.latching and fact.begins.reaction is Reaction.SAFE
+    ]
+    return f"not before it is cleared: {', '.join(held)}" if held else ""
+
+
+def _starts(body: FlightBody) -> str:
+    """Return the modes in which this body can start, as text."""
+    return ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))

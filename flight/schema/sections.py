@@ -93,7 +93,7 @@ class Detumble(Section, frozen=True, kw_only=True):
 
 
 class Health(Section, frozen=True, kw_only=True):
-    """Bounds of what the flight may take of its board (`flight.loop.fdir.resources`); looked at in real time.
+    """Bounds of what the flight may take of its board (`flight.loop.health`); looked at in real time.
 
     `cpu_share` of one core, `memory` and `disk_free` in bytes, `memory_slope` in bytes an hour over at least
     `slope_window` s after `warm_up` s; temperatures in degree C; `clock_step` in s.

@@ -12,7 +12,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import Command, CommandError, CommandPacker, Ping, Point, command_of, shown
 from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
 from flight.link.modes import Mode

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.app.cli.run import progress_on, seed_number
-from flight.app.request import RunRequest
+from flight.app.run import RunRequest
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.testbed import TestbedConfig
@@ -125,7 +125,7 @@ def run(options: argparse.Namespace) -> int:
 def _fly(options: argparse.Namespace) -> Path:
     """Fly the excitation and return the folder of the run."""
     from flight.app.flight import fly  # noqa: PLC0415 - only a flight needs devices
-    from flight.app.run_folder import default_folder  # noqa: PLC0415
+    from flight.app.run import default_folder  # noqa: PLC0415
 
     config = excitation_config(configuration.load_testbed(options.source), options.duration or DURATION)
     out = options.run or default_folder(Path(f"{options.source.stem}-identify"))

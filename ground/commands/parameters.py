@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import Command, CommandPacker, DumpParameters, LoadParameters, shown
 from flight.link.process.verification import Stage
 from flight.link.security.associations import COMMAND_SPIS

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands import codec
 from flight.link.commands.codec import CommandError
 from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.process.directives import LIST
 from flight.link.process.downlink import LIVE

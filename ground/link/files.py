@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.files.entity import GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.files.store import Store
 from flight.link.files.transfer import CRC32

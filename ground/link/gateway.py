@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.process.lines import host_port
 from flight.link.telemetry.definitions import VERIFICATION

@@ -13,7 +13,7 @@ import numpy as np
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray, to_text
-from flight.loop.fdir.facts import FACTS, StreamState
+from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit

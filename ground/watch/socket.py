@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT
 from flight.link.telemetry.packets import PacketArray, TelemetryError

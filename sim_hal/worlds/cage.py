@@ -2,7 +2,7 @@
 
 The true field is IGRF-14 with a ring current along an orbit under J2, in the local frame whose y axis is the
 axis of the thread. The cage produces the components normal to the thread, multiplied by its scale and the
-gain of its coils. `flight.bodies.testbed.cage` is the model of the flight software.
+gain of its coils. `flight.bodies.testbed.control` is the model of the flight software.
 """
 
 from __future__ import annotations

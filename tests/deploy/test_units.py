@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.flight import fly
-from flight.app.request import RunRequest
+from flight.app.run import RunRequest
 from flight.schema.errors import ConfigError
 from hal.interfaces.errors import NotResponding
 from tests.deploy.scripts import (

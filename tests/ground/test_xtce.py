@@ -6,7 +6,7 @@ from xml.etree.ElementTree import Element, fromstring
 
 import pytest
 
-from flight.bodies.orbit.view import LEVELS
+from flight.bodies.orbit.body import LEVELS
 from flight.link.commands.definitions import COMMANDS
 from flight.link.events import Severity
 from flight.link.process.directives import DIRECTIVES, NEW_KEY
@@ -16,7 +16,7 @@ from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
 from flight.loop.body import SteeringState
-from flight.loop.fdir.facts import FACTS, StreamState
+from flight.loop.facts import FACTS, StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
 from tests.flight.link.telemetry.samples import plain_contents

@@ -9,7 +9,7 @@ import pytest
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from flight.loop.fdir.resources import ResourceSample
+from flight.loop.health import ResourceSample
 from flight.schema.reader import replace
 from flight.schema.sections import Modes
 from ground.telemetry import Run

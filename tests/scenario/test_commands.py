@@ -131,7 +131,7 @@ def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.
     def fall(*_: object) -> str:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr("flight.loop.tasks.mode_control.ModeControl.command", fall)
+    monkeypatch.setattr("flight.loop.modes.ModeControl.command", fall)
     (hold,) = packed(ChangeMode(Mode.HOLD))
     run, _ = said(tmp_path, (1.0, hold))
     (row,) = run["command"]

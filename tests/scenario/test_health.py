@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from flight.link.modes import Mode
-from flight.loop.fdir.facts import FACTS, IMU_POOR, TASK_FAILING, StreamState
-from flight.loop.fdir.resources import ResourceSample
+from flight.loop.facts import FACTS, IMU_POOR, TASK_FAILING, StreamState
+from flight.loop.health import ResourceSample
 from ground.telemetry import Run
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.mode_flights import commanded, modes_of

@@ -10,8 +10,7 @@ import pytest
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from flight.loop.state.keeper import Notices, StateKeeper
-from flight.loop.state.store import StateStore
+from flight.loop.state import Notices, StateKeeper, StateStore
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter

@@ -12,8 +12,8 @@ from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import to_text
-from flight.loop.executive.executive import RateGroup
-from flight.loop.fdir.facts import FACTS
+from flight.loop.executive import RateGroup
+from flight.loop.facts import FACTS
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run

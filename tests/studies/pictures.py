@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flight.app.flight import fly
-from flight.app.request import RunRequest
-from flight.bodies.testbed.thread import plant_of
+from flight.app.run import RunRequest
+from flight.bodies.testbed.guidance import plant_of
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.testbed import as_testbed

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from flight.app import opening
+from flight.app import flight as opening
 from flight.app.flight import next_whole_second
 from flight.link.telemetry.packets import to_text
-from flight.loop.flight_loop import FlightLoop
-from flight.loop.flight_status import RunLabel
+from flight.loop.flight_loop import FlightLoop, RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed

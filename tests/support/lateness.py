@@ -22,7 +22,7 @@ class Grid:
 
     @property
     def lost(self) -> npt.NDArray[np.bool_]:
-        """Slots that the loop came half a period late for, or more (`flight.loop.executive.executive`)."""
+        """Slots that the loop came half a period late for, or more (`flight.loop.executive`)."""
         return np.asarray(2.0 * self.lateness >= self.period_ns * 1e-9)
 
     def figures(self) -> dict[str, float]:

@@ -1,23 +1,68 @@
 """The command line: one module a command; a mistake of the user's is one line and exit status 2.
 
-Only the module of the command that was typed is imported: a board that flies has no use for the others.
+Only the module of the command that was typed is imported: a board that flies has no use for the others. A
+command does its work to the end though nobody reads: its pipe may be closed (`| head`), its terminal may be
+gone, or it may have been started without one (`>&-`).
 """
 
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import importlib.util
 import io
+import os
 import sys
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from flight import __version__
-from flight.app.cli.outlet import outlast_readers
 from hal.interfaces.errors import DeviceError
 from knightcube.errors import FlightError, UsageError
+
+_READER_GONE = frozenset({errno.EPIPE, errno.EIO, errno.EBADF})
+
+
+class _Outlet(io.FileIO):
+    """A file descriptor that discards output once its reader is gone, or after its first error."""
+
+    _lost = False
+
+    def write(self, data: Any, /) -> int:
+        """Write bytes; return how many are done with. Raises OSError once, such as for a full disk."""
+        try:
+            if not self._lost:
+                return super().write(data)
+        except OSError as error:
+            self._lost = True
+            if error.errno not in _READER_GONE:
+                raise
+        return memoryview(data).nbytes
+
+
+def outlast_readers() -> None:
+    """Replace the process's two output streams; streams that a caller put there are left alone."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            # The number is free: a file that is opened next would get it, and the output of others.
+            while (held := os.open(os.devnull, os.O_WRONLY)) < number:
+                pass
+            if held != number:
+                os.close(held)
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - lasts as the process
+        elif stream is getattr(sys, f"__{name}__") and isinstance(stream, io.TextIOWrapper):
+            outlet = io.BufferedWriter(_Outlet(number, "w", closefd=False))
+            by_line = name == "stderr" or stream.line_buffering
+            made = io.TextIOWrapper(
+                outlet, encoding=stream.encoding, errors="backslashreplace", line_buffering=by_line
+            )
+            stream.flush()
+            setattr(sys, name, made)
+
 
 COMMANDS = {
     "run": "fly a configuration",

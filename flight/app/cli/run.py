@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from flight.app.cli import PROGRAM
-from flight.app.request import RunRequest, RunResult
-from flight.loop.flight_status import FlightEnding, FlightProgress
+from flight.app.run import RunRequest, RunResult
+from flight.loop.flight_loop import FlightEnding, FlightProgress
 from flight.schema.carried import config_path, names
 from knightcube.errors import FlightError
 
@@ -107,7 +107,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def _faults_help() -> str:
     """Return the grammar of faults and the list of them."""
-    from flight.app.simulated import fault_catalogue  # noqa: PLC0415 - only --help needs it
+    from flight.app.devices import fault_catalogue  # noqa: PLC0415 - only --help needs it
 
     grammar, listing = fault_catalogue()
     return (
@@ -121,7 +121,7 @@ def _faults_help() -> str:
 def run(options: argparse.Namespace) -> int:
     """Fly, showing progress on standard error; print the summary."""
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
-    from flight.app.run_folder import default_folder  # noqa: PLC0415
+    from flight.app.run import default_folder  # noqa: PLC0415
     from flight.app.service import StoppedError  # noqa: PLC0415
 
     request = RunRequest(

@@ -1,6 +1,7 @@
-"""A satellite in orbit with three coils. `ORBIT` builds it from the configuration.
+"""A satellite in orbit with three coils: its composition from the configuration, its packets and texts.
 
-It detumbles by magnetometer and gyro, acquires its attitude with its coils at rest, and points.
+The satellite detumbles by magnetometer and gyro, acquires its attitude with its coils at rest, and points.
+`ORBIT` builds it.
 """
 
 from __future__ import annotations
@@ -11,11 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, wide_feed_of
-from flight.bodies.orbit.control import FieldBrake, PointingTracker, SunAcquisitionBrake, expected_field
+from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
+from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
 from flight.bodies.orbit.environment import OrbitEnvironment
-from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, learned_of, start_from
-from flight.bodies.orbit.filter_steps import OrbitFilterSettings
+from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings, learned_of, start_from
 from flight.bodies.orbit.guidance import (
     ObjectAim,
     PlannedCraft,
@@ -24,14 +24,16 @@ from flight.bodies.orbit.guidance import (
     PointingTargets,
     Sensor,
 )
-from flight.bodies.orbit.view import OrbitView
 from flight.bodies.streak_methods import streak_estimator
+from flight.link import events
 from flight.link.modes import Mode
-from flight.loop.body import Body, BodyControl, BodyEstimation, BodyKind
-from flight.loop.fdir.coil_response import ResponseSettings
-from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
-from flight.loop.services import Services
-from flight.loop.state.content import Learned
+from flight.link.telemetry.definitions import NAVIGATION, SPIN
+from flight.loop import facts
+from flight.loop.body import BodyControl, BodyEstimation, BodyKind, ControlOutput, FlightBody, Target
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import ResponseSettings
+from flight.loop.facts import Services
+from flight.loop.state import Learned
 from flight.schema.camera_model import camera_model
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
@@ -52,10 +54,106 @@ from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, Su
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
+from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
+
+SPIN_EVERY = 10
+"""Control cycles from one spin packet to the next."""
+NAVIGATION_EVERY = 40
+"""Control cycles from one navigation packet to the next."""
+LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
+"""The knowledge by its number in the packet."""
+_NAN3 = [math.nan] * 3
+
+
+class OrbitView:
+    """Implements `flight.loop.body.BodyView`."""
+
+    def __init__(
+        self,
+        brake: FieldDetumblingLaw,
+        filter_: OrbitFilter,
+        environment: OrbitEnvironment,
+        services: Services,
+    ) -> None:
+        self._filter = filter_
+        self._environment = environment
+        self._events = services.events
+        self._facts = services.facts
+        self._knowledge = Knowledge.LOST
+        self._detumbler = brake.detumbler
+        self._recorder = services.recorder
+
+    def record_cycle(self, output: ControlOutput) -> None:
+        """Record how well the attitude is known, and the spin packet while the body is braked."""
+        self._record_knowledge(output)
+        if output.mode is not Mode.DETUMBLE or output.cycle.slot % SPIN_EVERY:
+            return
+        found = self._detumbler
+        rate, field = found.rate, found.field
+        self._recorder.record(
+            SPIN,
+            output.cycle.start_ns,
+            known=int(rate is not None),
+            rate=_NAN3 if rate is None else rate.tolist(),
+            rate_sigma=found.rate_sigma,
+            field=_NAN3 if field is None else field.tolist(),
+            restarts=found.restarts,
+            dipole=output.steered.dipole.tolist(),
+        )
+
+    def _record_knowledge(self, output: ControlOutput) -> None:
+        """Record the navigation packet; report another knowledge as an event."""
+        found, now_ns, estimate = self._filter, output.cycle.start_ns, output.estimate
+        known = found.knowledge
+        if known is not self._knowledge:
+            text = f"{self._knowledge.value} -> {known.value}"
+            self._events.report(events.ATTITUDE_KNOWLEDGE, now_ns, text)
+            self._knowledge = known
+        if output.cycle.slot % NAVIGATION_EVERY:
+            return
+        doubt = found.field_doubt
+        self._facts.update(
+            facts.FIELD_REFUSED, bool(doubt), now_ns, doubt or "the magnetometer agrees with the estimate"
+        )
+        self._recorder.record(
+            NAVIGATION,
+            now_ns,
+            knowledge=LEVELS.index(known),
+            placed=int(self._environment.known),
+            refused=found.refused,
+            fixes_refused=self._environment.refused,
+            restarts=found.restarts,
+            gyro_bias=_NAN3 if estimate is None else estimate.bias.tolist(),
+            field_bias=_NAN3 if estimate is None else estimate.field_bias.tolist(),
+            residual_dipole=_NAN3 if estimate is None else found.residual_dipole.tolist(),
+        )
+
+    def announce(self, target: Target, now_ns: int) -> None:
+        """Report a new target as an event."""
+        self._events.report(events.TARGET, now_ns, target.law.text)
+
+    def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
+        """Return the body's fields of the mode packet."""
+        return {"target_q2": math.nan}
+
+    def rate_text(self, rate: MeanRateMeasurement) -> str:
+        """Return a rate from streaks as text."""
+        return f"{np.rad2deg(rate.rate).round(3).tolist()} deg/s"
+
+    def progress(self, output: ControlOutput | None) -> str:
+        """Return mode and rate as text, for the progress line."""
+        mode = output.mode if output else Mode.BOOT
+        if self._knowledge is not Knowledge.LOST:
+            return f"{mode.label}, attitude {self._knowledge.value}"
+        rate = self._detumbler.rate if mode is Mode.DETUMBLE else None
+        if rate is None:
+            return mode.label
+        return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s by the magnetometer"
+
 
 _BELOW = 0.8
 """Largest rate of a path, as a fraction of the rate at which the body is detumbled; the rest is a margin."""
@@ -71,11 +169,13 @@ class SatelliteEstimation(BodyEstimation):
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
         self.feed = OrbitFeed(self.orbit_filter)
-        self.coil_watch = _coil_watch(config)
+        self.coil_monitor = _coil_monitor(config)
         self._sun = _sun(config, self.orbit_filter, self.environment)
         self.sun_acquisition = _seeker(config, services)
         if config.wide_cameras:
-            self.wide = wide_feed_of(config.wide_cameras, self.orbit_filter, self.environment, self._sun)
+            self.wide = horizon_camera_feed(
+                config.wide_cameras, self.orbit_filter, self.environment, self._sun
+            )
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the expected field (3,) T in body axes; zero while the orbit is not known."""
@@ -134,7 +234,7 @@ class SatelliteControl(BodyControl):
         self.targets = PointingTargets(_timed(config), paths, config.looks_for_objects())
         self.tracker = _tracker(config, filter_, environment)
         detumbler = _detumbler(config, filter_, environment)
-        self.brake = self.field_brake = FieldBrake(detumbler, self.dipole_per_ampere)
+        self.brake = self.field_detumbling = FieldDetumblingLaw(detumbler, self.dipole_per_ampere)
         self.sun_acquisition = estimation.sun_acquisition
 
     def follows_objects(self) -> bool:
@@ -150,13 +250,13 @@ class SatelliteControl(BodyControl):
         return self._pauses.calm(from_ns, exposure_ns)
 
 
-def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     """Return the satellite of a configuration, with the states that an earlier boot learned."""
     config = as_orbit(config)
     estimation = SatelliteEstimation(config, services, learned)
     control = SatelliteControl(config, estimation, services)
-    view = OrbitView(control.field_brake, estimation.orbit_filter, estimation.environment, services)
-    return Body(estimation, control, view, streak_estimator(config.camera))
+    view = OrbitView(control.field_detumbling, estimation.orbit_filter, estimation.environment, services)
+    return FlightBody(estimation, control, view, streak_estimator(config.camera))
 
 
 ORBIT = BodyKind(pointing_job.run, make)
@@ -279,7 +379,7 @@ def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironmen
     return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, environment)
 
 
-def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionBrake | None:
+def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
     """Return the brake that turns the pointing axis to the Sun in SAFE; None without solar cells."""
     section, craft = config.solar_strings, config.craft
     if section is None:
@@ -287,7 +387,7 @@ def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionBrake | No
     axis = np.array(config.pointing.axis)
     seeking = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
     seeker = SunAcquisition(_pauses(config), seeking)
-    return SunAcquisitionBrake(seeker, _strings(section), craft.dipole_per_ampere, services.events)
+    return SunAcquisitionLaw(seeker, _strings(section), craft.dipole_per_ampere, services.events)
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:
@@ -323,7 +423,7 @@ def _detumbler(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvi
     return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)
 
 
-def _coil_watch(config: OrbitConfig) -> CoilWatch:
+def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia, dipole = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
     settle_ns = round(config.detumble.settle * SECOND_NS)
@@ -341,4 +441,4 @@ def _coil_watch(config: OrbitConfig) -> CoilWatch:
     )
     slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)
     tumble = config.modes.tumble_rate
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response, slow=slow, tumble_rate=tumble))
+    return CoilMonitor(CoilMonitorSettings((x, y, z), response=response, slow=slow, tumble_rate=tumble))

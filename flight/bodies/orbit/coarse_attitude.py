@@ -167,8 +167,8 @@ FIELD_SIGMA = 0.03
 """Lower bound (rad) of the standard deviation of the field's direction in the search for the horizon."""
 
 
-class WideFeed:
-    """Implements `flight.loop.body.WideCameraUse`."""
+class HorizonCameraFeed:
+    """Implements `flight.loop.body.HorizonCameraUse`."""
 
     def __init__(
         self,
@@ -303,19 +303,19 @@ class WideFeed:
         return self._sun.strings, newest.currents
 
 
-def wide_feed_of(
+def horizon_camera_feed(
     sections: Sequence[WideCamera],
     filter_: OrbitFilter,
     environment: OrbitEnvironment,
     sun: CoarseSunFeed | None,
-) -> WideFeed:
+) -> HorizonCameraFeed:
     """Return the feed of configured cameras."""
     cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
     error = math.radians(max(one.lens_error_deg for one in sections))
     first, response = sections[0], None
     if first.response == "logarithmic":
         response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
-    return WideFeed(cameras, error, filter_, environment, sun, response)
+    return HorizonCameraFeed(cameras, error, filter_, environment, sun, response)
 
 
 def _is_of_strings(sun: MeasuredDirection | None) -> bool:

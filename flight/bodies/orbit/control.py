@@ -21,7 +21,7 @@ from flight.bodies.orbit.filter import OrbitFilter, StuckFieldCheck
 from flight.bodies.orbit.guidance import PathPoint
 from flight.link import events
 from flight.loop.body import CoilCommand
-from flight.loop.fdir.facts import EventLog
+from flight.loop.facts import EventLog
 from hal.interfaces.devices import StringReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import FieldAhead
@@ -34,8 +34,8 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 
 
-class FieldBrake:
-    """Commands the detumbler's dipole; implements `flight.loop.body.Brake`."""
+class FieldDetumblingLaw:
+    """Commands the detumbler's dipole; implements `flight.loop.body.WindowedLaw`."""
 
     def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
         """Take n A of each coil, m^2."""
@@ -88,7 +88,7 @@ def expected_field(
     return expected
 
 
-class SunAcquisitionBrake:
+class SunAcquisitionLaw:
     """Turns the body to the Sun, and reports whether a Sun is measured; implements `Brake` of the loop."""
 
     def __init__(

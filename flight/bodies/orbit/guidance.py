@@ -21,10 +21,8 @@ import numpy as np
 from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.link import events
 from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
-from flight.loop.executive.executive import Cycle
-from flight.loop.executive.jobs import JobResult
-from flight.loop.fdir.facts import EventLog
-from flight.loop.services import Services
+from flight.loop.executive import Cycle, JobResult
+from flight.loop.facts import EventLog, Services
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
@@ -64,7 +62,7 @@ class PathPoint:
 
 
 class PointingPaths:
-    """Implements `flight.loop.body.Paths`.
+    """Implements `flight.loop.body.FlownPaths`.
 
     Attributes:
         off: rad, how far the body was off the path at the last command; zero for a new path.
@@ -168,7 +166,7 @@ def target_of(target: Target) -> PointingTarget:
 
 
 class PointingTargets:
-    """Implements `flight.loop.body.Targets`."""
+    """Implements `flight.loop.body.BodyTargets`."""
 
     def __init__(
         self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool

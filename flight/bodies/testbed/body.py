@@ -11,28 +11,43 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.streak_methods import streak_estimator
-from flight.bodies.testbed.cage import CageField, CageFilter, CageTracker
-from flight.bodies.testbed.control import BdotBrake, ThreadTracker, controller_of
-from flight.bodies.testbed.guidance import Planning, PlanningSettings, Strategy, ThreadTargets, TimedStep
-from flight.bodies.testbed.thread import ThreadReader, angular_acceleration_psd_of, law_of, plant_of
+from flight.bodies.testbed.control import (
+    BdotLaw,
+    CageField,
+    CageFilter,
+    CageTracker,
+    ThreadTracker,
+    controller_of,
+)
+from flight.bodies.testbed.guidance import (
+    Planning,
+    PlanningSettings,
+    Strategy,
+    ThreadReader,
+    ThreadTargets,
+    TimedStep,
+    angular_acceleration_psd_of,
+    law_of,
+    plant_of,
+)
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.loop.body import (
     KEPT,
-    Body,
     BodyControl,
     BodyEstimation,
     BodyKind,
     ControlOutput,
+    FlightBody,
     ReadingAgreement,
     Target,
     Tracker,
 )
-from flight.loop.fdir.coil_response import ResponseSettings
-from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
-from flight.loop.services import Services
-from flight.loop.state.content import Learned, start_from
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import ResponseSettings
+from flight.loop.facts import Services
+from flight.loop.state import Learned, start_from
 from flight.schema.devices import InertialUnit
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
@@ -57,7 +72,7 @@ from knightcube.gnc.guidance.one_axis.vmc import NODES
 
 
 class UnitFeed:
-    """Implements `flight.loop.body.Feed`: starts the filter from attitude and rate, and applies both."""
+    """Implements `ReadingFeed`: starts the filter from attitude and rate, and applies both."""
 
     def __init__(self, filter_: AttitudeFilter, unit: InertialUnit) -> None:
         self._filter = filter_
@@ -169,7 +184,7 @@ class TestbedEstimation(BodyEstimation):
         filter_, self.learned_problems = attitude_filter(config, plant, learned, cage)
         self.filter = filter_
         self.feed = UnitFeed(filter_, config.inertial_unit)
-        self.coil_watch = coil_watch(config, plant)
+        self.coil_monitor = coil_monitor(config, plant)
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the field (3,) T in body axes."""
@@ -199,10 +214,10 @@ class TestbedControl(BodyControl):
         self.planner = self.planning = Planning(plant, settings, guidance, reader, services)
         self.targets = ThreadTargets(steps, reader, guidance, self.planning)
         self.tracker = _tracker(config, plant, reader, cage)
-        self.brake = brake_of(config, plant)
+        self.brake = detumbling_law(config, plant)
 
 
-def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
     config = as_testbed(config)
     cage = None if config.cage is None else CageField(config.cage, config.plant.field, services.clock)
@@ -210,7 +225,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     control = TestbedControl(config, reader, cage, services)
     estimation = TestbedEstimation(config, learned, reader, cage)
     view = ThreadView(reader, control.planning, services)
-    return Body(estimation, control, view, streak_estimator(config.camera))
+    return FlightBody(estimation, control, view, streak_estimator(config.camera))
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
@@ -277,7 +292,7 @@ def attitude_filter(
     return CageFilter(cage, body, settings, prior), problems
 
 
-def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:
+def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
     """Return the law and the windows of detumbling."""
     section = config.detumble
     settle_ns, measure_ns, act_ns = (
@@ -288,10 +303,10 @@ def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:
     share = share_in_rotating_field(section.field_turn, schedule) if turning else section.share
     dipole = dipole_per_ampere(config)
     braking = DetumblerSettings(plant.inertia, dipole, plant.current_limit, share)
-    return BdotBrake(Detumbler(schedule, braking), dipole)
+    return BdotLaw(Detumbler(schedule, braking), dipole)
 
 
-def coil_watch(config: TestbedConfig, plant: SingleAxisPlant) -> CoilWatch:
+def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
     """Return the watch over the coils' circuit."""
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     response = ResponseSettings(
@@ -301,7 +316,7 @@ def coil_watch(config: TestbedConfig, plant: SingleAxisPlant) -> CoilWatch:
         free=(False, True, False),
     )
     tumble = config.modes.tumble_rate
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response, tumble_rate=tumble))
+    return CoilMonitor(CoilMonitorSettings((x, y, z), response=response, tumble_rate=tumble))
 
 
 def planning_settings(config: TestbedConfig) -> PlanningSettings:

@@ -23,9 +23,9 @@ SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity i
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
 """The use of the coils (`flight.loop.body.SteeringState`)."""
 STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
-"""The quality of a stream of readings (`flight.loop.fdir.facts.StreamState`)."""
+"""The quality of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
-"""How well the attitude is known (`flight.bodies.orbit.view`)."""
+"""How well the attitude is known (`flight.bodies.orbit.body`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
 """The coils, by body axis."""
 STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
@@ -82,7 +82,7 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("wide-lost", "warning"),
     ("wide-false", "warning"),
 )
-"""The facts that monitors keep, in the order of `flight.loop.fdir.facts`, as grave as their events."""
+"""The facts that monitors keep, in the order of `flight.loop.facts`, as grave as their events."""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))
 FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS))
 

@@ -282,7 +282,7 @@ class Recorder:
             self._performance.write(packed)
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event, as the sink of `flight.loop.fdir.facts.EventLog`."""
+        """Write an event, as the sink of `flight.loop.facts.EventLog`."""
         packed = self.record(
             EVENT,
             time_ns,

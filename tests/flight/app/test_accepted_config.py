@@ -19,7 +19,7 @@ from flight.app.accepted_config import (
 )
 from flight.app.cli import main
 from flight.app.flight import fly
-from flight.app.request import RunRequest
+from flight.app.run import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError, UnreadConfigError
@@ -115,7 +115,7 @@ def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd:
 def test_one_error_of_the_disk_is_not_yet_damage(
     accepted: Path, service: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from flight.loop.state.store import LinuxFiles  # noqa: PLC0415
+    from flight.loop.state import LinuxFiles  # noqa: PLC0415
 
     read, calls = LinuxFiles.read, iter(range(100))
 
@@ -205,7 +205,7 @@ def test_a_crash_anywhere_while_one_is_kept_leaves_the_others(
             raise OSError(5, "crash")
 
         with monkeypatch.context() as patch:
-            patch.setattr(f"flight.loop.state.store.os.{name}", crash)
+            patch.setattr(f"flight.loop.state.os.{name}", crash)
             FlownConfig(TEXT + "#", folder).keep()
         assert TEXT in texts_kept(folder)
         FlownConfig(TEXT + "#", folder).keep()

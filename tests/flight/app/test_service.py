@@ -11,10 +11,10 @@ import pytest
 
 from flight.app import service as patient_start
 from flight.app.cli import main
-from flight.app.request import RunRequest
+from flight.app.run import RunRequest
 from flight.app.service import StartRetry, StoppedError, pauses, retried_start
 from flight.link.telemetry.packets import to_text
-from flight.loop.state.store import StateStore
+from flight.loop.state import StateStore
 from flight.schema.errors import ConfigError, UnreadConfigError
 from ground.telemetry import read_run
 from hal.interfaces.errors import NotResponding

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.testbed.body import TESTBED
-from flight.loop.body import Body, BodyKind, CoilCommand, Reference
-from flight.loop.services import Services
-from flight.loop.state.content import Learned
+from flight.loop.body import BodyKind, CoilCommand, FlightBody, Reference
+from flight.loop.facts import Services
+from flight.loop.state import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
@@ -38,7 +38,7 @@ class PlainTracker:
         pass
 
 
-def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     testbed = TESTBED.make(config, services, learned)
     field = np.array([0.0, 0.0, -as_testbed(config).plant.field])
     tracker = PlainTracker(field, config.coils.current_limit, testbed.control.dipole_per_ampere)

@@ -9,7 +9,7 @@ import pytest
 from msgspec import structs
 
 from flight.app.composition import body_kind
-from flight.loop.tasks.control_cycle import ATTITUDE_EVERY
+from flight.loop.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed

@@ -10,10 +10,11 @@ from itertools import product
 import pytest
 
 from flight.link.modes import Mode
-from flight.loop.fdir.facts import FACTS
+from flight.loop.facts import FACTS
 from flight.loop.modes import (
     COMMANDS,
     SAFING,
+    SAFING_REACTIONS,
     STARTS,
     TRANSITIONS,
     ModeChange,
@@ -24,7 +25,6 @@ from flight.loop.modes import (
     TriggerAnswer,
     check,
 )
-from flight.loop.tasks.mode_control import SAFING_REACTIONS
 from knightcube.errors import FlightError
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.link.commands.codec import Point
-from flight.loop.tasks.commanding import command_of
+from flight.loop.commanding import command_of
 from flight.schema import reader
 from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml

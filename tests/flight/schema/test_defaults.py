@@ -26,7 +26,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "AravisSettings": (devices.AravisDevice, devices.Camera),
     "CoilDriveSettings": (devices.Coils,),
     "CoilSettings": (devices.Coils,),
-    "CoilWatchSettings": (devices.Coils, devices.PowerMonitor),
+    "CoilMonitorSettings": (devices.Coils, devices.PowerMonitor),
     "DetumblerSettings": (testbed.BdotDetumble, testbed.Plant),
     "ExcitationSettings": (testbed.Identification,),
     "FieldDetumblerSettings": (orbit.FieldDetumble,),
@@ -49,7 +49,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
     "Vn100Settings": (devices.InertialUnit,),
-    "WideSettings": (orbit_devices.WideCamera,),
+    "HorizonCameraSettings": (orbit_devices.WideCamera,),
 }
 """The sections that a flight fills each settings class from."""
 

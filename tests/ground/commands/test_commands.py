@@ -15,7 +15,7 @@ import pytest
 
 from flight.app.cli import main
 from flight.app.cli.run import progress_on
-from flight.loop.flight_status import FlightProgress
+from flight.loop.flight_loop import FlightProgress
 from ground.telemetry import read_run
 from tests.ground.report.synthetic import Recipe, make_run
 

@@ -16,9 +16,8 @@ from flight.link.commands.codec import LoadParameters, unpack
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer
-from flight.loop.fdir.facts import EventLog, Facts, Streams
-from flight.loop.services import Services
-from flight.loop.tasks.commanding import ParameterTable, ParameterUsers
+from flight.loop.commanding import ParameterTable, ParameterUsers
+from flight.loop.facts import EventLog, Facts, Services, Streams
 from flight.schema.sections import Health, Modes
 from tests.support.flights import demo_config
 

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight.app.flight import fly
-from flight.app.request import RunRequest
+from flight.app.run import RunRequest
 from hal.buses.i2c_bus import lock_bus
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError

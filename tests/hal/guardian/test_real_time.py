@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from flight.app import opening as watchers
+from flight.app import supervision as watchers
 from hal.buses import linux_process
 from hal.drivers.h_bridge import DEVICE as COILS
 

@@ -27,7 +27,7 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
-from tests.flight.loop.executive.passing import passed
+from tests.flight.loop.passing import passed
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))

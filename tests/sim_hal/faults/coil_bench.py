@@ -10,8 +10,8 @@ import numpy as np
 
 from flight.app.devices import coil_settings, unit_settings
 from flight.app.flight import next_whole_second
-from flight.loop.fdir.coil_response import ResponseSettings
-from flight.loop.fdir.coil_watch import CoilWatch, CoilWatchSettings
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import ResponseSettings
 from flight.schema import reader as configuration
 from flight.schema.testbed import TestbedConfig
 from hal.drivers.coils import PwmTorqueCoils
@@ -47,7 +47,7 @@ def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) 
     return command
 
 
-def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilWatchSettings:
+def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilMonitorSettings:
     """Return what the flight loop gives a watch of the demonstration's hardware."""
     coils, plant = config.coils, config.plant
     full = [coils.supply_voltage / ohm for ohm in coils.resistance]
@@ -57,14 +57,14 @@ def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilWat
         rate_noise=config.inertial_unit.rate_noise,
         free=(False, True, False),
     )
-    return CoilWatchSettings((full[0], full[1], full[2]), response=None if monitor_only else response)
+    return CoilMonitorSettings((full[0], full[1], full[2]), response=None if monitor_only else response)
 
 
 @dataclass
 class Watched:
     """What a watch saw: verdicts with the time at which they came, s; what the coils carried (k, 3) A."""
 
-    watch: CoilWatch
+    watch: CoilMonitor
     found: list[tuple[float, str, str]]
     readings: int
     suspicious: int
@@ -97,7 +97,7 @@ def observe(
     monitor = Ina219(lock.wires.i2c, 0x45, clock)
     unit = Vn100(lock.wires.serial, clock, unit_settings(config))
     unit.configure()
-    watch = CoilWatch(watch_settings(config, monitor_only))
+    watch = CoilMonitor(watch_settings(config, monitor_only))
     epoch_ns = next_whole_second(clock)
     lock.release(epoch_ns)
     seen = Watched(watch, [], 0, 0, 0.0, np.empty(0), np.empty((0, 3)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.loop.executive.jobs import JobResult, LockStepRunner, Worker
+from flight.loop.executive import JobResult, LockStepRunner, Worker
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from sim_hal.clock import SimClock

@@ -17,10 +17,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from flight.loop.executive.memory import give_back
+from flight.loop.worker import give_back
 
 if TYPE_CHECKING:
-    from flight.loop.executive.jobs import Worker
+    from flight.loop.executive import Worker
 
 _M_ARENA_MAX = -8  # malloc.h
 
@@ -98,7 +98,7 @@ BUSY: dict[str, Callable[[Any], Any]] = {
 
 def keep_busy() -> None:
     """Have the flight that this process opens keep its workers busy."""
-    from flight.app import opening  # noqa: PLC0415 - see the top
+    from flight.app import flight as opening  # noqa: PLC0415
     from flight.app.composition import workers as made  # noqa: PLC0415
 
     def workers(*arguments: Any) -> list[Worker]:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.commands.codec import CommandPacker, Ping
 from ground.commands.command import exchange
 from knightcube.errors import FlightError

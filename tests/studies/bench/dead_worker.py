@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.link import events
-from flight.loop.executive.worker_processes import BUDGET
+from flight.loop.worker_processes import BUDGET
 from ground.telemetry import read_run
 from hal.interfaces.wires import SECOND_NS
 from tests.hal.guardian import live_flight
@@ -27,7 +27,7 @@ from tests.studies.bench.executive import Load, fifo_allowed, fly
 
 _BREAK = """
 from flight.loop.executive import processes
-processes.MODULE = "flight.loop.executive.no_such_module"
+processes.MODULE = "flight.loop.no_such_module"
 """
 WORKERS = ("planner", "vision")
 

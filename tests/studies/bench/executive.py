@@ -67,7 +67,7 @@ _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
 _IMPORTED = (
     "flight.app.flight",
     "flight.app.cli.run",
-    "flight.loop.executive.worker",
+    "flight.loop.worker",
     "knightcube.vision.streaks.estimate",
     "sim_hal.faults.host",
     "sim_hal.serving.remote",

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.app.run_folder import utc_ns
+from flight.app.run import utc_ns
 from flight.link.files.store import Store
 from flight.link.process import directives
 from flight.link.process.directives import Play, SendFile

@@ -18,9 +18,9 @@ import numpy as np
 
 from flight.bodies.orbit.body import ORBIT, SatelliteControl, SatelliteEstimation
 from flight.link.telemetry.packets import to_text
-from flight.loop.body import Body, BodyKind
-from flight.loop.services import Services
-from flight.loop.state.content import Learned
+from flight.loop.body import BodyKind, FlightBody
+from flight.loop.facts import Services
+from flight.loop.state import Learned
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
 from flight.schema.sections import Config
@@ -46,7 +46,7 @@ class _Unscheduled(SatelliteControl):
         return from_ns
 
 
-def _as_they_come(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+def _as_they_come(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
     """Return the satellite with exposures whenever the camera's turn comes."""
     body = ORBIT.make(config, services, learned)
     estimation = body.estimation

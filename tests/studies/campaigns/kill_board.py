@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from flight.loop.state.content import StoredState
-from flight.loop.state.store import StateStore
+from flight.loop.state import StateStore, StoredState
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.live_flight import LiveFlight, write_config
 

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 from flight.bodies.orbit.guidance import ObjectAim, Sensor
 from flight.link.events import EventKind
-from flight.loop.fdir.facts import EventLog
+from flight.loop.facts import EventLog
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector

@@ -9,8 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from flight.loop.state.content import StoredState, begin_boot
-from flight.loop.state.store import COPIES, StateStore
+from flight.loop.state import COPIES, StateStore, StoredState, begin_boot
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.campaigns import faults_kill
 from tests.studies.campaigns.campaign import fly_here

@@ -31,7 +31,7 @@ from unittest import mock
 from flight.app import cli
 from flight.app import flight as flown
 from flight.app.accepted_config import requested_config
-from flight.app.request import RunRequest, RunResult
+from flight.app.run import RunRequest, RunResult
 from flight.link.telemetry.archive import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS

@@ -25,8 +25,7 @@ from flight.app.service import TRIALS, FlownRelease
 from flight.link.process.scheduling import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed
-from flight.loop.state.content import Learned, StoredState, UncleanShutdown
-from flight.loop.state.store import decode, encode
+from flight.loop.state import Learned, StoredState, UncleanShutdown, decode, encode
 from flight.schema.errors import ConfigError
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.errors import UsageError

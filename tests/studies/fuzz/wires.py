@@ -19,7 +19,7 @@ import numpy as np
 from flight.link.frames.stream import SYNC, telecommand_stream, telemetry_stream
 from flight.link.frames.telecommand import LONGEST_FRAME, TelecommandHeader, close_frame
 from flight.link.frames.telemetry import MasterCount, PacketAssembler, TelemetryFramer, open_frame
-from flight.loop.executive.messages import message_length, pack_values, unpack_values
+from flight.loop.worker import message_length, pack_values, unpack_values
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685

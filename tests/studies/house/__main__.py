@@ -1,6 +1,7 @@
 """Draws the house from the code's own imports and sizes: `python -m tests.studies.house`.
 
-With `--reached` it also flies, and reports the lines of `flight/` that the flights reach.
+With `--reached` it also flies, and reports the lines of `flight/` that the flights reach. With `--touched` it
+flies and solves an image, and reports how many files a control cycle, an opening and a star fix enter.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -99,14 +100,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines, hit = sum(file.lines for file in reached), sum(file.reached for file in reached)
         share = 100.0 * hit / lines
         bars.append(Bar("lines reached by flights, %", round(share, 1), ">= 90", share >= 90.0))
+    entered: dict[str, list[str]] = {}
+    if options.touched:
+        from tests.studies.house import touched as files  # noqa: PLC0415  # it imports the product
+
+        entered = {name: sorted(names) for name, names in files.measure().items()}
+        bars += [at_most(f"files of a {name}", len(entered[name]), files.LIMITS[name]) for name in entered]
     if options.json:
-        sys.stdout.write(json.dumps(_as_json(house, bars, reached)) + "\n")
+        sys.stdout.write(json.dumps(_as_json(house, bars, reached) | {"touched": entered}) + "\n")
     else:
-        sys.stdout.write(_text(house, bars, reached))
+        sys.stdout.write(_text(house, bars, reached, entered))
     return int(not all(bar.met for bar in bars))
 
 
-def _text(house: House, bars: Sequence[Bar], reached: Sequence[Any]) -> str:
+def _text(
+    house: House, bars: Sequence[Bar], reached: Sequence[Any], entered: Mapping[str, Sequence[str]]
+) -> str:
     lines = []
     for floor in sorted(set(house.floors.values()), reverse=True):
         for room in sorted(room for room, height in house.floors.items() if height == floor):
@@ -120,6 +129,7 @@ def _text(house: House, bars: Sequence[Bar], reached: Sequence[Any]) -> str:
         "largest classes": house.sizes.classes[:5],
         f"functions over {sizes.LONG_FUNCTION} lines": house.sizes.long_functions,
     }
+    lists |= {f"files of a {name}": files for name, files in entered.items()}
     for title, entries in lists.items():
         if entries:
             lines += [f"{title}:", *(f"  {entry}" for entry in entries)]
@@ -149,6 +159,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--reached", action="store_true", help="also fly, and count the lines of flight/ reached"
+    )
+    parser.add_argument(
+        "--touched",
+        action="store_true",
+        help="also count the files that a cycle, an opening and a star fix enter",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser

@@ -83,7 +83,7 @@ exclude_also =
 # Workers end by SIGKILL, when coverage.py can save nothing: they save every half second.
 _SAVE_OFTEN = """
 import sys, threading
-if "flight.loop.executive.worker" in sys.orig_argv:
+if "flight.loop.worker" in sys.orig_argv:
     from coverage import Coverage
     def save():
         while not threading.Event().wait(0.5):

@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from flight.app.cli.check import flight_problems
-from flight.app.request import RunResult
-from flight.loop.flight_status import FlightEnding
+from flight.app.run import RunResult
+from flight.loop.flight_loop import FlightEnding
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import DEMO, ROOT
 

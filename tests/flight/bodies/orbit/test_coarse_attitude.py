@@ -9,8 +9,7 @@ import pytest
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed
 from flight.bodies.orbit.environment import OrbitEnvironment
-from flight.bodies.orbit.filter import OrbitFilter
-from flight.bodies.orbit.filter_steps import OrbitFilterSettings
+from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
 from hal.interfaces.devices import ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.bodies.orbit.control import SunAcquisitionBrake
+from flight.bodies.orbit.control import SunAcquisitionLaw
 from flight.link.events import EventKind
-from flight.loop.fdir.facts import EventLog
+from flight.loop.facts import EventLog
 from hal.interfaces.devices import StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
@@ -27,7 +27,7 @@ class Seen:
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
             SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
-        self.seeker = SunAcquisitionBrake(law, SolarStringModel(), 0.648, EventLog(self._tell))
+        self.seeker = SunAcquisitionLaw(law, SolarStringModel(), 0.648, EventLog(self._tell))
         self.seeker.begin(0)
 
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter
-from flight.bodies.orbit.filter_steps import DipoleHistory, OrbitFilterSettings
+from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, DipoleHistory, OrbitFilter, OrbitFilterSettings
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

@@ -13,8 +13,7 @@ from flight.bodies.orbit.filter import (
     learned_of,
     start_from,
 )
-from flight.loop.state.content import Learned, StoredState
-from flight.loop.state.store import decode, encode
+from flight.loop.state import Learned, StoredState, decode, encode
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.free_filter import (
     DIPOLE,

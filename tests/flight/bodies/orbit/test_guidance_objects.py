@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.bodies.orbit.guidance import ObjectAim, Sensor
 from flight.link.events import EventKind
-from flight.loop.fdir.facts import EventLog
+from flight.loop.facts import EventLog
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict

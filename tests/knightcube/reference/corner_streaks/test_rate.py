@@ -20,7 +20,7 @@ from knightcube.reference.corner_streaks.settings import (
 )
 from knightcube.vision.objects.streak_ends import segment_frame
 from knightcube.vision.streaks.streak_result import StreakStatus, direction_of_time
-from tests.flight.loop.executive.passing import passed
+from tests.flight.loop.passing import passed
 from tests.support.streak_frames import (
     Camera,
     expose,

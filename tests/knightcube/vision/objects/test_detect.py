@@ -35,7 +35,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack
-from tests.flight.loop.executive.passing import passed
+from tests.flight.loop.passing import passed
 from tests.knightcube.vision.objects.space_objects import (
     add_object,
     frame_with,

@@ -19,7 +19,7 @@ from knightcube.vision.streaks.joint_fit import true_ends, unbroken
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
-from tests.flight.loop.executive.passing import passed
+from tests.flight.loop.passing import passed
 from tests.knightcube.vision.streaks.scenes import (
     CAMERA,
     SATURATION,

@@ -28,7 +28,7 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
     PathProgram,
     Trial,
 )
-from tests.flight.loop.executive.passing import passed
+from tests.flight.loop.passing import passed
 from tests.pace import ordinary_seconds
 from tests.studies.bench.plan import largest_ratio
 from tests.support.collocation_oracle import solve

@@ -1,0 +1,116 @@
+"""A run: its request, its folder with the configuration and the logs, and its result."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs, open_segment
+from flight.link.telemetry.log import FlightLog
+from flight.loop.flight_loop import FlightEnding
+from flight.schema.sections import Config
+from hal.buses.clock import SystemClock
+from hal.interfaces.wires import SECOND_NS, Rig
+from knightcube.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """A request to fly. `duration` in s and `seed` replace the configuration's when given.
+
+    `devices` is the file of a running server of simulated devices; without it, a server is started.
+    `archive` holds the runs of a board: the flight's folder is the archive's next, instead of `out`.
+    `accepted` flies `config_path` only if it is the accepted file, else the last one that flew.
+    `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.schedule`.
+    """
+
+    config_path: Path
+    out: Path
+    realtime: bool = False
+    duration: float | None = None
+    seed: int | None = None
+    devices: Path | None = None
+    archive: Path | None = None
+    faults: tuple[str, ...] = ()
+    accepted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """How a flight ended; `interrupted` when by a signal.
+
+    `ending` is how the loop stood. `restart` says why the process should be restarted, empty when it should
+    not. `faults` were injected.
+    """
+
+    folder: Path
+    reason: str
+    interrupted: bool
+    log_error: str
+    ending: FlightEnding
+    restart: str = ""
+    faults: tuple[str, ...] = ()
+
+
+def utc_ns() -> int:
+    """Return the machine's UTC, ns since 1970."""
+    return SystemClock().utc_ns()
+
+
+def utc_text() -> str:
+    """Return the machine's UTC as text, for names of folders."""
+    return f"{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"
+
+
+_NEWEST = 4
+"""Runs that are asked for the number of their boot."""
+
+
+def default_folder(config_path: Path) -> Path:
+    """Return the default folder of a run, named after its configuration and the time."""
+    return Path("runs") / f"{config_path.stem}-{utc_text()}"
+
+
+def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
+    """Create the run's folder, the archive's next if there is an archive.
+
+    Return the request with its path, and the folders of the archive's newest runs before.
+
+    Raises UsageError for a folder that holds a run, and for a folder that cannot be written; a board with an
+    archive flies on in spite of disk trouble, and its logs wait for the disk.
+    """
+    earlier: list[Path] = []
+    if request.archive is not None:
+        earlier = find_runs(request.archive)[-_NEWEST:]
+        logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
+        run = begin_run(request.archive, config.telemetry.archive_bytes, logs_bytes)
+        request = replace(request, out=run.folder)
+    out = request.out
+    if any(out.glob("*.ccsds")):
+        raise UsageError(f"{out} holds a run already: give another folder, or remove this one")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "config.yaml").write_text(text, encoding="utf-8")
+    except OSError as error:
+        if request.archive is not None and error.errno in DISK_TROUBLE:
+            return request, earlier
+        raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return request, earlier
+
+
+def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:
+    """Open one log of the run, synchronised to disk once a second in real time."""
+    log = FlightLog(
+        folder,
+        stem,
+        clock=rig.clock,
+        segment_bytes=config.telemetry.segment_bytes,
+        budget_bytes=config.telemetry.budget_bytes,
+        sync_period_ns=SECOND_NS if rig.realtime else None,
+        patient=patient,
+        opener=open_segment if rig.host is None else rig.host.opener(open_segment),
+    )
+    stack.callback(log.close)
+    return log

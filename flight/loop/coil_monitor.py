@@ -1,0 +1,748 @@
+"""The coil monitor: detects broken coils from commands, supply current and motion, and identifies the fault.
+
+Each cycle the loop passes the commands (`commanded`, `interrupted`), the samples of the inertial unit
+(`observe_motion`) and the newest reading of the current monitor (`measured`) to `CoilMonitor`, and then reads
+`verdicts`, `available`, `resting`, `braked`, `at_rest`, `probe`, `suspicion` and `monitor_doubted`. No call
+waits. `CoilKnowledge` states whether the coil currents are known: they are unknown while the PWM driver
+fails, after the loop has stalled, and while the supply current contradicts the commands.
+
+The current monitor measures the sum of |I| of three bridges, so it cannot detect a reversed coil, and detects
+an open coil only while that axis is commanded: axes that are not driven are not judged. Every reading is
+compared with the prediction of each hypothesis (healthy; each axis open, shorted, either leg of either input
+stuck; see `flight.loop.coil_response`). There is a verdict when `healthy` is rejected and the hypotheses that
+explain the readings since then all name one axis; between axes that are not driven, a small wave on each in
+turn decides. A reversed coil is found from the angular acceleration, which also distinguishes a wrong monitor
+from a broken coil; over longer bins the acceleration raises a suspicion if a current too small for the
+monitor makes no torque.
+
+A leg stuck high is found by setting the coils to zero and braking bridges. Braking (both inputs high) removes
+the voltage from any coil, whether its bridge is healthy or not. When the supply current is far too large or
+too small, all coils are commanded to zero: a remaining current was not commanded. Then all bridges are braked
+at once. If the current stops, they are released one by one: the bridge with which the current returns is
+broken. No healthy coil carries current meanwhile, and there is no other verdict during the search. If neither
+rest nor brakes change the current, as with a shorted coil or a wrong monitor, the search ends. When commands
+change all the time, as in B-dot's windows, the command of an ADC sample is ambiguous: then there is a rest
+every few seconds without a suspicion, as a check.
+
+A reversed coil draws the current of a healthy one, so that the monitor cannot confirm the verdict, and in a
+tumble the motion depends on the inertia more than on the coils. A coil that looks reversed in a tumble is
+therefore not isolated: it rests, and is tried and judged again once the body is slower than `tumble_rate`, or
+after ten minutes.
+
+The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
+18 % error of a single ADC sample of the chopped current (`hal.drivers.ina219`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.loop.coil_response import (
+    ELECTRICAL,
+    MEAN,
+    NEWEST,
+    NONE,
+    Axes,
+    Bounds,
+    CoilCommands,
+    CoilFault,
+    CoilResponse,
+    MotionWitness,
+    Predicted,
+    ResponseSettings,
+    Sampling,
+    Supplied,
+    fits,
+    predict,
+)
+from hal.interfaces.devices import CoilState, PowerReading
+from knightcube.astro.arrays import FloatArray
+
+_SURE = 2
+"""Conversions in a row that must agree."""
+_PATIENCE = 12
+"""Conversions without agreement after which a step is given up."""
+_PAUSE = 50
+"""Conversions between a rest without a finding and the next rest: control has priority."""
+_UNCLEAR = 20
+"""Conversions in a row whose command is ambiguous, after which there is a rest as a check."""
+
+
+class _Step(Enum):
+    WATCHING = auto()
+    RESTING = auto()
+    ALL_BRAKED = auto()
+    ONE_RELEASED = auto()
+    NO_CURE = auto()
+
+
+class StuckLeg:
+    """Searches for a stuck leg: processes ADC samples, requests rest and brakes, and returns an axis.
+
+    Attributes:
+        brake: which bridges are to be braked now.
+        rest: whether all commands are to be zero now.
+        suspicion: why there is a search, empty without a suspicion.
+    """
+
+    def __init__(self, excess: float) -> None:
+        """Take the excess current, A, that only a fault can draw."""
+        self._excess = excess
+        self._pause = self._unclear = 0
+        self._high = self._short = self._normal = self._looks = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Release all bridges and end the search."""
+        self._step = _Step.WATCHING
+        self._left: list[int] = []
+        self._braked: tuple[int, ...] = ()
+        self._await()
+        self.brake = NONE
+        self.rest = False
+        self.suspicion = ""
+
+    @property
+    def is_searching(self) -> bool:
+        """Whether a search is running: coils at rest, and perhaps braked."""
+        return self.rest
+
+    def exceeds(self, supplied: Supplied) -> bool:
+        """Return whether a conversion is more than healthy coils can draw."""
+        return supplied.current > supplied.most + self._excess
+
+    def ask_for_rest(self, why: str) -> None:
+        """Request a rest, unless a search is running or the last rest was too recent."""
+        if self._step is _Step.WATCHING and not self._pause:
+            self._rest(why)
+
+    def look(self, supplied: Supplied) -> int | None:
+        """Process a conversion; return the axis of a stuck leg when found."""
+        self._pause = max(self._pause - 1, 0)
+        if self.rest and supplied.driven:
+            return None  # not yet at rest
+        high = self.exceeds(supplied)
+        short = supplied.current < supplied.least - self._excess
+        self._high = self._high + 1 if high else 0
+        self._short = self._short + 1 if short else 0
+        self._normal = 0 if high or short else self._normal + 1
+        self._looks += 1
+        if self.is_searching and self._looks > _PATIENCE:
+            self._give_up()  # an intermittent current is no stuck leg
+            return None
+        self._unclear = self._unclear + 1 if supplied.spread > self._excess else 0
+        if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
+            self._rest("")
+            return None
+        if self._high >= _SURE:
+            return self._judge_too_much(supplied)
+        if self._short >= _SURE and self._step is _Step.WATCHING:
+            self._put_to_rest(supplied)
+        elif self._normal >= _SURE:
+            self._judge_normal()
+        return None
+
+    def _judge_too_much(self, supplied: Supplied) -> int | None:
+        match self._step:
+            case _Step.WATCHING if supplied.driven:
+                self._put_to_rest(supplied)
+            case _Step.WATCHING | _Step.RESTING if supplied.at_rest:
+                self._brake_all(supplied)
+            case _Step.ONE_RELEASED:
+                found = self._left[0]
+                self.reset()
+                return found
+            case _:
+                self._give_up()
+        return None
+
+    def _judge_normal(self) -> None:
+        match self._step:
+            case _Step.RESTING if not self.suspicion:
+                self.reset()
+            case _Step.RESTING:
+                self._pause = _PAUSE
+                self._give_up()
+            case _Step.ALL_BRAKED:
+                self._release_next()
+            case _Step.ONE_RELEASED:
+                del self._left[0]
+                self._release_next()
+            case _Step.NO_CURE:
+                self.reset()
+            case _Step.WATCHING:
+                pass
+
+    def _brake_all(self, supplied: Supplied) -> None:
+        self.suspicion = self.suspicion or _reason(supplied)
+        self._step, self._left, self._braked = (
+            _Step.ALL_BRAKED,
+            list(supplied.at_rest),
+            tuple(supplied.at_rest),
+        )
+        self.brake, self.rest = _only(supplied.at_rest), True
+        self._await()
+
+    def _put_to_rest(self, supplied: Supplied) -> None:
+        if self._pause:
+            self._give_up()
+            return
+        self._rest(_reason(supplied))
+
+    def _rest(self, why: str) -> None:
+        self.suspicion = self.suspicion or why
+        self._step = _Step.RESTING
+        self.brake, self.rest = NONE, True
+        self._await()
+
+    def _release_next(self) -> None:
+        """Release the next bridge; end the search when none is left."""
+        if not self._left:
+            self.reset()
+            return
+        self._step = _Step.ONE_RELEASED
+        self.brake = _only([axis for axis in self._braked if axis != self._left[0]])
+        self._await()
+
+    def _give_up(self) -> None:
+        """End the search until the current is normal again."""
+        self.reset()
+        self._step = _Step.NO_CURE
+
+    def _await(self) -> None:
+        self._high = self._short = self._normal = self._looks = 0
+
+
+def _reason(supplied: Supplied) -> str:
+    due = f"{1e3 * max(supplied.least, 0.0):.0f} to {1e3 * supplied.most:.0f} mA"
+    return f"supply current {1e3 * supplied.current:.0f} mA where {due} are due"
+
+
+def _only(axes: Sequence[int]) -> Axes:
+    return 0 in axes, 1 in axes, 2 in axes
+
+
+_PROOFS = 2
+"""Conversions in a row that must agree."""
+
+
+class BrakeProof:
+    """Collects conversions made under brakes that are not confirmed yet."""
+
+    def __init__(self) -> None:
+        self._axes: set[int] = set()
+        self._exceeds: deque[bool] = deque(maxlen=_PROOFS)
+
+    def __bool__(self) -> bool:
+        """Return whether any brake is unconfirmed."""
+        return bool(self._axes)
+
+    def add(self, axis: int) -> None:
+        """Add an axis that is braked on a verdict alone."""
+        self._axes.add(axis)
+
+    def discard(self, axis: int) -> None:
+        """Remove an axis."""
+        self._axes.discard(axis)
+
+    def ingest(self, exceeds: bool) -> frozenset[int]:
+        """Note whether a conversion shows current despite the brakes; return the axes braked wrongly."""
+        self._exceeds.append(exceeds)
+        if len(self._exceeds) < _PROOFS:
+            return frozenset()
+        wrong = frozenset(self._axes) if all(self._exceeds) else frozenset()
+        if len(set(self._exceeds)) == 1:
+            self._axes.clear()
+            self._exceeds.clear()
+        return wrong
+
+
+@dataclass(frozen=True, slots=True)
+class CoilVerdict:
+    """One broken axis: 0, 1, 2 for x, y, z."""
+
+    axis: int
+    fault: CoilFault
+    time_ns: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class CoilMonitorSettings:
+    """Properties of the coils' circuit and of the monitor.
+
+    Attributes:
+        full_current: A, of a coil that is fully on: supply voltage over resistance.
+        current_uncertainty: A, bound on each driven coil's deviation from its command.
+        gain_error: relative bound: resistance, supply, and the monitor's sampling of the chopped current.
+        monitor_noise: A, bound, at any current.
+        window_ns: averaging time of a reading's mean. A longer gap between readings resets the watch.
+        persistence: readings in a row that fit no healthy circuit, until there is a suspicion.
+        settle: readings after that until the window lies wholly after the fault.
+        evidence: readings that a verdict needs.
+        probe_current: A, of the wave that distinguishes faults of axes at rest.
+        probe_half_ns: half the wave's period.
+        response: the body's response to the coils; None where the motion is not used.
+        slow: the same over longer bins, which show currents that the monitor can not tell from none.
+        tumble_rate: rad/s; a coil that looks reversed while the body turns faster rests until it is slower.
+    """
+
+    full_current: tuple[float, float, float]
+    current_uncertainty: float = 3.5e-3
+    gain_error: float = 0.2
+    monitor_noise: float = 1.5e-3
+    window_ns: int = 1_100_000_000
+    persistence: int = 3
+    settle: int = 2
+    evidence: int = 3
+    probe_current: float = 0.04
+    probe_half_ns: int = 800_000_000
+    response: ResponseSettings | None = None
+    slow: ResponseSettings | None = None
+    tumble_rate: float = math.inf
+
+
+_UNSEEN_NS = 600_000_000
+"""The coil driver reads its outputs back twice a second: an error may be this old when found."""
+_UNSUSPECTED_NS = 800_000_000
+"""Four readings of the monitor: `CoilMonitorSettings.persistence` of them in a row begin a suspicion."""
+STOOD_NS = 200_000_000
+"""If the loop stalls for longer, the guardian may have zeroed the coils."""
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentValidity:
+    """Whether the coil currents are known.
+
+    Attributes:
+        now: whether the currents in force are known.
+        since_last_look: whether the chip kept all commands since the previous look.
+        since_ns: time since which they are known.
+        uncertain_since_ns: time from which currents assumed so far turn out to be uncertain; None if none do.
+    """
+
+    now: bool
+    since_last_look: bool
+    since_ns: int
+    uncertain_since_ns: int | None
+
+
+class CoilKnowledge:
+    """Checks the coil driver once a cycle."""
+
+    def __init__(self) -> None:
+        self._obeys = True
+        self._suspected = False
+        self._since_ns = -1
+        self._looked_ns: int | None = None
+
+    def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
+        """Return which currents are known, from the driver's state and the time since the last look.
+
+        `suspected` is whether the supply current fits no healthy circuit: a coil may carry any current then.
+        """
+        obeyed, self._obeys = self._obeys, not in_force.error
+        was_suspected, self._suspected = self._suspected, suspected
+        looked_ns, self._looked_ns = self._looked_ns, now_ns
+        stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
+        since_last_look = obeyed and self._obeys and not stood
+        now = self._obeys and not suspected
+        if now and (was_suspected or not since_last_look):
+            self._since_ns = now_ns
+        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._obeys else []
+        if suspected and not was_suspected:
+            uncertain.append(now_ns - _UNSUSPECTED_NS)
+        if looked_ns is not None and stood:
+            uncertain.append(looked_ns)
+        return CurrentValidity(now, since_last_look, self._since_ns, min(uncertain, default=None))
+
+
+class Probe:
+    """Applies a zero-mean square wave to one axis after the other.
+
+    The two halves last `half_ns` each and carry +`current` and -`current` A: they make no mean torque.
+    """
+
+    def __init__(self, current: float, half_ns: int) -> None:
+        self._current = current
+        self._half_ns = half_ns
+        self._running: tuple[int, int] | None = None  # axis, and since when
+        self._tried: set[int] = set()
+
+    def begin(self, axes: set[int], now_ns: int) -> int | None:
+        """Begin a wave on the next untried of `axes`; return the wave's end, None when all were tried."""
+        candidates = sorted(axes - self._tried)
+        if not candidates:
+            self._tried.clear()
+            return None
+        self._tried.add(candidates[0])
+        self._running = (candidates[0], now_ns)
+        return now_ns + 2 * self._half_ns
+
+    def stop(self) -> None:
+        """End the wave; count all axes as untried."""
+        self._running = None
+        self._tried.clear()
+
+    def wave(self, now_ns: int) -> FloatArray:
+        """Return (3,) A to be added to the commands at `now_ns`."""
+        wave = np.zeros(3)
+        if self._running is not None:
+            axis, since_ns = self._running
+            half = (now_ns - since_ns) // self._half_ns
+            if half < 2:
+                wave[axis] = self._current * (1.0 if half == 0 else -1.0)
+            else:
+                self._running = None
+        return wave
+
+
+__all__ = ["CoilFault", "CoilMonitor", "CoilMonitorSettings", "CoilVerdict"]
+
+AXES = "xyz"
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+_BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
+_STUCK_EXCESS = 0.3
+"""Of the current of a coil that is fully on: a leg stuck high certainly draws more."""
+_LEAST_SHORT = 0.02
+"""A; a smaller excess could not be confirmed by the body's motion."""
+_READING_NS = 200_000_000
+_MOST_EVIDENCE = 40
+_IN_DOUBT = 5
+"""Readings after which a verdict may leave the kind of fault open."""
+_LONGEST_REST_NS = 600_000_000_000
+"""Rest of a coil that looks reversed in a tumble; then it is tried again, however fast the body is."""
+
+
+class CoilMonitor:
+    """Judges the coils by the commands and readings of the last seconds.
+
+    Longer than 200 lines because all methods share the state of one suspicion, from detection to verdict.
+
+    Attributes:
+        tumble_rate: rad/s, above which no coil is isolated by the motion alone.
+    """
+
+    def __init__(self, settings: CoilMonitorSettings) -> None:
+        self._settings = settings
+        self.tumble_rate = settings.tumble_rate
+        self._bounds = Bounds(
+            settings.full_current,
+            settings.current_uncertainty,
+            settings.gain_error,
+            settings.monitor_noise,
+        )
+        self._commands = CoilCommands(2 * settings.window_ns)
+        self._reading_ns = -(1 << 62)
+        self._fresh = 0
+        self._strange = 0
+        self._suspected_ns: int | None = None
+        self._judge_ns = 0  # from when on a verdict may leave the kind of fault open
+        self._sound_ns = 0  # when a driven coil last drew the expected current
+        self._unmixed_ns = 0  # from when on a reading's mean covers one state of the circuit
+        self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
+        self._probe = Probe(settings.probe_current, settings.probe_half_ns)
+        self._response = None if settings.response is None else CoilResponse(settings.response)
+        self._slow = None if settings.slow is None else CoilResponse(settings.slow)
+        self._weak = ""  # which coil's torque is missing in the motion
+        self._verdicts: dict[int, CoilVerdict] = {}
+        # By resting axis: time at which its rest began, and the reason.
+        self._rests: dict[int, tuple[int, str]] = {}
+        self._looked_ns = 0
+        self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
+        self._proof = BrakeProof()
+        self._witness = MotionWitness(self._response, settings.full_current)
+        self._strangeness = ""
+
+    @property
+    def verdicts(self) -> tuple[CoilVerdict, ...]:
+        """The broken axes, at most one verdict each, in the order found; kept until `forget`."""
+        return tuple(self._verdicts.values())
+
+    @property
+    def available(self) -> BoolArray:
+        """(3,) which axes may be used, for `knightcube.gnc.control.allocation`."""
+        return np.array([axis not in self._verdicts for axis in range(3)])
+
+    @property
+    def resting(self) -> BoolArray:
+        """(3,) whether each axis is not to be driven for now, because it looks reversed in a tumble."""
+        return np.array([axis in self._rests for axis in range(3)])
+
+    @property
+    def suspicion(self) -> str:
+        """Why a coil is suspected; empty while the readings fit a healthy circuit."""
+        rests = "; ".join(why for _, why in self._rests.values())
+        return self._unknown or rests
+
+    @property
+    def doubts_currents(self) -> bool:
+        """Whether a coil may carry another current than its command; a coil that rests carries none."""
+        return bool(self._unknown)
+
+    @property
+    def _unknown(self) -> str:
+        """Why a coil may carry another current than its command."""
+        return self._leg.suspicion or self._strangeness or self._weak
+
+    @property
+    def braked(self) -> Axes:
+        """Which bridges are to be braked: those with a leg stuck high, and those of a search for one."""
+        if not self._verdicts:
+            return self._leg.brake
+        x, y, z = (
+            asked or (axis in self._verdicts and self._verdicts[axis].fault in _BRAKED)
+            for axis, asked in enumerate(self._leg.brake)
+        )
+        return x, y, z
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether all commands are to be zero now, to reveal a leg stuck high."""
+        return self._leg.rest
+
+    def forget(self, axis: int) -> None:
+        """Trust an axis again, by command; a lasting fault will be found again."""
+        self._verdicts.pop(axis, None)
+        self._rests.pop(axis, None)
+        self._proof.discard(axis)
+        self.interrupted(self._commands.newest_ns if self._commands else 0)
+
+    def commanded(
+        self, time_ns: int, currents: FloatArray, braked: Axes = NONE, written_ns: int | None = None
+    ) -> None:
+        """Note the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or now."""
+        values = tuple(currents.tolist())
+        self._commands.note(time_ns, values, braked)
+        # Without readings, a rest or a brake would never end.
+        if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
+            self._leg.reset()
+        for response in self._responses:
+            response.commanded(time_ns if written_ns is None else written_ns, values)
+
+    def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
+        """Add a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
+        if self._rests:
+            self._end_rests(time_ns, float(np.sqrt(rate @ rate)))
+        for response in self._responses:
+            if response.observe_motion(time_ns, rate, field):
+                self._judge_motion(response, time_ns)
+
+    def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
+        """Give a verdict on an axis that turns the body the wrong way; suspect one that does not turn it.
+
+        In a tumble there is no verdict: the axis rests.
+        """
+        for axis in response.reversed_axes():
+            # An uncommanded current turns the body too.
+            if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
+                continue
+            if response.fastest <= self.tumble_rate:
+                self._give(axis, CoilFault.REVERSED, now_ns, response.text(axis))
+            else:
+                why = f"coil {AXES[axis]}: {response.text(axis)}; it rests while the body tumbles"
+                self._rests[axis] = now_ns, why
+        if response is self._slow:
+            known = self._verdicts.keys() | self._rests.keys()
+            axes = [axis for axis in response.feeble_axes() if axis not in known]
+            # If several coils look weak at once, the gyro or the field is more likely wrong.
+            self._weak = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
+
+    def _end_rests(self, now_ns: int, speed: float) -> None:
+        """Try the resting axes again, on new evidence, once the body is slow or the rest has lasted long."""
+        oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
+        if speed <= self.tumble_rate or now_ns - oldest_ns > _LONGEST_REST_NS:
+            self._rests.clear()
+            for response in self._responses:
+                response.reset()
+
+    def interrupted(self, now_ns: int) -> None:
+        """Discard the evidence until now: the coil currents of that time are unknown."""
+        self._fresh = 0
+        self._leg.reset()
+        self._reset()
+        self._weak = ""
+        for response in self._responses:
+            response.interrupted(now_ns)
+
+    def measured(self, reading: PowerReading) -> None:
+        """Add a reading of the monitor; a repeated reading is ignored."""
+        gap_ns = reading.time_ns - self._reading_ns
+        if gap_ns <= 0 or not self._commands:
+            return
+        self._reading_ns = reading.time_ns
+        self._look_at_legs(reading)
+        if self._leg.is_searching:
+            self._unmixed_ns = reading.time_ns
+            if self._suspected_ns is None and self._leg.suspicion:
+                self._suspect(self._leg.suspicion)
+            return
+        self._fresh = self._fresh + 1 if gap_ns < self._settings.window_ns else 1
+        if self._fresh <= self._settings.settle:
+            self._reset()
+            self._unmixed_ns = reading.time_ns
+            return
+        predictions = self._predictions(reading)
+        if self._suspected_ns is None:
+            self._check_healthy(predictions, reading)
+        elif reading.time_ns - self._suspected_ns > self._settle_ns:
+            self._evidence.extend(predictions)
+            self._judge(reading.time_ns)
+
+    @property
+    def probe(self) -> FloatArray:
+        """(3,) A to be added to the commands now: zero, or a zero-mean wave."""
+        return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
+
+    @property
+    def monitor_doubted(self) -> str:
+        """Why the monitor, not a coil, is doubted; empty while the monitor is trusted."""
+        return self._witness.doubt
+
+    @property
+    def _responses(self) -> list[CoilResponse]:
+        return [response for response in (self._response, self._slow) if response is not None]
+
+    @property
+    def _settle_ns(self) -> int:
+        return self._settings.settle * _READING_NS
+
+    @property
+    def _known(self) -> dict[int, CoilFault]:
+        """The fault of each broken axis in the supply current: a braked axis draws no current."""
+        return {
+            axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
+            for axis, verdict in self._verdicts.items()
+        }
+
+    def _look_at_legs(self, reading: PowerReading) -> None:
+        """Search for a leg stuck high, if this conversion was made under the present brakes."""
+        commands = self._commands
+        if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
+            return
+        self._looked_ns = reading.time_ns
+        seen = commands.supplied(reading, self._bounds, self._known)
+        if self._proof:
+            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # back to both inputs low
+                self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
+            return
+        found = self._leg.look(seen)
+        if found is not None:
+            text = f"{1e3 * reading.newest:.0f} mA without a command"
+            self._give(found, CoilFault.HIGH, reading.time_ns, text)
+            self.interrupted(reading.time_ns)
+
+    def _predictions(self, reading: PowerReading) -> list[Predicted]:
+        """Return a reading's newest conversion, and its mean unless it mixes states, with predictions."""
+        windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
+        begin_ns = reading.time_ns - self._settings.window_ns
+        if begin_ns >= self._unmixed_ns:
+            windows.append((reading.current, begin_ns, MEAN))
+        return [
+            predict(
+                current,
+                self._commands.window(since_ns, reading.time_ns),
+                self._bounds,
+                sampling,
+                reading.clipped,
+            )
+            for current, since_ns, sampling in windows
+        ]
+
+    def _check_healthy(self, predictions: list[Predicted], reading: PowerReading) -> None:
+        asked = float(predictions[0].mean[:, 0].sum())
+        if all(fits([one], self._bounds, self._known) for one in predictions):
+            self._strange = 0
+            self._witness.trust_monitor()
+            if asked > self._bounds.uncertainty:
+                self._sound_ns = reading.newest_since_ns
+            return
+        self._strange += 1
+        if self._strange >= self._settings.persistence:
+            why = f"supply current {1e3 * reading.newest:.0f} mA where {1e3 * asked:.0f} are due"
+            self._suspect(why)
+            if reading.newest > asked > 0.0:
+                self._leg.ask_for_rest(why)
+
+    def _suspect(self, why: str) -> None:
+        self._suspected_ns = self._unmixed_ns = self._reading_ns
+        self._judge_ns = self._reading_ns + self._settle_ns + _IN_DOUBT * _READING_NS
+        self._evidence.clear()
+        self._strangeness = why
+
+    def _judge(self, now_ns: int) -> None:
+        """Give a verdict if the evidence leaves one axis; drop the suspicion if the readings are healthy."""
+        evidence = tuple(self._evidence)
+        if len(evidence) < self._settings.evidence:
+            return
+        if fits(evidence[-8:], self._bounds, self._known):
+            self._reset()
+            return
+        sound = [axis for axis in range(3) if axis not in self._verdicts]
+        left = [
+            (axis, fault)
+            for axis in sound
+            for fault in ELECTRICAL
+            if fits(evidence, self._bounds, self._known, axis, fault)
+        ]
+        axes = {axis for axis, _ in left}
+        waited = now_ns >= self._judge_ns
+        if len(axes) == 1 and (len(left) == 1 or waited):
+            axis, fault = left[0]
+            self._conclude(axis, fault if len(left) == 1 else CoilFault.UNCERTAIN, now_ns)
+        elif waited:
+            self._look_further(axes, now_ns)
+
+    def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
+        excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
+        if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
+            self._reset()  # too small to be confirmed by the motion: it may be the monitor
+            return
+        if self._is_contradicted(axis, fault):
+            why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
+            self._witness.doubt_monitor(why, now_ns)
+        else:
+            self._give(axis, fault, now_ns, self._strangeness)
+            if fault in _BRAKED:
+                self._proof.add(axis)
+                self._fresh = 0
+        self._reset()
+
+    def _is_contradicted(self, axis: int, fault: CoilFault) -> bool:
+        if self._suspected_ns is None:
+            return False
+        begun_ns = min(self._sound_ns, self._suspected_ns - self._settings.window_ns)
+        return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
+
+    def _look_further(self, axes: set[int], now_ns: int) -> None:
+        """Probe the next of the axes in question; when all were tried, collect new evidence.
+
+        No hypothesis explains an intermittent fault, or a fault of the monitor.
+        """
+        ends_ns = self._probe.begin(axes, now_ns)
+        if ends_ns is None:
+            self._evidence.clear()
+            self._judge_ns = now_ns + _IN_DOUBT * _READING_NS
+        else:
+            self._judge_ns = ends_ns + _READING_NS
+
+    def _give(self, axis: int, fault: CoilFault, now_ns: int, why: str) -> None:
+        text = f"coil {AXES[axis]} {fault.value} ({why})"
+        self._verdicts[axis] = CoilVerdict(axis, fault, now_ns, text)
+
+    def _reset(self) -> None:
+        self._strange = 0
+        self._suspected_ns = None
+        self._evidence.clear()
+        self._probe.stop()
+        self._strangeness = ""

@@ -1,0 +1,618 @@
+"""Responses of the coils to commands: supply current and angular acceleration, with and without faults.
+
+The supply current of each hypothesis (healthy, or one fault on one axis) is predicted from the commands.
+Input A of a bridge is pulsed for a positive current, B for a negative one. A leg that is stuck high drives
+its coil continuously; a pulse on the other input cancels the drive for its duration.
+
+`CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some seconds.
+Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins; differences of
+neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
+constant disturbance, a torsion and a damping of each free axis. Gain 1 is healthy, 0 is without torque, -1 is
+reversed. When the commands vary too little, the gain's standard deviation is large and no axis is judged. A
+gain beyond `LARGEST_GAIN` is physically impossible: the model is wrong then, and no axis is judged.
+
+The gyroscopic acceleration of a free body exceeds the coils' hundredfold in a tumble, so that an inertia 2 %
+wrong makes healthy coils look reversed. The fit therefore subtracts the acceleration that the assumed inertia
+makes, and estimates the error that remains by nuisance parameters (`knightcube.gnc.estimation.rigid_body`).
+If the coils' field at the magnetometer is as large as the Earth's, the field measured in their last pause is
+rotated with the body.
+
+The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
+supply current did distinguishes a broken coil from a wrong monitor (`observed_share`). `MotionWitness` checks
+verdicts that rest on the supply current in this way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from functools import cache
+
+import numpy as np
+
+from hal.interfaces.devices import PowerReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_matrices
+from knightcube.gnc.estimation.rigid_body import (
+    BodyErrors,
+    coefficient_modes,
+    gyroscopic_coefficients,
+    rate_products,
+)
+
+Axes = tuple[bool, bool, bool]
+NONE: Axes = (False, False, False)
+
+
+@dataclass(frozen=True, slots=True)
+class Supplied:
+    """A conversion made entirely under the present brakes, and the current that healthy coils would draw.
+
+    Attributes:
+        current: A, measured.
+        least, most: A, bounds of the total current of healthy coils.
+        spread: A, range of the total command in the conversion's window.
+        at_rest: the axes that were not driven and have no known fault.
+        driven: whether any axis was driven.
+    """
+
+    current: float
+    least: float
+    most: float
+    at_rest: Sequence[int]
+    driven: bool
+    spread: float = 0.0
+
+
+class CoilFault(Enum):
+    """The fault of an axis; the values are the log's texts."""
+
+    OPEN = "open: no current when driven"
+    SHORTED = "shorted: too much current when driven"
+    A_LOW = "input A's leg stuck low: no current in the positive direction"
+    B_LOW = "input B's leg stuck low: no current in the negative direction"
+    A_HIGH = "input A's leg stuck high: current at zero command"
+    B_HIGH = "input B's leg stuck high: current at zero command"
+    HIGH = "a leg stuck high: current at zero command, gone while its bridge is braked"
+    REVERSED = "reversed: it turns the body the wrong way"
+    UNCERTAIN = "broken in one of several ways"
+
+
+ELECTRICAL = (
+    CoilFault.OPEN,
+    CoilFault.SHORTED,
+    CoilFault.A_LOW,
+    CoilFault.B_LOW,
+    CoilFault.A_HIGH,
+    CoilFault.B_HIGH,
+)
+_VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
+PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
+"""Of each variant in a prediction; None is a healthy bridge."""
+_SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
+_SHORTED_SLACK = 0.04
+_OUTLIERS = 0.15
+"""Fraction of the readings that a hypothesis may miss: those whose window contains the fault's onset."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Bounds of the error of a predicted reading.
+
+    Attributes:
+        full_current: A, of a coil that is fully on.
+        uncertainty: A, for each driven coil.
+        gain: relative, common to all readings.
+        noise: A, of the monitor.
+    """
+
+    full_current: tuple[float, float, float]
+    uncertainty: float
+    gain: float
+    noise: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """Error bounds of a reading of a chopped current that changes within the reading's window.
+
+    Attributes:
+        scatter: error caused by chopping, of a bridge's current or of what lacks to its full current,
+            whichever is smaller: a bridge that is fully on is not chopped.
+        range_share: error of the mean, as a fraction of the range in the window.
+    """
+
+    scatter: float
+    range_share: float
+
+
+NEWEST = Sampling(0.2, 1.0)
+"""A single conversion, at an unknown time in its window; 18 % (`hal.drivers.ina219`)."""
+MEAN = Sampling(0.02, 0.25)
+"""The mean of five conversions; the remaining 7 % are in the gain, common to readings in a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """A reading in A, and the prediction of each axis (rows) under each variant (3, v), A.
+
+    `mean` of the window, `slack`, and `chopped`, the error by chopping. A `clipped` reading may be smaller
+    than the current.
+    """
+
+    current: float
+    mean: FloatArray
+    slack: FloatArray
+    chopped: FloatArray
+    clipped: bool = False
+
+
+def predict(
+    current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
+) -> Predicted:
+    """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
+    full = np.array(bounds.full_current)[:, None]
+    drawn = supply_currents(commands.T, full)
+    count = len(commands)
+    chopped = sampling.scatter * np.minimum(drawn, full[:, None] - drawn).clip(0.0).sum(axis=2) / count
+    slack = bounds.uncertainty * ((drawn != 0.0).sum(axis=2) / count)
+    slack += sampling.range_share * (drawn.max(axis=2) - drawn.min(axis=2))
+    return Predicted(current, drawn.sum(axis=2) / count, slack, chopped, clipped)
+
+
+def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
+    """Return the supply currents (n, v, k) of n bridges under each variant for commands (n, k) A.
+
+    `full` (n, 1) A is drawn when fully on. A shorted coil's are those of a healthy coil.
+    """
+    forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
+    drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
+    drawn[:, PLACE[None]] = drawn[:, PLACE[CoilFault.SHORTED]] = forward + backward
+    drawn[:, PLACE[CoilFault.OPEN]] = 0.0
+    drawn[:, PLACE[CoilFault.A_LOW]] = backward
+    drawn[:, PLACE[CoilFault.B_LOW]] = forward
+    drawn[:, PLACE[CoilFault.A_HIGH]] = np.maximum(full - backward, 0.0)
+    drawn[:, PLACE[CoilFault.B_HIGH]] = np.maximum(full - forward, 0.0)
+    return drawn
+
+
+def fits(
+    evidence: Sequence[Predicted],
+    bounds: Bounds,
+    known: Mapping[int, CoilFault],
+    axis: int | None = None,
+    fault: CoilFault | None = None,
+) -> bool:
+    """Return whether `fault` on `axis`, together with the known faults, explains nearly all readings."""
+    variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
+    if axis is not None:
+        variants[axis] = fault
+    current = np.array([one.current for one in evidence])
+    means, slacks = np.array([one.mean for one in evidence]), np.array([one.slack for one in evidence])
+    chops = np.array([one.chopped for one in evidence])
+    mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
+    slack: FloatArray = np.full(len(evidence), bounds.noise)
+    free = 0.0  # current that axes of unknown state may add
+    for number, variant in enumerate(variants):
+        if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
+            free += bounds.full_current[number]
+            continue
+        place = PLACE.get(variant, 0)
+        slack += slacks[:, number, place]
+        if variant is CoilFault.SHORTED:
+            own, own_chopped = means[:, number, place], chops[:, number, place]
+        else:
+            mean += means[:, number, place]
+            chopped += chops[:, number, place]
+    scales = _scales(bounds.gain)
+    explained, spare = scales * mean, slack + scales * chopped
+    if own.any():
+        explained = explained + _SHORTED_FACTORS * own
+        spare = spare + _SHORTED_FACTORS * (own_chopped + _SHORTED_SLACK * own)
+    clipped = np.array([one.clipped for one in evidence])
+    inside = (clipped | (current >= explained - spare)) & (current <= explained + spare + free)
+    misses = len(evidence) - int(inside.sum(axis=2).max())
+    return misses <= _OUTLIERS * len(evidence)
+
+
+@cache
+def _scales(gain: float) -> FloatArray:
+    """Return factors (9, 1, 1) over the range of the gain error."""
+    return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
+
+
+_SAMPLES_NS = 25_000_000
+_NOTED_LATE_NS = 25_000_000
+"""A command is noted one cycle after it was written."""
+
+
+class CoilCommands:
+    """Commanded currents and brakes with their times; `braked` holds which bridges are braked now."""
+
+    def __init__(self, reach_ns: int) -> None:
+        """Keep the commands of the last `reach_ns`."""
+        self._reach_ns = reach_ns
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
+        self._braked_ns = 0
+        self.braked = NONE
+
+    def __bool__(self) -> bool:
+        """Return whether a command was noted yet."""
+        return bool(self._commands)
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest command."""
+        return self._commands[-1][0]
+
+    def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
+        """Note the currents (3,) A and brakes in force from `time_ns` on."""
+        if braked != self.braked:
+            self._braked_ns, self.braked = time_ns, braked
+        self._commands.append((time_ns, currents))
+        horizon = time_ns - self._reach_ns
+        while len(self._commands) > 1 and self._commands[1][0] <= horizon:
+            self._commands.popleft()
+
+    def is_known_since(self, time_ns: int) -> bool:
+        """Return whether all commands since `time_ns` are known and made under the present brakes."""
+        return time_ns >= max(self._braked_ns, self._commands[0][0])
+
+    def window(self, begin_ns: int, end_ns: int) -> FloatArray:
+        """Return the commands (k, 3) A that may have been in force between two times, evenly sampled."""
+        later = iter(self._commands)
+        _, currents = next(later)
+        following = next(later, None)
+        sampled: list[tuple[float, ...]] = []
+        for time_ns in range(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS):
+            while following is not None and following[0] <= time_ns:
+                currents, following = following[1], next(later, None)
+            sampled.append(currents)
+        return np.array(sampled)
+
+    def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
+        """Return the newest conversion with the bounds of the current that healthy coils would draw.
+
+        `known` holds the known faults by axis.
+        """
+        sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
+        free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
+        unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
+        driven: list[bool] = [any(column) for column in sizes.T.tolist()]
+        total = sizes.sum(axis=1)
+        sure = np.delete(sizes, unsure, axis=1).sum(axis=1) if unsure else total
+        slack = sum(driven) * bounds.uncertainty + bounds.noise
+        error = bounds.gain + NEWEST.scatter
+        lowest, highest = float(total.min()), float(total.max())
+        return Supplied(
+            reading.newest,
+            least=float(sure.min()) * (1.0 - error) - slack,
+            most=highest * (1.0 + error) + slack + sum(bounds.full_current[axis] for axis in free),
+            at_rest=[axis for axis in range(3) if not driven[axis] and axis not in known],
+            driven=any(driven),
+            spread=highest - lowest,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseSettings:
+    """The body's response to the coils, and the settings of the fit.
+
+    Attributes:
+        inertia: (3, 3) kg m^2.
+        dipole_per_ampere: n A of each coil, m^2.
+        rate_noise: rad/s, standard deviation of a sample of the rate about each axis.
+        free: (3,) whether the body can turn about each axis; on a thread only about y.
+        bin_samples: samples of the rate in a bin.
+        bins: differences of bins in the fit.
+        model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.
+        torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
+        errors: largest errors of the inertia and of the gyro, of a body free about three axes.
+        sure: standard deviation below which a gain is used.
+        persistence: fits in a row that must agree.
+        lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
+            torque, and of a reversed one.
+        memory_ns: how long the residual accelerations are kept.
+        settle_ns: how long the coils must have been at rest for the field to be the Earth's; None if the
+            coils' field is small compared with the Earth's.
+    """
+
+    inertia: FloatArray
+    dipole_per_ampere: float
+    rate_noise: float
+    free: tuple[bool, bool, bool] = (True, True, True)
+    bin_samples: int = 8
+    bins: int = 15
+    model_error: float = 8.0e-4
+    torsion: float = 0.03
+    damping: float = 5.0e-3
+    errors: BodyErrors = field(default_factory=BodyErrors)
+    sure: float = 0.25
+    persistence: int = 3
+    lowest_sound: float = 0.6
+    highest_feeble: float = 0.4
+    highest_reversed: float = -0.5
+    memory_ns: int = 20_000_000_000
+    settle_ns: int | None = None
+
+
+_STALE_NS = 200_000_000
+_REACH_NS = 3_000_000_000
+"""For how long commands are kept: after a stall of the loop, samples arrive late and in a burst."""
+_LEAST_CHANGE = 4.0e-3
+"""rad/s^2: smaller changes cannot be detected."""
+LARGEST_GAIN = 1.5
+"""Largest gain, of either sign, that a coil and the described body can have."""
+_GAIN_PRIOR = 10.0
+_WEAK_GAIN, _SIGMAS = 0.7, 2.5
+"""Gain of a coil with little torque, and number of standard deviations by which the gain must be lower."""
+
+
+class CoilResponse:
+    """Sliding fit of the three gains.
+
+    Attributes:
+        gain, sigma: (3,) newest fit; sigma is infinite before the first.
+        fastest: largest body rate within the newest fit, rad/s.
+    """
+
+    def __init__(self, settings: ResponseSettings) -> None:
+        self._settings = settings
+        self._per_field = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
+        self._free = np.flatnonzero(settings.free)
+        self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
+        count = len(self._free)
+        # The gyroscopic acceleration (3, 6) per rate product, and the changes (k, 3, 6) that its errors make.
+        self._gyroscopic: FloatArray = np.zeros((3, 6))
+        self._modes: FloatArray = np.zeros((0, 3, 6))
+        if count == 3:
+            self._gyroscopic = gyroscopic_coefficients(settings.inertia)
+            self._modes = coefficient_modes(settings.inertia, settings.errors)
+        # Parameters: three gains, a torsion and a damping of each free axis, and a weight of each mode.
+        spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
+        spreads += [1.0] * len(self._modes)
+        self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
+        self._expected: FloatArray = self._prior[:, :3].sum(axis=1)
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
+        self._known_ns = 0
+        self._last_ns = 0
+        self.gain: FloatArray = np.ones(3)
+        self.sigma: FloatArray = np.full(3, np.inf)
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard all samples."""
+        self._asked: FloatArray = np.zeros((3, 3))
+        # Time and time since the sample before, s; rate and field (3,); currents (3,).
+        self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
+        self._previous: tuple[float, FloatArray, FloatArray, FloatArray] | None = None
+        self._turned: FloatArray = np.zeros(3)
+        self._spun: FloatArray = np.zeros(6)  # rad^2/s, the integrals of the rate products
+        self._quiet_field: FloatArray | None = None
+        # Of each free axis (f, 6 + k): accelerations by the coils (3), observed, mean rate and angle of the
+        # bin, accelerations by the k modes.
+        self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
+        self._speeds: deque[float] = deque(maxlen=self._settings.bins)
+        self.fastest = 0.0
+        self._weights: FloatArray = np.zeros(len(self._modes))  # of the modes, in the newest fit
+        # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,); the modes'
+        # accelerations (3, k).
+        self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
+        self._wrong_for = [0, 0, 0]
+        self._sound_for = [0, 0, 0]
+        self._feeble_for = [0, 0, 0]
+        self.sigma = np.full(3, np.inf)
+
+    def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
+        """Note the currents (3,) A in force from `time_ns` on."""
+        if currents == self._commands[-1][1]:
+            return
+        self._commands.append((time_ns, currents))
+        while len(self._commands) > 1 and self._commands[1][0] < time_ns - _REACH_NS:
+            self._commands.popleft()
+
+    def interrupted(self, until_ns: int) -> None:
+        """Ignore samples up to `until_ns`: the coil currents of that time are unknown."""
+        self._known_ns = until_ns
+        self.reset()
+
+    def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
+        """Add a sample of rate (3,) rad/s and field (3,) T; return whether there is a new fit."""
+        if time_ns < self._known_ns:
+            return False
+        since_ns = time_ns - self._last_ns
+        self._last_ns = time_ns
+        if not 0 < since_ns < _STALE_NS:
+            self.reset()
+            return False
+        if self._settings.settle_ns is not None:
+            quiet_field = self._field_without_coils(time_ns, since_ns * 1e-9, rate, field)
+            if quiet_field is None:
+                return False
+            field = quiet_field
+        self._samples.append((time_ns, since_ns * 1e-9, rate, field, self._command_at(time_ns)))
+        return len(self._samples) >= self._settings.bin_samples and self._close_bin()
+
+    def _field_without_coils(
+        self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
+    ) -> FloatArray | None:
+        """Return the Earth's field of the pause, or of the last one turned with the body; None before one."""
+        since_ns, currents = self._commands[-1]
+        settle_ns = self._settings.settle_ns or 0
+        if not any(currents) and time_ns - since_ns >= settle_ns:
+            self._quiet_field = field
+        elif self._quiet_field is not None:
+            (x, y, z), (wx, wy, wz) = self._quiet_field.tolist(), (span * rate).tolist()
+            turned = (x + y * wz - z * wy, y + z * wx - x * wz, z + x * wy - y * wx)
+            self._quiet_field = np.array(turned)
+        return self._quiet_field
+
+    def _command_at(self, time_ns: int) -> tuple[float, ...]:
+        for since_ns, currents in reversed(self._commands):
+            if since_ns <= time_ns:
+                return currents
+        return self._commands[0][1]
+
+    def reversed_axes(self) -> list[int]:
+        """Return the axes whose gain was reversed in the last `persistence` fits."""
+        return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
+
+    def feeble_axes(self) -> list[int]:
+        """Return the axes whose torque was missing or reversed in the last `persistence` fits."""
+        return [axis for axis in range(3) if self._feeble_for[axis] >= self._settings.persistence]
+
+    def is_healthy(self, axis: int) -> bool:
+        """Return whether the gain of an axis was healthy in the last `persistence` fits."""
+        return self._sound_for[axis] >= self._settings.persistence
+
+    def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
+        """Return the observed fraction of a change of torque.
+
+        The assumed change: the coil carries `constant` A instead of its command. The residuals before
+        `since_ns` are compared with those after `settled_ns`. None if the change is too small to be observed,
+        NaN if there are too few residuals.
+        """
+        before = [row[3] - row[4] @ self._weights for row in self._remainders if row[0] < since_ns]
+        after = [row for row in self._remainders if row[0] >= settled_ns]
+        if len(before) < 3 or len(after) < 3:
+            return math.nan
+        expected = np.mean([constant * row[2][:, axis] - row[1][:, axis] for row in after], axis=0)
+        size = float(expected @ expected)
+        if size < _LEAST_CHANGE**2:
+            return None
+        residuals = [row[3] - row[4] @ self._weights for row in after]
+        change = np.mean(residuals, axis=0) - np.mean(before[-10:], axis=0)
+        return float(change @ expected) / size
+
+    def text(self, axis: int) -> str:
+        """Return the gain in words."""
+        return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
+
+    def _close_bin(self) -> bool:
+        times, spans, rates, fields, currents = zip(*self._samples, strict=True)
+        self._samples.clear()
+        count = len(times)
+        # Row a: acceleration per ampere in coil a alone, J^-1 (n e_a x B).
+        per_ampere = cross_matrices(np.array(fields)) @ self._per_field
+        steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
+        steps[0] += self._asked
+        integral = np.cumsum(steps, axis=0)
+        self._asked = integral[-1]
+        middle = sum(times) / count * 1e-9
+        turning = np.array(rates)
+        products = rate_products(turning) * np.array(spans)[:, None]
+        products[0] += self._spun
+        spinning = np.cumsum(products, axis=0)
+        self._spun = spinning[-1]
+        rate, asked, spun = (part.sum(axis=0) / count for part in (turning, integral, spinning))
+        before, self._previous = self._previous, (middle, rate, asked, spun)
+        if before is None:
+            return False
+        span = middle - before[0]
+        mean_rate = 0.5 * (rate + before[1])
+        self._turned = self._turned + mean_rate * span
+        spin = (spun - before[3]) / span
+        row = np.empty((3, 6 + len(self._modes)))
+        row[:, :3] = (asked - before[2]).T / span
+        row[:, 3] = (rate - before[1]) / span - self._gyroscopic @ spin
+        row[:, 4], row[:, 5], row[:, 6:] = mean_rate, self._turned, (self._modes @ spin).T
+        self._rows.append(row[self._free])
+        self._speeds.append(math.sqrt(float(np.square(turning).sum(axis=1).max())))
+        row *= self._mask
+        remainder = row[:, 3] - row[:, :3].sum(axis=1)
+        per_ampere = per_ampere[-1].T * self._mask
+        self._remainders.append((self._last_ns, row[:, :3], per_ampere, remainder, row[:, 6:]))
+        while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
+            self._remainders.popleft()
+        if len(self._rows) < self._settings.bins // 2:
+            return False
+        self._fit(span)
+        return True
+
+    def _fit(self, span: float) -> None:
+        rows = np.array(self._rows)
+        # A constant disturbance about each free axis drops out with the means.
+        rows -= rows.sum(axis=0) / len(rows)
+        count = len(self._free)
+        inputs = np.zeros((len(rows), count, len(self._prior)))
+        inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = rows[:, :, :3], rows[:, :, 6:]
+        for place in range(count):
+            inputs[:, place, 3 + place] = -rows[:, place, 5]
+            inputs[:, place, 3 + count + place] = -rows[:, place, 4]
+        matrix, outputs = inputs.reshape(-1, len(self._prior)), rows[:, :, 3].reshape(-1)
+        settings = self._settings
+        floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + settings.model_error
+        weight = 1.0 / floor**2
+        covariance = np.linalg.inv(matrix.T @ matrix * weight + self._prior)
+        found = covariance @ (matrix.T @ outputs * weight + self._expected)
+        residual = outputs - matrix @ found
+        freedom = max(len(outputs) - count - 3, 1)
+        spread = max(1.0, float(residual @ residual) * weight / freedom)
+        self.gain = found[:3]
+        self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
+        self.fastest = max(self._speeds)
+        self._weights = found[3 + 2 * count :]
+        # The model is wrong if a gain is certainly impossible.
+        possible = bool((np.abs(self.gain) - 3.0 * self.sigma < LARGEST_GAIN).all())
+        pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
+        for number, (gain, sigma) in enumerate(pairs):
+            judged = possible and abs(gain) <= LARGEST_GAIN
+            wrong = judged and gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
+            weak = gain + _SIGMAS * sigma < _WEAK_GAIN and gain < settings.highest_feeble
+            feeble = wrong or (judged and sigma < settings.sure and weak)
+            sound = judged and sigma < settings.sure and gain > settings.lowest_sound
+            self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
+            self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
+            self._sound_for[number] = self._sound_for[number] + 1 if sound else 0
+
+
+_DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
+"""A leg stuck high drives its coil continuously, in this direction."""
+_LITTLE_RESPONSE = 0.4
+_DOUBTED_FOR_NS = 60_000_000_000
+"""Time (ns) after a false verdict during which the monitor is ignored if the motion is inconclusive."""
+
+
+class MotionWitness:
+    """Compares verdicts with the torque observed in the body's motion.
+
+    Attributes:
+        doubt: why the monitor, not a coil, is doubted; empty while the monitor is trusted.
+    """
+
+    def __init__(self, response: CoilResponse | None, full_current: tuple[float, float, float]) -> None:
+        """Take the fit of the motion, and the current (3,) A of each coil when fully on."""
+        self._response = response
+        self._full_current = full_current
+        self._doubted_ns = -_DOUBTED_FOR_NS
+        self.doubt = ""
+
+    def trust_monitor(self) -> None:
+        """Trust the monitor: its readings fit a healthy circuit."""
+        self.doubt = ""
+
+    def doubt_monitor(self, why: str, now_ns: int) -> None:
+        """Doubt the monitor from now on."""
+        self.doubt, self._doubted_ns = why, now_ns
+
+    def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
+        """Return whether the coil's torque is unchanged, so that the monitor is wrong.
+
+        The fault began after `begun_ns`, when the coil last drew the expected current, and was suspected at
+        `suspected_ns`; the newest reading is of `now_ns`.
+        """
+        if self._response is None:
+            return False
+        carried = _DRIVEN.get(fault, 0.0) * self._full_current[axis]
+        observed = self._response.observed_share(axis, carried, begun_ns, suspected_ns)
+        if (observed is None or math.isnan(observed)) and now_ns - self._doubted_ns < _DOUBTED_FOR_NS:
+            return True
+        if observed is None:
+            return fault not in _DRIVEN and self._response.is_healthy(axis)
+        if math.isnan(observed):
+            # No data from before the fault; a coil driven at zero command would show its torque by now.
+            return fault in _DRIVEN or self._response.is_healthy(axis)
+        return observed < _LITTLE_RESPONSE

@@ -1,0 +1,297 @@
+"""Commanding: executes commands from channels and from the time line, and answers them.
+
+The dispatcher is one of the named containment boundaries: no command can end the loop.
+
+The table of parameters is replaced as a whole by a command, and kept for the next boots. A table is checked
+before it is flown: its ranges, then the schema's bounds. If a flight ends uncleanly within `PROVEN_NS` of a
+load, the next boot flies the table before (`flight.loop.state`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgspec
+
+from flight.link import events
+from flight.link.commands.channel import Channel
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandError,
+    DumpParameters,
+    LoadParameters,
+    MalformedError,
+    Ping,
+    Point,
+    Slew,
+    unpack,
+)
+from flight.link.commands.definitions import DUMP_PARAMETERS, PING
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import COMMAND, PARAMETERS
+from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of, problem_of
+from flight.loop.executive import Cycle
+from flight.loop.facts import Services
+from flight.loop.modes import ModeControl
+from flight.loop.state import KeptTable, StateKeeper
+from flight.loop.steering import CoilDrive
+from flight.schema.sections import CommandStep, Config, Health, Modes
+
+S = TypeVar("S", Modes, Health)
+
+PROVEN_NS = 60_000_000_000
+"""Flight time after which a loaded table stays, however the flight ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterUsers:
+    """Who goes on with other bounds of the modes and of health."""
+
+    modes: Sequence[Callable[[Modes], None]]
+    health: Callable[[Health], None]
+
+
+class ParameterTable:
+    """Owns the table of parameters that flies."""
+
+    def __init__(
+        self, config: Config, adopters: ParameterUsers, keeper: StateKeeper | None, services: Services
+    ) -> None:
+        """Start with the configuration's values, or with a table that the `keeper` has."""
+        self._config = config
+        self._adopters = adopters
+        self._keeper = keeper
+        self._recorder = services.recorder
+        self._events = services.events
+        self._configured = {key: float(_value(config, key)) for key in KEYS}
+        self._values: Mapping[str, float] = self._configured
+        self._table = KeptTable() if keeper is None else keeper.table
+        self._loaded_ns = 0
+
+    def begin(self, now_ns: int) -> None:
+        """Fly the kept table, where this version and configuration can; report the table that flies."""
+        self._loaded_ns = now_ns
+        if kept := self._table.values:
+            # Of another version of the software a key may be gone or new: there the configuration holds.
+            table = {key: kept.get(key, value) for key, value in self._configured.items()}
+            if problem := problem_of(table) or self._adopt(table):
+                self._table = msgspec.structs.replace(self._table, values={}, proven=True)
+                self._events.report(events.PARAMETERS_LEFT, now_ns, problem)
+        self.dump(now_ns)
+
+    def run(self, now_ns: int) -> None:
+        """Trust a table that has flown long enough."""
+        if not self._table.proven and now_ns - self._loaded_ns >= PROVEN_NS:
+            self._keep(msgspec.structs.replace(self._table, proven=True))
+
+    def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
+        """Fly another table in place of the one whose CRC is `replaced`; return why not, empty when done."""
+        if replaced != self._crc:
+            return f"the table that flies is {self._crc:08x}, not {replaced:08x}: dump it and look again"
+        before = self._table.values if self._table.proven else self._table.before
+        if problem := problem_of(values) or self._adopt(values):
+            return problem
+        self._loaded_ns = now_ns
+        self._keep(
+            KeptTable(values=dict(values), before=dict(before), proven=False, loads=self._table.loads + 1)
+        )
+        self.dump(now_ns)
+        return ""
+
+    def dump(self, now_ns: int) -> None:
+        """Record the table."""
+        named = {field.name: self._values[key] for field, key in zip(FIELDS, KEYS, strict=True)}
+        fields: dict[str, Any] = {
+            "loads": self._table.loads,
+            "crc": self._crc,
+            "table": int(self._values is not self._configured),
+            "kept": int(self._keeper is not None),
+        }
+        self._recorder.record(PARAMETERS, now_ns, **fields, **named)
+
+    @property
+    def _crc(self) -> int:
+        return crc_of([self._values[key] for key in KEYS])
+
+    def _keep(self, table: KeptTable) -> None:
+        self._table = table
+        if self._keeper is not None:
+            self._keeper.note_table(table)
+
+    def _adopt(self, values: Mapping[str, float]) -> str:
+        """Have everybody go on with a table; return why the schema refuses it, empty when done."""
+        try:
+            modes = _section(self._config.modes, "modes", values)
+            health = _section(self._config.health, "health", values)
+        except msgspec.ValidationError as error:
+            return str(error)
+        self._values = values
+        for adopt in self._adopters.modes:
+            adopt(modes)
+        self._adopters.health(health)
+        return ""
+
+
+def _value(config: Config, key: str) -> Any:
+    section, _, name = key.partition(".")
+    return getattr(getattr(config, section), name)
+
+
+def _section(section: S, name: str, values: Mapping[str, float]) -> S:
+    """Return a section with the values of a table. Raises ValidationError."""
+    changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
+    return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
+
+
+_REMEMBERED = 64
+
+
+@dataclass(frozen=True, slots=True)
+class CommandedTasks:
+    """The tasks that obey commands."""
+
+    modes: ModeControl
+    drive: CoilDrive
+    parameters: ParameterTable
+
+
+class CommandTask:
+    """The task of the commands' rate group."""
+
+    def __init__(
+        self,
+        obeying: CommandedTasks,
+        timeline: Sequence[CommandStep],
+        channels: Sequence[Channel],
+        services: Services,
+    ) -> None:
+        self._modes = obeying.modes
+        self._drive = obeying.drive
+        self._parameters = obeying.parameters
+        self._timeline = deque(sorted(timeline, key=lambda step: step.at))
+        self._channels = channels
+        self._facts = services.facts
+        self._recorder = services.recorder
+        self._events = services.events
+        self._answers = Packer()
+        self._received: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._count = 0
+
+    def begin(self, now_ns: int) -> None:
+        """Fly the parameters that an earlier boot kept."""
+        self._parameters.begin(now_ns)
+
+    def run(self, cycle: Cycle) -> None:
+        """Execute the commands that are due or have arrived."""
+        now_ns = cycle.start_ns
+        self._parameters.run(now_ns)
+        while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
+            self._conclude("timeline", command_of(self._timeline.popleft()), "", now_ns)
+        for channel in self._channels:
+            received = channel.poll()
+            if news := channel.news():
+                self._events.report(events.COMMAND_SOCKET, now_ns, news)
+            for data, sender in received:
+                fields, well_formed = self._execute(channel.name, data, now_ns)
+                if not well_formed:
+                    continue
+                mission_ns = now_ns - self._recorder.epoch_ns
+                channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + self._asked(fields), sender)
+
+    def _asked(self, fields: Mapping[str, Any]) -> bytes:
+        """Return the packets that a command asked for."""
+        if fields["obeyed"] and fields["name"] == PING.name:
+            return self._recorder.status()
+        if fields["obeyed"] and fields["name"] == DUMP_PARAMETERS.name:
+            return self._recorder.newest(PARAMETERS)
+        return b""
+
+    def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
+        """Execute a datagram; return the fields of the answer, and whether it is a packet of a command."""
+        command: Command | None = None
+        problem = ""
+        well_formed = True
+        if data in self._received:
+            problem = "the very same packet has come before"
+        else:
+            try:
+                command = unpack(data)
+                self._received.append(data)
+            except CommandError as error:
+                problem = str(error)
+                well_formed = not isinstance(error, MalformedError)
+        return self._conclude(source, command, problem, now_ns), well_formed
+
+    def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
+        """Execute a command, unless there is a `problem`; report and record the result."""
+        self._count += 1
+        if command is not None and not problem:
+            try:
+                problem = self._obey(command, now_ns)
+            except Exception as error:  # noqa: BLE001 - containment boundary: the command dispatcher
+                problem = f"{type(error).__name__}: {error}"
+        text = command.text if command is not None else ""
+        report = ": ".join(part for part in (text, problem) if part)
+        self._events.report(
+            events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {report}"
+        )
+        fields = {
+            "obeyed": int(not problem),
+            "name": command.packet.name if command is not None else "",
+            "source": source,
+            "count": self._count,
+            "mode": int(self._modes.mode),
+            "text": report,
+        }
+        self._recorder.record(COMMAND, now_ns, **fields)
+        return fields
+
+    def _obey(self, command: Command, now_ns: int) -> str:
+        """Execute a command; return why it was refused, empty when done."""
+        problem = ""
+        match command:
+            case Ping():
+                pass
+            case ChangeMode(mode):
+                problem = self._modes.command(mode, now_ns)
+            case Slew(wanted):
+                problem = self._modes.command(Mode.SLEW, now_ns, wanted)
+            case Clear(event):
+                problem = self._clear(event, now_ns)
+            case Point(target):
+                problem = self._modes.command(Mode.POINT, now_ns, target)
+            case LoadParameters(replaced):
+                problem = self._parameters.load(command.by_key, replaced, now_ns)
+            case DumpParameters():
+                self._parameters.dump(now_ns)
+        return problem
+
+    def _clear(self, event: str, now_ns: int) -> str:
+        if not self._facts.clear(event):
+            latched = [fact.begins.name for fact in self._facts.held() if fact.latching]
+            return f"nothing is latched under {event!r}; latched: {', '.join(latched) or 'nothing'}"
+        if event == events.COIL_BROKEN.name:
+            self._drive.trust(now_ns)
+        return ""
+
+
+def command_of(step: CommandStep) -> Command:
+    """Return the command of a step of a time line. Raises CommandError unless it is exactly one."""
+    found: list[Command] = []
+    if step.mode is not None:
+        found.append(ChangeMode(Mode.named(step.mode)))
+    if step.slew is not None:
+        found.append(Slew(step.slew))
+    if step.point is not None:
+        found.append(Point(step.target_at(step.point)))
+    if step.clear is not None:
+        found.append(Clear(step.clear))
+    if len(found) != 1:
+        raise CommandError(f"at {step.at:g} s: give one of mode, slew, point, clear; {len(found)} are given")
+    return found[0]

@@ -1,1 +1,0 @@
-"""Fixed-rate groups on an injected clock, and the workers for long jobs."""

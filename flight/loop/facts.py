@@ -1,0 +1,390 @@
+"""Events, facts and streams, by which the loop detects and reports faults; and the shared services.
+
+Events are written to the flight log, throttled by kind, and trigger their reactions. The first event of a
+kind is written at once, then at most one every `THROTTLE_NS`, with the number held back: a fault at 40 Hz
+writes one event every few seconds, not forty a second.
+
+A fact is a condition that monitors update. As in NASA's Limit Checker, a fact counts after N violations in a
+row; an unknown state (None) changes no count. A latching fact stays until it is cleared by command. A mode in
+which a fact is not watched resets its count.
+
+A stream is one kind of reading, with its nominal rate, age limit and valid range. As in openpilot's
+SubMaster, liveness, rate and validity are checked separately. A stale value is not good, however plausible
+the value was.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+from flight.link import events
+from flight.link.events import EVENTS, EventKind, Reaction
+from flight.link.modes import STEERING, Mode
+from flight.link.telemetry.log import Recorder
+from flight.loop.executive import JobRunner
+from flight.schema.devices import Camera
+from flight.schema.sections import Config
+from hal.interfaces.wires import Clock
+from knightcube.errors import FlightError
+
+THROTTLE_NS = 5_000_000_000
+
+Sink = Callable[[EventKind, int, int, str], None]
+"""Writes an event; arguments: kind, time in ns, number of events of the kind held back before, text."""
+
+Reactor = Callable[[EventKind, int, str], None]
+"""Carries out the reaction of an event: kind, time in ns, text."""
+
+
+class EventLog:
+    """Passes events to a sink, throttled by kind; `count` and `counts`, by kind, include those held back."""
+
+    def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
+        self._sink = sink
+        self._react: Reactor | None = None
+        self._throttle_ns = throttle_ns
+        self._last_written: dict[int, int] = {}
+        self._held_back: dict[int, int] = {}
+        self.count = 0
+        self.counts: Counter[EventKind] = Counter()
+
+    def react_by(self, react: Reactor) -> None:
+        """Call `react` for every event whose reaction is more than a note, throttled or not."""
+        self._react = react
+
+    def report(self, kind: EventKind, time_ns: int, text: str) -> None:
+        """Write an event, or count it if one of its kind was written less than a throttle ago; then react."""
+        self._write(kind, time_ns, text)
+        if self._react is not None and kind.reaction is not Reaction.NOTE:
+            self._react(kind, time_ns, text)
+
+    def _write(self, kind: EventKind, time_ns: int, text: str) -> None:
+        self.count += 1
+        self.counts[kind] += 1
+        last_ns = self._last_written.get(kind.code)
+        if last_ns is not None and time_ns - last_ns < self._throttle_ns:
+            self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
+            return
+        self._last_written[kind.code] = time_ns
+        self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
+
+    def flush(self, time_ns: int) -> None:
+        """Write the events that are still held back, at the end."""
+        by_code = {kind.code: kind for kind in EVENTS}
+        for code, held_back in list(self._held_back.items()):
+            self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")
+        self._held_back.clear()
+
+
+EVERYWHERE = frozenset(Mode)
+_DRIVEN = STEERING | {Mode.DETUMBLE}
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One row: a fact's persistence, and the events that report its begin and end.
+
+    Facts of the 40 Hz cycle count cycles, the others count runs of the health task.
+
+    Attributes:
+        after: updates in a row in which the condition holds, until the fact counts.
+        mended_after: updates in a row in which the condition does not hold, until the fact ends.
+        latching: the fact ends only when cleared by command.
+        modes: in which the fact is watched.
+    """
+
+    name: str
+    begins: EventKind
+    ends: EventKind | None = None
+    after: int = 1
+    mended_after: int = 1
+    latching: bool = False
+    modes: frozenset[Mode] = EVERYWHERE
+
+
+BOOT_WAITS = Fact("boot-waits", events.BOOT_WAITS, modes=frozenset({Mode.BOOT}))
+TASK_FAILING = Fact("task-failing", events.TASK_FAILING, latching=True)
+NO_PROGRESS = Fact("no-progress", events.NO_PROGRESS)
+IMU_SILENT = Fact("imu-silent", events.IMU_SILENT, events.IMU_RECOVERED)
+IMU_UNUSABLE = Fact("imu-unusable", events.IMU_UNUSABLE, events.IMU_RECOVERED)
+IMU_LINE_LOST = Fact("imu-line-lost", events.IMU_LINE_LOST, events.IMU_RECOVERED)
+CONTROL_LOST = Fact("control-lost", events.CONTROL_LOST, events.CONTROL_REGAINED)
+BLIND = Fact("blind", events.BLIND, modes=_DRIVEN)
+TUMBLING = Fact("tumbling", events.TUMBLING, after=8, modes=STEERING | {Mode.ACQUIRE})
+HOLD_IMPOSSIBLE = Fact(
+    "hold-impossible", events.HOLD_IMPOSSIBLE, modes=frozenset({Mode.HOLD, Mode.TESTBED_DEMO})
+)
+SLEW_LATE = Fact("slew-late", events.SLEW_LATE, modes=frozenset({Mode.SLEW}))
+HOLDING = Fact("holding", events.HOLDING, modes=frozenset({Mode.SLEW, Mode.TESTBED_DEMO}))
+COIL_FAULT = Fact("coil-fault", events.COIL_FAULT, events.COIL_RECOVERED)
+COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN = (
+    Fact(f"coil-{axis}-broken", events.COIL_BROKEN, latching=True) for axis in "xyz"
+)
+COIL_SUSPECT = Fact("coil-suspect", events.COIL_SUSPECT)
+COMMANDS_DOUBTED = Fact("commands-doubted", events.COMMANDS_DOUBTED, events.COMMANDS_TRUSTED)
+POWER_DOUBTED = Fact("power-doubted", events.POWER_DOUBTED)
+POWER_FAULT = Fact("power-fault", events.POWER_FAULT, events.POWER_RECOVERED)
+CAMERA_LOST = Fact("camera-lost", events.CAMERA_LOST, events.CAMERA_RECOVERED)
+LOG_FAULT = Fact("log-fault", events.LOG_FAULT, events.LOG_RECOVERED)
+CPU_HIGH = Fact("cpu-high", events.CPU_HIGH, events.RESOURCE_NORMAL, after=3, mended_after=3)
+MEMORY_GROWS = Fact("memory-grows", events.MEMORY_GROWS, events.RESOURCE_NORMAL, after=3, mended_after=3)
+MEMORY_HIGH = Fact("memory-high", events.MEMORY_HIGH, after=3)
+DISK_LOW = Fact("disk-low", events.DISK_LOW, events.RESOURCE_NORMAL, after=2, mended_after=2)
+HOT = Fact("hot", events.HOT, events.RESOURCE_NORMAL, after=2, mended_after=2)
+TOO_HOT = Fact("too-hot", events.TOO_HOT, after=2, latching=True)
+IMU_POOR, FIELD_POOR, COILS_POOR, POWER_POOR, CAMERA_POOR = (
+    Fact(f"{stream}-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
+    for stream in ("imu", "field", "coils", "power", "camera")
+)
+SERVICE_FAILING = Fact("service-failing", events.SERVICE_FAILING, events.SERVICE_RECOVERED)
+CAMERA_LATE = Fact("camera-late", events.CAMERA_LATE, events.CAMERA_RECOVERED)
+VISION_SLOW = Fact("vision-slow", events.VISION_SLOW)
+GPS_LOST = Fact("gps-lost", events.GPS_LOST, events.GPS_RECOVERED)
+GPS_POOR = Fact("gps-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
+STRINGS_LOST = Fact("strings-lost", events.STRINGS_LOST, events.STRINGS_RECOVERED)
+SUN_UNCLEAR = Fact("sun-unclear", events.SUN_UNCLEAR, events.SUN_CLEAR, after=3, mended_after=3)
+CLOCK_OFF = Fact("clock-off", events.CLOCK_OFF, after=2)
+FIELD_REFUSED = Fact("field-refused", events.FIELD_REFUSED, events.FIELD_TRUSTED)
+WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
+WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED, after=3)
+
+FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
+
+
+def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
+    """Validate the table; raises FlightError naming the row.
+
+    `modes_of` returns the modes in which a reaction has an effect: facts watched in none have no effect.
+    """
+    seen: set[str] = set()
+    for fact in facts:
+        if fact.name in seen:
+            raise FlightError(f"fact {fact.name} stands twice in the table")
+        seen.add(fact.name)
+        if fact.after < 1 or fact.mended_after < 1:
+            raise FlightError(f"fact {fact.name}: a count of statements must be at least 1")
+        if not fact.modes & modes_of(fact.begins.reaction):
+            raise FlightError(
+                f"fact {fact.name}: in no mode in which it is watched does its reaction "
+                f"{fact.begins.reaction.name.lower()} do anything"
+            )
+
+
+@dataclass(slots=True)
+class _State:
+    holds: bool = False
+    count: int = 0
+
+
+class Facts:
+    """Holds the state of every fact, and reports an event when a fact begins or ends."""
+
+    def __init__(self, event_log: EventLog) -> None:
+        self._events = event_log
+        self._states = {fact.name: _State() for fact in FACTS}
+        self._mode = Mode.BOOT
+
+    def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
+        """Update whether a fact's condition holds now, None when unknown. `text` goes with the event."""
+        state = self._states[fact.name]
+        if holds is None or self._mode not in fact.modes:
+            return
+        if holds == state.holds:
+            state.count = 0
+            return
+        state.count += 1
+        if state.holds and (fact.latching or state.count < fact.mended_after):
+            return
+        if not state.holds and state.count < fact.after:
+            return
+        state.holds, state.count = holds, 0
+        kind = fact.begins if holds else fact.ends
+        if kind is not None:
+            self._events.report(kind, now_ns, text)
+
+    def holds(self, fact: Fact) -> bool:
+        """Return whether a fact counts now."""
+        return self._states[fact.name].holds
+
+    def held(self) -> tuple[Fact, ...]:
+        """Return the facts that count now, in the order of the table."""
+        return tuple(fact for fact in FACTS if self._states[fact.name].holds)
+
+    def clear(self, event_name: str) -> bool:
+        """Reset the facts latched under an event's name; return whether there were any."""
+        found = [fact for fact in self.held() if fact.latching and fact.begins.name == event_name]
+        for fact in found:
+            self._states[fact.name] = _State()
+        return bool(found)
+
+    def enter(self, mode: Mode) -> None:
+        """Watch the facts of `mode`; reset the others."""
+        self._mode = mode
+        for fact in FACTS:
+            if mode not in fact.modes:
+                self._states[fact.name] = _State()
+
+
+LEAST_RATE = 0.8
+"""Fraction of the nominal rate below which a stream is slow."""
+_SPAN = 2.0
+_SECOND = 1e-9
+_PERIODS = 5
+
+
+class StreamState(IntEnum):
+    """The quality of a stream; the values are those of the health packet."""
+
+    NOT_FITTED = 0
+    NEVER = 1
+    STALE = 2
+    INVALID = 3
+    SLOW = 4
+    GOOD = 5
+
+
+@dataclass(frozen=True, slots=True)
+class StreamLimits:
+    """One row: rate in Hz, age limit in s, and the range of its value, in the value's unit.
+
+    `has_silence_alarm`: another fact covers the silence of this stream, so that `poor` does not.
+    """
+
+    name: str
+    rate_hz: float
+    max_age: float
+    poor: Fact
+    low: float = float("-inf")
+    high: float = float("inf")
+    has_silence_alarm: bool = True
+
+
+def streams_of(config: Config) -> tuple[StreamLimits, ...]:
+    """Return the streams of the devices that a configuration has."""
+    unit, coils, field = config.inertial_unit, config.coils, config.field_range()
+    control_hz = config.executive.control_rate_hz
+    rows = [
+        StreamLimits("imu", float(unit.rate_hz), unit.max_age, IMU_POOR),
+        StreamLimits("field", float(unit.rate_hz), unit.max_age, FIELD_POOR, *field),
+        StreamLimits("coils", control_hz, coils.stale_after, COILS_POOR),
+    ]
+    if config.power_monitor is not None:
+        most = 1.5 * sum(coils.supply_voltage / resistance for resistance in coils.resistance)
+        rows.append(StreamLimits("power", 1.0, 3.0, POWER_POOR, -0.1 * most, most))
+    if config.camera is not None:
+        camera = config.camera
+        rows.append(StreamLimits("camera", 1.0 / _seldom(camera), camera.max_age, CAMERA_POOR))
+    if config.gps is not None:
+        rows.append(StreamLimits("gps", 1.0 / config.gps.period, config.gps.max_age, GPS_POOR))
+    return tuple(rows)
+
+
+def _seldom(camera: Camera) -> float:
+    """Return the longest time, s, between two frames; exposures that follow the rate shift them."""
+    if camera.fine_period is None and camera.streak_exposure is None:
+        return camera.period
+    return max(camera.period, camera.fine_period or 0.0) + max(camera.streak_exposure or (camera.exposure,))
+
+
+class StreamWatch:
+    """Computes the age, rate and state of one stream from its readings."""
+
+    def __init__(self, stream: StreamLimits, time_ns: int) -> None:
+        self.stream = stream
+        self._window_ns = round(max(_SPAN, _PERIODS / stream.rate_hz) * 1e9)
+        self._times: deque[int] = deque(maxlen=max(int(2.0 * stream.rate_hz * self._window_ns * _SECOND), 2))
+        self._since_ns = time_ns
+        self._valid = True
+
+    def begin(self, time_ns: int) -> None:
+        """Discard earlier readings; count from `time_ns`."""
+        self._times.clear()
+        self._since_ns = time_ns
+
+    def note(self, time_ns: int, value: float | None = None) -> None:
+        """Note a reading taken at `time_ns`, with the value that has a range."""
+        if self._times and time_ns - self._times[-1] > self._window_ns // 2:
+            self._since_ns = time_ns  # a gap is reported as stale, not as slow
+        self._times.append(time_ns)
+        if value is not None:
+            self._valid = self.stream.low <= value <= self.stream.high  # NaN compares false
+
+    def age(self, now_ns: int) -> float:
+        """Return the age of the newest reading in s, infinite before the first."""
+        return (now_ns - self._times[-1]) * _SECOND if self._times else float("inf")
+
+    def rate(self, now_ns: int) -> float:
+        """Return the rate in Hz over the window that ends now, NaN before it is full."""
+        begin_ns = now_ns - self._window_ns
+        if begin_ns < self._since_ns:
+            return float("nan")
+        count = sum(1 for time_ns in self._times if time_ns > begin_ns)
+        return count / (self._window_ns * _SECOND)
+
+    def state(self, now_ns: int) -> StreamState:
+        """Return the state of the stream now."""
+        if not self._times:
+            return StreamState.NEVER
+        if self.age(now_ns) > self.stream.max_age:
+            return StreamState.STALE
+        if not self._valid:
+            return StreamState.INVALID
+        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # False for NaN: an unknown rate is not slow
+            return StreamState.SLOW
+        return StreamState.GOOD
+
+
+class Streams:
+    """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
+
+    def __init__(self, rows: tuple[StreamLimits, ...], time_ns: int = 0) -> None:
+        self._watches = {row.name: StreamWatch(row, time_ns) for row in rows}
+
+    def begin(self, time_ns: int) -> None:
+        """Discard earlier readings; count from `time_ns`."""
+        for watch in self._watches.values():
+            watch.begin(time_ns)
+
+    def note(self, name: str, time_ns: int, value: float | None = None) -> None:
+        """Note a reading of the named stream, if fitted."""
+        watch = self._watches.get(name)
+        if watch is not None:
+            watch.note(time_ns, value)
+
+    def state(self, name: str, now_ns: int) -> StreamState:
+        """Return the state of the named stream."""
+        watch = self._watches.get(name)
+        return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
+
+    def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
+        """Return for each stream whether it is poor, None when unknown or covered elsewhere, and why."""
+        return [(watch.stream, *_poor(watch, now_ns)) for watch in self._watches.values()]
+
+
+def _poor(watch: StreamWatch, now_ns: int) -> tuple[bool | None, str]:
+    stream, state = watch.stream, watch.state(now_ns)
+    if state is StreamState.GOOD:
+        return False, f"{stream.name}: good again"
+    if state is StreamState.NEVER or (state is StreamState.STALE and stream.has_silence_alarm):
+        return None, ""
+    reason = {
+        StreamState.STALE: f"{watch.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",
+        StreamState.SLOW: f"{watch.rate(now_ns):.1f} Hz, {stream.rate_hz:g} Hz nominal",
+        StreamState.INVALID: f"outside {stream.low:.3g} .. {stream.high:.3g}",
+    }[state]
+    return True, f"{stream.name}: {state.name.lower()}, {reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """The clock, the workers, the recorder, and the tables of events, facts and streams."""
+
+    clock: Clock
+    jobs: JobRunner
+    recorder: Recorder
+    events: EventLog
+    facts: Facts
+    streams: Streams

@@ -1,1 +1,0 @@
-"""Fault detection, isolation and recovery: facts become events, events reactions, reactions a mode."""

@@ -1,0 +1,570 @@
+"""Health, housekeeping and performance: checks and records the loop itself.
+
+Health checks streams, progress and resources, and feeds the watchdog while all of them progress. A rate group
+is stalled when no cycle has completed within its time limit; a worker, when a job has been running for longer
+than its time limit. Jobs on tickers are only reported: a slow disk or a hung bus may delay them, which a
+restart would not cure. A `ResourceReader` samples processor, memory, disk and temperature (`Board` on Linux,
+a script in tests) on a ticker outside the control loop, because the kernel may take milliseconds to answer.
+
+Housekeeping records the counters of devices and loop once a second, and checks the flight log. The
+performance record has the times and execution times of cycles in a log of its own; its observer turns slips
+and failures into events, and zeroes the coils after a failed control cycle.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from flight.link import events
+from flight.link.telemetry.definitions import CYCLE_TIMING, HEALTH, HOUSEKEEPING, JOB_TIMING, RATE_GROUP
+from flight.loop import facts
+from flight.loop.body import Planner, SteeringState
+from flight.loop.executive import Cycle, JobResult, RateGroup, WorkerChange
+from flight.loop.facts import FACTS, EventLog, Facts, Services
+from flight.loop.imaging import Imaging
+from flight.loop.modes import ModeControl
+from flight.loop.navigation import Navigation
+from flight.loop.steering import CoilDrive
+from flight.schema.sections import Health
+from hal.interfaces.devices import CoilState, PowerMonitor, TorqueCoils
+from hal.interfaces.wires import Clock, Ticker
+
+_HOUR = 3600.0
+_LEAST_SLOPE_SAMPLES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceSample:
+    """One sample of the board's resources; NaN for values that are not available.
+
+    Attributes:
+        time_ns: monotonic.
+        cpu: s, processor time of the control process since its start.
+        resident: bytes, resident set size of the control process.
+        proportional: bytes, proportional set size of all flight processes together.
+        disk_free: bytes, free on the flight log's file system.
+        temperature: degree C of the warmest zone.
+    """
+
+    time_ns: int
+    cpu: float
+    resident: float
+    proportional: float
+    disk_free: float
+    temperature: float
+
+
+class ResourceReader(Protocol):
+    """Samples the board's resources."""
+
+    def __call__(self, now_ns: int) -> ResourceSample:
+        """Return a sample. Must not raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceState:
+    """Values derived from the samples; NaN before there are enough.
+
+    Attributes:
+        cpu_share: of one core, between the last two samples.
+        memory_slope: bytes/s, by least squares over the window.
+    """
+
+    sample: ResourceSample | None = None
+    cpu_share: float = math.nan
+    memory_slope: float = math.nan
+
+
+class ResourceMonitor:
+    """Keeps the newest samples and updates the facts about resources."""
+
+    def __init__(self, settings: Health) -> None:
+        self._settings = settings
+        self._warm: deque[ResourceSample] = deque(maxlen=max(round(_HOUR / settings.look_period), 2))
+        self._begun_ns: int | None = None
+        self.state = ResourceState()
+
+    def adopt(self, settings: Health) -> None:
+        """Go on with other bounds."""
+        self._settings = settings
+
+    def ingest(self, sample: ResourceSample) -> None:
+        """Add a sample."""
+        share = math.nan
+        if self.state.sample is not None:
+            span = (sample.time_ns - self.state.sample.time_ns) * 1e-9
+            share = (sample.cpu - self.state.sample.cpu) / span if span > 0.0 else math.nan
+        if self._begun_ns is None:
+            self._begun_ns = sample.time_ns
+        if (sample.time_ns - self._begun_ns) * 1e-9 >= self._settings.warm_up:
+            self._warm.append(sample)
+        self.state = ResourceState(sample, share, self._slope())
+
+    def report(self, facts_: Facts, now_ns: int) -> None:
+        """Update the facts from the newest sample."""
+        sample, limits = self.state.sample, self._settings
+        if sample is None:
+            return
+        slope = self.state.memory_slope * _HOUR
+        for fact, value, limit, text in (
+            (facts.CPU_HIGH, self.state.cpu_share, limits.cpu_share, "{:.2f} of a core, {:g} allowed"),
+            (facts.MEMORY_GROWS, slope, limits.memory_slope, "{:.3g} bytes an hour, {:g} allowed"),
+            (facts.MEMORY_HIGH, sample.proportional, limits.memory, "{:.4g} bytes, {:g} allowed"),
+            (facts.DISK_LOW, -sample.disk_free, -limits.disk_free, "{:.3g} bytes free, {:g} wanted"),
+            (facts.HOT, sample.temperature, limits.temperature, "{:.1f} deg C, {:g} is warm"),
+            (facts.TOO_HOT, sample.temperature, limits.hottest, "{:.1f} deg C, {:g} allowed"),
+        ):
+            known = not math.isnan(value)
+            facts_.update(fact, value > limit if known else None, now_ns, text.format(abs(value), abs(limit)))
+
+    def _slope(self) -> float:
+        if len(self._warm) < _LEAST_SLOPE_SAMPLES:
+            return math.nan
+        time = np.array([sample.time_ns for sample in self._warm]) * 1e-9
+        memory = np.array([sample.proportional for sample in self._warm])
+        time -= time.mean()
+        if (time[-1] - time[0]) < self._settings.slope_window or not np.isfinite(memory).all():
+            return math.nan
+        return float(time @ (memory - memory.mean()) / (time @ time))
+
+
+class ClockWatch:
+    """Detects steps of the wall clock by comparing UTC with monotonic time."""
+
+    def __init__(self, clock: Clock, threshold: float) -> None:
+        """Watch `clock` for steps larger than `threshold` s."""
+        self._clock = clock
+        self._threshold_ns = round(threshold * 1e9)
+        self._offset_ns: int | None = None
+        self.steps = 0
+
+    def look(self) -> float | None:
+        """Return the step in s since the last call, None without one; slow drift is followed."""
+        offset_ns = self._clock.utc_ns() - self._clock.now_ns()
+        before_ns, self._offset_ns = self._offset_ns, offset_ns
+        if before_ns is None or abs(offset_ns - before_ns) <= self._threshold_ns:
+            return None
+        self.steps += 1
+        return (offset_ns - before_ns) * 1e-9
+
+
+_TICKS = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class Board:
+    """Reads resources from the kernel; values that the kernel does not provide are NaN."""
+
+    def __init__(self, log_folder: Path, proc: Path = Path("/proc"), thermal: Path | None = None) -> None:
+        """Take the flight log's folder, and the kernel's folders of processes and thermal zones."""
+        self._folder = log_folder
+        self._proc = proc
+        self._thermal = thermal or Path("/sys/class/thermal")
+
+    def __call__(self, now_ns: int) -> ResourceSample:
+        """Return the board's resources now."""
+        process = os.getpid()
+        members = [process, *self._below(process)]
+        return ResourceSample(
+            now_ns,
+            self._cpu(process),
+            self._resident(process),
+            math.fsum(self._proportional(member) for member in members),
+            self._disk_free(),
+            self._temperature(),
+        )
+
+    def _below(self, parent: int) -> Iterator[int]:
+        """Yield all descendants of `parent`, its workers."""
+        for task in sorted((self._proc / str(parent) / "task").glob("*/children")):
+            for word in _read(task).split():
+                yield int(word)
+                yield from self._below(int(word))
+
+    def _cpu(self, process: int) -> float:
+        # The name in brackets may hold any character; user and system time are fields 14 and 15 (proc(5)).
+        words = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / _TICKS if len(words) > 12 else math.nan
+
+    def _resident(self, process: int) -> float:
+        words = _read(self._proc / str(process) / "statm").split()
+        return float(words[1]) * _PAGE if len(words) > 1 else math.nan
+
+    def _proportional(self, process: int) -> float:
+        """Return the proportional set size in bytes; 0 for a process that has ended, waited for or not."""
+        for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
+            if line.startswith("Pss:"):
+                return float(line.split()[1]) * 1024.0
+        state = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()[:1]
+        return 0.0 if state in ([], ["Z"], ["X"]) else math.nan
+
+    def _disk_free(self) -> float:
+        try:
+            room = os.statvfs(self._folder)
+        except OSError:
+            return math.nan
+        return float(room.f_bavail) * room.f_frsize
+
+    def _temperature(self) -> float:
+        found = []
+        for zone in sorted(self._thermal.glob("thermal_zone*/temp")):
+            word = _read(zone).strip()
+            if word.lstrip("-").isdigit():
+                found.append(int(word) * 1e-3)
+        return max(found, default=math.nan)
+
+
+def _read(path: Path) -> str:
+    """Return the content of a kernel file; empty when it cannot be read."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+_PERIODS = 3
+_SHORTEST_LIMIT_NS = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerWatch:
+    """A worker by name; `busy_since_ns` returns since when a job has been running, None when none is."""
+
+    name: str
+    busy_since_ns: Callable[[], int | None]
+    limit_ns: int
+
+
+class _GroupWatch:
+    def __init__(self, group: RateGroup) -> None:
+        self.group = group
+        self.limit_ns = max(_PERIODS * group.period_ns, _SHORTEST_LIMIT_NS)
+        self._completed = group.completed
+        self.since_ns = 0
+
+    def is_stalled(self, now_ns: int) -> bool:
+        if self.group.completed != self._completed:
+            self._completed, self.since_ns = self.group.completed, now_ns
+        return now_ns - self.since_ns > self.limit_ns
+
+
+class GroupsAndWorkers:
+    """Watches rate groups and workers."""
+
+    def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
+        self._groups = [_GroupWatch(group) for group in groups]
+        self._workers = workers
+
+    def begin(self, time_ns: int) -> None:
+        """Count from here."""
+        for watch in self._groups:
+            watch.since_ns = time_ns
+
+    def stalled(self, now_ns: int) -> list[str]:
+        """Return the names of the stalled groups and workers."""
+        names = [watch.group.name for watch in self._groups if watch.is_stalled(now_ns)]
+        for worker in self._workers:
+            since_ns = worker.busy_since_ns()
+            if since_ns is not None and now_ns - since_ns > worker.limit_ns:
+                names.append(worker.name)
+        return names
+
+
+def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
+    """Return a text for each job outside the loop that raises or is stalled."""
+    problems = []
+    for ticker in tickers:
+        stood_ns = now_ns - ticker.served_ns
+        if ticker.error:
+            problems.append(f"{ticker.name}: {ticker.error}")
+        elif stood_ns > max(_PERIODS * ticker.period_ns, _SHORTEST_LIMIT_NS):
+            problems.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
+    return problems
+
+
+CONTROL = "control"
+
+
+class PerformanceObserver:
+    """Records every cycle, slip and failure that the executive reports."""
+
+    def __init__(self, coils: TorqueCoils, services: Services) -> None:
+        self._coils = coils
+        self._clock = services.clock
+        self._recorder = services.recorder
+        self._events = services.events
+
+    def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
+        """Record a control cycle's lateness and execution time."""
+        if group.name == CONTROL:
+            self._recorder.time(
+                CYCLE_TIMING,
+                cycle.start_ns,
+                cycle=cycle.slot,
+                lateness=(cycle.start_ns - cycle.due_ns) * 1e-9,
+                execution=execution_ns * 1e-9,
+            )
+
+    def slipped(self, group: RateGroup, slots: int) -> None:
+        """Report skipped slots of the control group: no other group can slip without it."""
+        if group.name != CONTROL:
+            return
+        text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
+        self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
+
+    def failed(self, group: RateGroup, error: Exception) -> None:
+        """Switch the coils off when the control task failed, and report the error's place."""
+        if group.name == CONTROL:
+            self._coils.off()
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{group.name}: {type(error).__name__}: {error} ({last.name}, line {last.lineno})"
+        self._events.report(events.TASK_FAILED, self._clock.now_ns(), text)
+
+    def group(self, group: RateGroup, now_ns: int) -> None:
+        """Record the statistics of a rate group."""
+        self._recorder.time(
+            RATE_GROUP,
+            now_ns,
+            name=group.name,
+            period=group.period_ns * 1e-9,
+            cycles=group.cycles,
+            slips=group.slips,
+            overruns=group.overruns,
+            mean=group.mean_execution_ns * 1e-9,
+            max=group.max_execution_ns * 1e-9,
+        )
+
+    def job(self, result: JobResult, now_ns: int) -> None:
+        """Record the execution time of a job."""
+        self._recorder.time(
+            JOB_TIMING,
+            now_ns,
+            name=result.worker,
+            execution=result.execution_ns * 1e-9,
+            outcome=result.outcome,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HousekeepingInputs:
+    """The sources of housekeeping; `log_error` returns why the flight log fails, empty while it works."""
+
+    navigation: Navigation
+    planner: Planner
+    imaging: Imaging | None
+    coils: TorqueCoils
+    power: PowerMonitor | None
+    log_error: Callable[[], str]
+
+
+class Housekeeping:
+    """Writes the housekeeping packet."""
+
+    def __init__(self, watched: HousekeepingInputs, services: Services) -> None:
+        self._watched = watched
+        self._recorder = services.recorder
+        self._events = services.events
+        self._facts = services.facts
+        self._lost = 0
+
+    def coils(self) -> CoilState:
+        """Return the state of the coils."""
+        return self._watched.coils.state()
+
+    def run(self, cycle: Cycle, state: SteeringState) -> None:
+        """Write the packet; `state` is that of the newest control cycle."""
+        watched, now_ns = self._watched, cycle.start_ns
+        error = watched.power.error() if watched.power else ""
+        log_error = watched.log_error()
+        text = log_error or "packets reach the disk again"
+        self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
+        self.report_lost(now_ns)
+        reading = watched.power.latest() if watched.power and not error else None
+        link = watched.navigation.link()
+        accepted, refused = watched.planner.counts()
+        frames, streak_rates = watched.imaging.counts() if watched.imaging else (0, 0)
+        self._recorder.record(
+            HOUSEKEEPING,
+            now_ns,
+            state=int(state),
+            imu_packets=link.packets,
+            imu_bad_checksum=link.bad_checksum,
+            imu_discarded_bytes=link.discarded_bytes,
+            imu_out_of_range=link.out_of_range,
+            imu_not_finite=link.not_finite,
+            coil_faults=watched.coils.state().faults,
+            coil_voltage=reading.voltage if reading else math.nan,
+            coil_current=reading.current if reading else math.nan,
+            coil_power=reading.power if reading else math.nan,
+            plans_accepted=accepted,
+            plans_refused=refused,
+            frames=frames,
+            streak_rates=streak_rates,
+            events=self._events.count,
+            records_lost=self._recorder.lost,
+        )
+
+    def report_lost(self, now_ns: int) -> None:
+        """Report the records that were lost since the last call, with the newest reason."""
+        lost = self._recorder.lost
+        if lost != self._lost:
+            text = f"{lost - self._lost} more, the newest: {self._recorder.lost_text}"
+            self._lost = lost
+            self._events.report(events.RECORD_LOST, now_ns, text)
+
+
+RUNS_PER_PACKET = 4
+_FAILING_CYCLES = 60
+_WORKER_EVENTS = {
+    WorkerChange.DIED: events.WORKER_DIED,
+    WorkerChange.READY: events.WORKER_READY,
+    WorkerChange.SPENT: events.WORKER_RESTS,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class HealthInputs:
+    """The tasks and devices that health checks, in addition to the streams."""
+
+    modes: ModeControl
+    drive: CoilDrive
+    power: PowerMonitor | None
+    workers: Sequence[WorkerWatch]
+
+
+class HealthWatch:
+    """The task of the health rate group."""
+
+    def __init__(
+        self, inputs: HealthInputs, limits: Health, feed: Callable[[], None], services: Services
+    ) -> None:
+        """Watch `inputs`; `feed` is called while every rate group and worker makes progress."""
+        self._inputs = inputs
+        self._monitor = ResourceMonitor(limits)
+        self._clock_watch = ClockWatch(services.clock, limits.clock_step)
+        self._clock = services.clock
+        self._recorder = services.recorder
+        self._events = services.events
+        self._jobs = services.jobs
+        # Every death of a worker is written: the budget of restarts bounds them, so there is no throttle.
+        self._worker_events = EventLog(services.recorder.event, 0)
+        self._facts = services.facts
+        self._streams = services.streams
+        self._feed = feed
+        self._fed = 0
+        self._power_ns = -1
+        self._sample: ResourceSample | None = None
+        self._ticker: Ticker | None = None
+
+    def watch(self, groups: Sequence[RateGroup]) -> None:
+        """Watch the rate groups of the flight, control first."""
+        self._control = groups[0]
+        self._progress = GroupsAndWorkers(list(groups), list(self._inputs.workers))
+        self._counted = (self._control.cycles, self._control.completed)
+
+    def read_resources(self, read: ResourceReader, period_ns: int) -> None:
+        """Read the board's resources on a ticker, outside the loop, until `close`."""
+
+        def sample() -> None:
+            self._sample = read(self._clock.now_ns())
+
+        self._ticker = self._clock.ticker("resources", period_ns, sample)
+
+    def adopt(self, limits: Health) -> None:
+        """Go on with other bounds of resources."""
+        self._monitor.adopt(limits)
+
+    def begin(self, time_ns: int) -> None:
+        """Count from here."""
+        self._progress.begin(time_ns)
+
+    def close(self) -> None:
+        """Stop reading the board. Safe to call twice."""
+        ticker, self._ticker = self._ticker, None
+        if ticker is not None:
+            ticker.stop()
+
+    def run(self, cycle: Cycle) -> None:
+        """Run all checks once."""
+        now_ns = cycle.start_ns
+        self._look_at_streams(now_ns)
+        self._look_at_progress(now_ns)
+        self._look_at_services(now_ns)
+        for news in self._jobs.news():
+            text = f"{news.worker}: {news.text}"
+            self._worker_events.report(_WORKER_EVENTS[news.change], now_ns, text)
+        step = self._clock_watch.look()
+        if step is not None:
+            self._events.report(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")
+        sample, self._sample = self._sample, None
+        if sample is not None:
+            self._monitor.ingest(sample)
+            self._monitor.report(self._facts, now_ns)
+        if cycle.slot % RUNS_PER_PACKET == 0:
+            self._record(now_ns)
+
+    def _look_at_streams(self, now_ns: int) -> None:
+        inputs = self._inputs
+        error = inputs.power.error() if inputs.power is not None else ""
+        self._facts.update(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
+        reading = inputs.power.latest() if inputs.power is not None else None
+        if reading is not None and reading.time_ns != self._power_ns:
+            self._power_ns = reading.time_ns
+            self._streams.note("power", reading.time_ns, reading.current)
+        for stream, poor, text in self._streams.look(now_ns):
+            self._facts.update(stream.poor, poor, now_ns, text)
+
+    def _look_at_progress(self, now_ns: int) -> None:
+        """Feed the watchdog if nothing is stalled; update the fact that the control task keeps failing."""
+        before = self._counted
+        if self._control.completed != before[1]:
+            self._counted = (self._control.cycles, self._control.completed)
+        failed = self._control.cycles - self._counted[0]
+        text = f"{failed} control cycles in a row have failed"
+        self._facts.update(facts.TASK_FAILING, failed >= _FAILING_CYCLES, now_ns, text)
+        still = self._progress.stalled(now_ns)
+        self._facts.update(facts.NO_PROGRESS, bool(still), now_ns, f"no progress: {', '.join(still)}")
+        if not still:
+            self._feed()
+            self._fed += 1
+
+    def _look_at_services(self, now_ns: int) -> None:
+        """Update the fact that a job outside the loop fails or is stalled."""
+        poor = failing(self._clock.tickers, now_ns)
+        text = "; ".join(poor) if poor else "all jobs run"
+        self._facts.update(facts.SERVICE_FAILING, bool(poor), now_ns, text)
+
+    def _record(self, now_ns: int) -> None:
+        inputs, state = self._inputs, self._monitor.state
+        sample, streams = state.sample, self._streams
+        self._recorder.record(
+            HEALTH,
+            now_ns,
+            mode=int(inputs.modes.mode),
+            mode_age=(now_ns - inputs.modes.since_ns) * 1e-9,
+            imu=int(streams.state("imu", now_ns)),
+            field=int(streams.state("field", now_ns)),
+            coils=int(streams.state("coils", now_ns)),
+            power=int(streams.state("power", now_ns)),
+            camera=int(streams.state("camera", now_ns)),
+            facts=sum(self._facts.holds(fact) << bit for bit, fact in enumerate(FACTS)),
+            coils_in_use=sum(int(used) << axis for axis, used in enumerate(inputs.drive.available)),
+            fed=self._fed,
+            slips=self._control.slips,
+            clock_steps=self._clock_watch.steps,
+            cpu_share=state.cpu_share,
+            resident=sample.resident if sample else math.nan,
+            proportional=sample.proportional if sample else math.nan,
+            memory_slope=state.memory_slope,
+            disk_free=sample.disk_free if sample else math.nan,
+            temperature=sample.temperature if sample else math.nan,
+        )

@@ -1,0 +1,613 @@
+"""Imaging: triggers the star camera, passes frames to the vision worker and results to navigation.
+
+The star camera is checked by sequence number, pixels and age of its frames, and by whether the stars match
+the catalogue. The objects that vision detects are tracked from frame to frame.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.link import events
+from flight.link.telemetry.definitions import MOST_SIGHTINGS, SIGHTINGS, STARS, STREAK, TRACK
+from flight.loop import facts
+from flight.loop.body import BodyView, FlightBody
+from flight.loop.executive import Cycle, JobResult
+from flight.loop.facts import Services
+from flight.loop.navigation import Navigation
+from hal.interfaces.devices import Frame, FrameSource
+from hal.interfaces.errors import DeviceError
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Knowledge
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, Track, TrackSettings
+from knightcube.vision.camera.images import KeptFrames
+from knightcube.vision.camera.lens import CameraModel, Exposures
+from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings
+from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
+from knightcube.vision.startracker.solve import (
+    NODES,
+    AttitudePrior,
+    FrameSolution,
+    RatePrior,
+    SolveStatus,
+    middle_covariance,
+    weighting_of,
+)
+from knightcube.vision.streaks.geometry import Course
+from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
+
+# rad, of the mounting between the camera and the inertial unit that the estimate is of.
+_LEAST_PRIOR_SIGMA = 5e-4
+# Instants of an exposure at which the rate is taken.
+_COURSE_NODES = 17
+_NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class ImagingSettings:
+    """Properties and time limits of the camera, and the settings of vision.
+
+    Attributes:
+        exposures: how long to expose at a rate.
+        fine_rest_ns: minimum time between exposures while the attitude is fine and no object is searched for.
+        seeks: returns whether an object is searched for.
+        calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
+        late_ns: age after the exposure from which a frame is late.
+        max_rate: rad/s of the body, beyond which no exposure is begun.
+        slow_ns: processing time from which vision is slow.
+        mounting: (4,) body axes to camera axes.
+        angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
+            acceleration at a time.
+        objects: how objects are sighted; None: they are not.
+        kept: where frames are kept; None: they are not.
+        velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
+        knowledge: returns how well the attitude is known now.
+    """
+
+    camera: CameraModel
+    exposures: Exposures
+    fine_rest_ns: int
+    max_age_ns: int
+    late_ns: int
+    slow_ns: int
+    max_rate: float
+    mounting: FloatArray
+    estimator: LikelihoodSettings | StreakEstimator
+    tracker: TrackerSettings | None
+    angular_acceleration_psd: Callable[[int], FloatArray]
+    velocity: Callable[[int], FloatArray | None]
+    knowledge: Callable[[], Knowledge]
+    seeks: Callable[[], bool]
+    calm: Callable[[int, int], int]
+    objects: ObjectMeasurementSettings | None = None
+    kept: KeptFrames | None = None
+
+
+class FrameMeasurer:
+    """Builds jobs from frames, and measurements from the worker's results."""
+
+    def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
+        self._settings = settings
+        self._navigation = navigation
+        self._body_to_camera = attitude_matrix(settings.mounting)
+
+    def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
+        """Return the worker's job; `last_checksum` is that of the previous frame, to detect a repetition.
+
+        `spare`: whether there is time to look for objects.
+        """
+        past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
+        return FrameJob(
+            frame.pixels,
+            self._settings.camera,
+            frame.exposure_ns * 1e-9,
+            self._estimator(past),
+            self._tracker(frame),
+            self._rate_prior(frame, past) if past is not None else None,
+            self._attitude_prior(past) if past is not None else None,
+            last_checksum,
+            objects=self._settings.objects if spare else None,
+            kept=None if kept is None else replace(kept, name=f"frame-{frame.sequence:08d}"),
+        )
+
+    def exposure_ns(self, now_ns: int) -> int:
+        """Return how long to expose from now on: by the estimated rate across the boresight."""
+        exposures, estimate = self._settings.exposures, self._navigation.estimate(now_ns)
+        if estimate is None:
+            return round(exposures.usual * SECOND_NS)
+        x, y, _ = (self._body_to_camera @ estimate.rate).tolist()
+        return round(exposures.at(math.hypot(x, y)) * SECOND_NS)
+
+    def _tracker(self, frame: Frame) -> TrackerSettings | None:
+        tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
+        if tracker is None or velocity is None:
+            return tracker
+        return replace(tracker, solve=replace(tracker.solve, velocity=velocity))
+
+    def _estimator(self, past: Estimate | None) -> LikelihoodSettings | StreakEstimator:
+        estimator = self._settings.estimator
+        if past is None and isinstance(estimator, LikelihoodSettings):
+            # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
+            return replace(estimator, rate_model="accelerating")
+        return estimator
+
+    def _rate_prior(self, frame: Frame, past: Estimate) -> RatePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
+        rate, sigma = self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0))
+        return RatePrior(rate, sigma, self._course(frame, sigma))
+
+    def _course(self, frame: Frame, sigma: float) -> Course | None:
+        """Return how the camera turned, its rate known to `sigma` rad/s; None beyond the history."""
+        spanning = self._navigation.rates(
+            frame.exposure_start_ns, frame.exposure_start_ns + frame.exposure_ns
+        )
+        if spanning is None:
+            return None
+        times, rates = spanning
+        at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (frame.exposure_start_ns - times[0])
+        even = np.stack([np.interp(at, times - times[0], rate) for rate in rates.T], axis=1)
+        return Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, sigma)
+
+    def _attitude_prior(self, past: Estimate) -> AttitudePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[ATTITUDE, ATTITUDE])[-1])
+        sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
+        return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
+
+    def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
+        """Return the mean body rate over the exposure, None without a rate or without an estimate then."""
+        start_ns = frame.exposure_start_ns
+        if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
+            return None
+        return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
+
+    def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
+        """Return the attitude at mid-exposure, None without a fix."""
+        fix = found.solution.fix if found.solution is not None else None
+        if fix is None:
+            return None
+        turn = self._body_to_camera.T
+        covariance = turn @ fix.covariance @ turn.T + self._off_middle(frame, found.motion)
+        quaternion = multiply(conjugate(self._settings.mounting), fix.quaternion)
+        return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
+
+    def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
+        """Return rate and covariance in body axes; NaN when there is none."""
+        if found is None or found.rate is None or found.covariance is None:
+            return _NAN
+        turn = self._body_to_camera.T
+        return turn @ found.rate, turn @ found.covariance @ turn.T
+
+    def _off_middle(self, frame: Frame, motion: FrameMotion) -> FloatArray:
+        """Return the covariance (3, 3) rad^2 of the stars' attitude relative to that of mid-exposure."""
+        turns = np.zeros((len(NODES), 3))
+        middle = self._navigation.past(middle_ns(frame))
+        if middle is not None:
+            back = conjugate(middle.quaternion)
+            for number, part in enumerate(NODES):
+                past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
+                if past is not None:
+                    turns[number] = to_rotation_vector(multiply(past.quaternion, back))
+        density = self._settings.angular_acceleration_psd(middle_ns(frame))
+        return middle_covariance(weighting_of(motion), turns, density, frame.exposure_ns * 1e-9)
+
+
+def middle_ns(frame: Frame) -> int:
+    """Return the time of mid-exposure."""
+    return frame.exposure_start_ns + frame.exposure_ns // 2
+
+
+_MANY_STARS = 12
+"""A frame with at least this many unmatched detections does not show the sky: its pixels are invalid."""
+_NAMED_ELSEWHERE = {
+    StreakStatus.TOO_SHORT,  # no motion
+    StreakStatus.BLACK,
+    StreakStatus.SATURATED,
+    StreakStatus.FROZEN,
+}
+"""States of a frame without motion, or with an event of their own."""
+_NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
+
+
+class FrameReport:
+    """Records frames; `accepted` counts the rates from streaks that entered the estimate."""
+
+    def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
+        self._measurer = measurer
+        self._view = view
+        self._recorder = services.recorder
+        self._events = services.events
+        self.accepted = 0
+
+    def rate(
+        self, frame: Frame, motion: FrameMotion, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
+    ) -> None:
+        """Record the rate from the streaks, and report a rejected rate."""
+        self.accepted += accepted
+        if rate is not None and not accepted:
+            text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
+            self._events.report(events.STREAK_REFUSED, now_ns, text)
+        self.record(frame, motion.status.value, motion, now_ns, accepted)
+
+    def unused(self, frame: Frame, found: FrameFound, now_ns: int) -> None:
+        """Report a frame of a body in motion that gave no rate and no attitude."""
+        if found.motion.status in _NAMED_ELSEWHERE:
+            return
+        stars = f", stars {found.solution.status.value}" if found.solution is not None else ""
+        text = f"frame {frame.sequence}: streaks {found.motion.status.value}{stars}"
+        self._events.report(events.FRAME_UNUSED, now_ns, text)
+
+    def stars(
+        self,
+        frame: Frame,
+        solution: FrameSolution,
+        attitude: AttitudeMeasurement | None,
+        now_ns: int,
+        accepted: bool | None,
+    ) -> None:
+        """Record the attitude from the stars; `accepted` is None when not offered to the filter."""
+        if is_strange(solution):
+            text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
+            self._events.report(events.CAMERA_STRANGE, now_ns, text)
+        if accepted is False:
+            text = f"frame {frame.sequence}: {len(solution.matched)} stars"
+            self._events.report(events.STARS_REFUSED, now_ns, text)
+        quaternion = _NAN4 if attitude is None else attitude.quaternion
+        covariance = _NAN33 if attitude is None else attitude.covariance
+        self._recorder.record(
+            STARS,
+            now_ns,
+            sequence=frame.sequence,
+            middle_ns=middle_ns(frame) - self._recorder.epoch_ns,
+            status=solution.status.value,
+            tracked=int(solution.tracked),
+            found=len(solution.points),
+            matched=len(solution.matched),
+            quaternion=quaternion.tolist(),
+            covariance=_packed(covariance),
+            log10_false_alarm=solution.log10_false_alarm,
+            accepted=int(bool(accepted)),
+        )
+
+    def record(
+        self, frame: Frame, status: str, found: FrameMotion | None, now_ns: int, accepted: bool
+    ) -> None:
+        """Record the streak packet."""
+        rate, covariance = self._measurer.rate_in_body(found)
+        self._recorder.record(
+            STREAK,
+            now_ns,
+            sequence=frame.sequence,
+            exposure_start_ns=frame.exposure_start_ns - self._recorder.epoch_ns,
+            exposure=frame.exposure_ns * 1e-9,
+            status=status,
+            streaks=found.found if found else 0,
+            used=found.used_count if found else 0,
+            length=found.length if found else math.nan,
+            rate=rate.tolist(),
+            covariance=_packed(covariance),
+            residual=found.residual if found else math.nan,
+            accepted=int(accepted),
+        )
+
+
+def is_strange(solution: FrameSolution | None) -> bool:
+    """Return whether a frame shows many stars but matches no part of the sky."""
+    if solution is None or solution.status is not SolveStatus.NO_MATCH:
+        return False
+    return len(solution.points) >= _MANY_STARS
+
+
+def _packed(c: FloatArray) -> list[float]:
+    """Return xx yy zz xy xz yz of a symmetric matrix (3, 3)."""
+    return [float(c[0, 0]), float(c[1, 1]), float(c[2, 2]), float(c[0, 1]), float(c[0, 2]), float(c[1, 2])]
+
+
+_ROWS = 32
+_FRAMES = 4
+"""The number of a driver's buffers."""
+_LEAST_CHANGES = 0.125
+"""A row has noise when at least this fraction of neighbouring pixels differ."""
+
+
+class RepeatedRows:
+    """Keeps checksums of some rows of the last frames."""
+
+    def __init__(self) -> None:
+        self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
+
+    def look(self, pixels: Image) -> int:
+        """Check a frame (rows, columns); return how many sampled rows are copies of an earlier frame's.
+
+        0 for an intact frame, and for a frame of copied rows only.
+        """
+        rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
+        here = {row: zlib.crc32(pixels[row].tobytes()) for row in rows if _has_noise(pixels[row])}
+        old = sum(any(before.get(row) == value for before in self._seen) for row, value in here.items())
+        self._seen.append(here)
+        return old if old < len(here) else 0
+
+
+def _has_noise(row: Image) -> bool:
+    return int(np.count_nonzero(row[1:] != row[:-1])) >= _LEAST_CHANGES * len(row)
+
+
+_UNKNOWN = [math.nan] * 3
+
+
+class ObjectTracks:
+    """Owns the tracks of objects."""
+
+    def __init__(self, settings: TrackSettings, body: FlightBody, services: Services) -> None:
+        self._body = body
+        self._tracker = ObjectTracker(settings)
+        self._recorder = services.recorder
+        self._events = services.events
+
+    def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
+        """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
+        self._record_sightings(sequence, middle_ns, sighted, now_ns)
+        orbit = self._body.estimation.orbit(middle_ns)
+        frame = FrameSightings(
+            middle_ns,
+            sighted.directions,
+            sighted.covariance,
+            sighted.magnitudes,
+            sighted.attitude,
+            None if orbit is None else orbit.position,
+        )
+        confirmed, ended = self._tracker.ingest(frame)
+        for track in confirmed:
+            rate_deg = math.degrees(float(np.linalg.norm(track.line.rate)))
+            text = f"object {track.number}: {rate_deg:.3f} deg/s among the stars, V {track.magnitude:.1f}"
+            self._events.report(events.OBJECT_FOUND, now_ns, text)
+        for track in ended:
+            away = (middle_ns - track.seen_ns) * 1e-9
+            text = f"object {track.number}: not seen for {away:.1f} s, {track.sightings} sightings"
+            self._events.report(events.OBJECT_LOST, now_ns, text)
+        for track in self._tracker.objects:
+            self._record_track(track, now_ns)
+        self._body.control.accept_tracks(self._tracker.objects, now_ns)
+
+    def _record_sightings(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
+        x, y = np.reshape(sighted.points, (-1, 2)).T
+        self._recorder.record(
+            SIGHTINGS,
+            now_ns,
+            sequence=sequence,
+            middle_ns=middle_ns - self._recorder.epoch_ns,
+            found=len(x),
+            x=_padded(x),
+            y=_padded(y),
+            magnitude=_padded(sighted.magnitudes),
+        )
+
+    def _record_track(self, track: Track, now_ns: int) -> None:
+        line = track.line
+        across = np.eye(3) - np.outer(line.direction, line.direction)
+        orbit = self._body.estimation.orbit(line.time_ns)
+        self._recorder.record(
+            TRACK,
+            now_ns,
+            number=track.number,
+            middle_ns=line.time_ns - self._recorder.epoch_ns,
+            seen=int(track.seen),
+            sightings=track.sightings,
+            measured=track.measured.tolist(),
+            measured_sigma=track.measured_sigma,
+            direction=line.direction.tolist(),
+            rate=line.rate.tolist(),
+            acceleration=line.acceleration.tolist(),
+            covariance=_packed(line.covariance[:3, :3]),
+            rate_covariance=_packed(across @ line.covariance[3:, 3:] @ across),
+            magnitude=track.magnitude,
+            magnitude_sigma=track.magnitude_sigma,
+            place=_UNKNOWN if orbit is None else orbit.position.tolist(),
+            velocity=_UNKNOWN if orbit is None else orbit.velocity.tolist(),
+            place_sigma=math.nan if orbit is None else orbit.sigma,
+        )
+
+
+def _padded(values: FloatArray) -> list[float]:
+    """Return the first values, and NaN for those that are missing."""
+    first = [float(value) for value in values[:MOST_SIGHTINGS]]
+    return first + [math.nan] * (MOST_SIGHTINGS - len(first))
+
+
+WORKER = "vision"
+
+
+class Imaging:
+    """Owns the frame in process, and monitors the camera."""
+
+    def __init__(
+        self,
+        camera: FrameSource,
+        settings: ImagingSettings,
+        navigation: Navigation,
+        view: BodyView,
+        services: Services,
+        objects: ObjectTracks | None = None,
+    ) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._navigation = navigation
+        self._measurer = FrameMeasurer(settings, navigation)
+        self._report = FrameReport(self._measurer, view, services)
+        self._jobs = services.jobs
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
+        self._frame: Frame | None = None
+        self._last_sequence = -1
+        self._last_checksum: int | None = None
+        self._last_frame_ns = 0
+        self._triggered_ns = -settings.fine_rest_ns
+        self._ordered: tuple[int, int] | None = None  # the begin and the length, ns, of an exposure to come
+        self._due_ns: int | None = None  # when the frame of the oldest open trigger is due
+        self._rows = RepeatedRows()
+        self._busy_since_ns = 0
+        self._frames = 0
+        self._objects = objects
+        self._spare = True  # the last frame left time to look for objects
+
+    def counts(self) -> tuple[int, int]:
+        """Return the number of frames, and of rates from streaks that entered the estimate."""
+        return self._frames, self._report.accepted
+
+    def busy_since_ns(self) -> int | None:
+        """Return since when a frame has been in process, None when none is."""
+        return None if self._frame is None else self._busy_since_ns
+
+    def begin(self, time_ns: int) -> None:
+        """Measure the age of the newest frame from `time_ns` on."""
+        self._last_frame_ns = time_ns
+
+    def trigger(self, cycle: Cycle) -> None:
+        """Order an exposure: the task of the camera's rate group.
+
+        Not while the body turns too fast for one, and seldom while the attitude is fine. It begins where no
+        step of the coils falls within: a rate is one rate then.
+        """
+        if self._navigation.speed > self._settings.max_rate:
+            self._last_frame_ns = cycle.start_ns
+            self._streams.note("camera", cycle.start_ns)  # it rests on purpose
+            return
+        rested_ns = cycle.start_ns - self._triggered_ns
+        fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
+        if rested_ns < self._settings.fine_rest_ns and fine:
+            return
+        self._triggered_ns = now_ns = cycle.start_ns
+        exposure_ns = self._measurer.exposure_ns(now_ns)
+        self._ordered = self._settings.calm(now_ns, exposure_ns), exposure_ns
+        self._expose(now_ns)
+
+    def _expose(self, now_ns: int) -> None:
+        """Start the exposure that is ordered, when its time has come."""
+        if self._ordered is None or now_ns < self._ordered[0]:
+            return
+        (_, exposure_ns), self._ordered = self._ordered, None
+        try:
+            self._camera.trigger(exposure_ns)
+        except DeviceError as error:
+            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
+            return
+        if self._due_ns is None:
+            # A free-running camera first completes the exposure in progress.
+            self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
+
+    def serve(self, now_ns: int) -> None:
+        """Start a due exposure; check the camera; pass a new frame to the worker."""
+        self._look_at_worker(now_ns)
+        frame = self._poll(now_ns)
+        age_ns = now_ns - self._last_frame_ns
+        if frame is None:
+            if self._due_ns is not None and now_ns > self._due_ns:
+                self._facts.update(facts.CAMERA_LATE, True, now_ns, "no frame yet after its trigger")
+            if age_ns > self._settings.max_age_ns:
+                self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
+            return
+        if frame.sequence <= self._last_sequence:
+            # A repeated frame does not reset the age.
+            text = f"frame {frame.sequence} comes again"
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
+            self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
+            return
+        self._due_ns = None
+        # Frame age is measured from exposure, not arrival.
+        self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
+        age_ns = now_ns - self._last_frame_ns
+        late = age_ns > self._settings.max_age_ns
+        text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
+        self._facts.update(facts.CAMERA_LOST, late, now_ns, text)
+        self._facts.update(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
+        if not late:
+            self._streams.note("camera", now_ns)
+        old = self._rows.look(frame.pixels)
+        if old:
+            text = f"frame {frame.sequence}: {old} of the rows looked at are an earlier frame's"
+            self._events.report(events.CAMERA_TORN, now_ns, text)
+        self._frames += 1
+        self._last_sequence = frame.sequence
+        if old:
+            self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
+        elif self._jobs.submit(WORKER, self._measurer.job(frame, self._last_checksum, self._spare)):
+            self._frame = frame
+            self._busy_since_ns = now_ns
+        else:
+            self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
+
+    def finish(self, result: JobResult, now_ns: int) -> None:
+        """Accept the worker's result."""
+        frame, self._frame = self._frame, None
+        if frame is None:
+            return
+        self._judge_speed(now_ns)
+        if result.outcome != "done":
+            self._events.report(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
+            self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
+            return
+        found: FrameFound = result.value
+        motion = found.motion
+        self._last_checksum = motion.checksum
+        self._look_at_light(frame, motion.status, now_ns)
+        rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
+        if is_strange(found.solution):
+            rate = None  # its pixels are invalid
+        if found.objects is not None and self._objects is not None:
+            self._objects.ingest(frame.sequence, middle_ns(frame), found.objects, now_ns)
+        if rate is None and attitude is None:
+            self._report.unused(frame, found, now_ns)
+        known = self._navigation.past(middle_ns(frame)) is not None
+        began = attitude is not None and self._navigation.begin_from(attitude)
+        late = [m for m in (rate, attitude if known else None) if m is not None]
+
+        def report(accepted: list[bool]) -> None:
+            took = dict(zip(map(type, late), accepted, strict=True))
+            self._report.rate(frame, motion, rate, now_ns, took.get(MeanRateMeasurement, False))
+            if found.solution is not None:
+                self._report.stars(
+                    frame, found.solution, attitude, now_ns, began or took.get(AttitudeMeasurement)
+                )
+
+        if late:
+            self._navigation.ingest_late(late, report)
+        else:
+            report([])
+
+    def _look_at_light(self, frame: Frame, status: StreakStatus, now_ns: int) -> None:
+        """Report a frame with the pixels of the last one, or without stars for lack or excess of light."""
+        if status is StreakStatus.FROZEN:
+            text = f"frame {frame.sequence} has the pixels of the last"
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
+        elif status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
+            self._events.report(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {status.value}")
+
+    def _look_at_worker(self, now_ns: int) -> None:
+        """Report a slow worker while the frame is still in process."""
+        if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
+            self._judge_speed(now_ns)
+
+    def _judge_speed(self, now_ns: int) -> None:
+        taken_ns = now_ns - self._busy_since_ns
+        self._spare = taken_ns <= self._settings.slow_ns
+        text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
+        self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
+
+    def _poll(self, now_ns: int) -> Frame | None:
+        """Start an exposure that is due; return a frame that has come."""
+        self._expose(now_ns)
+        try:
+            return self._camera.poll()
+        except DeviceError as error:
+            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
+            return None

@@ -1,0 +1,294 @@
+"""Navigation: passes readings of inertial unit, GPS receiver and solar cells to the body; monitors them.
+
+The inertial unit's line is monitored for silence (no bytes), corruption (bytes without valid packets) and
+implausible values. Rates from streaks and attitudes from stars enter the estimate at their own times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from flight.link import events
+from flight.link.telemetry.definitions import IMU
+from flight.loop import facts
+from flight.loop.body import BodyEstimation
+from flight.loop.coil_monitor import CurrentValidity
+from flight.loop.facts import Services
+from hal.interfaces.devices import (
+    CoilState,
+    GpsReading,
+    GpsReceiver,
+    ImuLink,
+    ImuReading,
+    InertialUnit,
+    SolarStrings,
+    StringReading,
+)
+from hal.interfaces.errors import DeviceError
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
+
+_AT_A_TIME = 16
+"""Measurements applied again per cycle: takes a few ms, so that a second of them takes a few cycles."""
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationSettings:
+    """Age limits of the inertial unit's readings.
+
+    Attributes:
+        max_age_ns: age limit of a reading by which the coils are driven.
+        coast_ns: for how long the estimate is propagated without a measurement, for telemetry only.
+        period_ns: of the control cycle: a commanded current flows at least until the next cycle.
+    """
+
+    max_age_ns: int
+    coast_ns: int
+    period_ns: int
+
+
+class Navigation:
+    """Owns the filter, and monitors the inertial unit's line."""
+
+    def __init__(
+        self, unit: InertialUnit, estimation: BodyEstimation, settings: NavigationSettings, services: Services
+    ) -> None:
+        self._unit = unit
+        self._filter = estimation.filter
+        self._feed = estimation.feed
+        self._settings = settings
+        self._recorder = services.recorder
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
+        self._since_ns = 0
+        self._received_ns = 0  # the newest reading, and the newest that agreed with the estimate
+        self._agreed_ns = 0
+        self._link = unit.link()
+        self._bytes_since_ns = 0
+        self.speed = 0.0
+        """rad/s, of the newest reading, the gyro's bias included."""
+
+    def begin(self, time_ns: int) -> None:
+        """Use samples from `time_ns` on only: the body is released then."""
+        self._since_ns = time_ns
+        self._received_ns = self._agreed_ns = time_ns
+        self._bytes_since_ns = time_ns
+        self._link = self._unit.link()
+
+    def link(self) -> ImuLink:
+        """Return the unit's counters."""
+        return self._link
+
+    def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
+        """Give the filter the coil currents, as far as they are known."""
+        if known.uncertain_since_ns is not None:
+            self._filter.mark_unknown(known.uncertain_since_ns)
+        self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
+
+    def update(self, now_ns: int) -> tuple[ImuReading, ...]:
+        """Apply new and late measurements; return the readings of this cycle, oldest first."""
+        self._filter.catch_up(_AT_A_TIME)
+        try:
+            polled = self._unit.poll()
+        except DeviceError as error:
+            self._facts.update(facts.IMU_LINE_LOST, True, now_ns, str(error))
+            return ()
+        self._facts.update(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+        readings = tuple(reading for reading in polled if reading.time_ns >= self._since_ns)
+        for reading in readings:
+            self._ingest(reading)
+            self._streams.note("imu", reading.time_ns)
+            self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
+            self._received_ns = reading.time_ns
+            self.speed = math.hypot(*reading.rate.tolist())
+        self._watch_line(now_ns)
+        doubted = self._filter.doubts_commands
+        text = "the rate departs from the commanded" if doubted else "the rate follows the commands"
+        self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
+        return readings
+
+    def is_current(self, now_ns: int) -> bool:
+        """Return whether the coils may be driven by readings alone until the next cycle."""
+        return self._is_fresh(self._received_ns, now_ns)
+
+    def is_measured(self, now_ns: int) -> bool:
+        """Return whether the coils may be driven by the estimate until the next cycle.
+
+        The newest reading that agreed with the estimate must be within the age limit until then. An estimate
+        propagated by the model alone is recorded, but not used for steering.
+        """
+        return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
+
+    def _is_fresh(self, time_ns: int, now_ns: int) -> bool:
+        return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
+
+    def estimate(self, now_ns: int) -> Estimate | None:
+        """Return the estimate for now, measured or propagated by the model; None when there is none."""
+        # Over a long silence, propagation would cost more with every cycle, for an estimate of no use.
+        if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
+            return None
+        return self._filter.at(now_ns)
+
+    def past(self, time_ns: int) -> Estimate | None:
+        """Return the estimate of a past time, None beyond the filter's history."""
+        return self._filter.past(time_ns) if self._filter.started else None
+
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return times (n,) ns and rates (n, 3) rad/s that span a past interval; None beyond the history."""
+        return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
+
+    def begin_from(self, attitude: AttitudeMeasurement) -> bool:
+        """Offer an attitude of the stars while there is no estimate; return whether it began one."""
+        return not self._filter.started and self._feed.begin(attitude)
+
+    def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
+        """Apply measurements of a frame at their times, over the next cycles.
+
+        `report` is called, later or at once, with whether each of them passed the gate.
+        """
+        if self._filter.started:
+            self._filter.measure_late(late, report)
+        else:
+            report([False] * len(late))
+
+    def _ingest(self, reading: ImuReading) -> None:
+        self._recorder.record(
+            IMU,
+            reading.arrival_ns,
+            sample_time_ns=reading.time_ns - self._recorder.epoch_ns,
+            device_time_ns=reading.device_time_ns,
+            quaternion=reading.quaternion.tolist(),
+            rate=reading.rate.tolist(),
+            field=reading.field.tolist(),
+            acceleration=reading.acceleration.tolist(),
+        )
+        agreement = self._feed.accept(reading)
+        if agreement.holds:
+            self._agreed_ns = reading.time_ns
+        if agreement.objection:
+            text = f"{agreement.objection} disagree with the estimate"
+            self._events.report(events.IMU_REFUSED, reading.arrival_ns, text)
+
+    def _watch_line(self, now_ns: int) -> None:
+        link, before = self._unit.link(), self._link
+        self._link = link
+        limit_ns = self._settings.max_age_ns
+        quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
+        silent = quiet_ns > limit_ns
+        text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
+        self._facts.update(facts.IMU_SILENT, silent, now_ns, text)
+        if silent:
+            self._bytes_since_ns = now_ns
+        without_ns = now_ns - max(self._received_ns, self._bytes_since_ns)
+        unusable = without_ns > limit_ns
+        text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
+        text = text if unusable else "readings come again"
+        self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
+        bad = link.bad_checksum - before.bad_checksum
+        stray = link.discarded_bytes - before.discarded_bytes
+        if bad or stray:
+            text = f"{bad} packets with a wrong checksum, {stray} bytes of no packet"
+            self._events.report(events.IMU_CORRUPT, now_ns, text)
+        odd = link.out_of_range - before.out_of_range
+        endless = link.not_finite - before.not_finite
+        if odd or endless:
+            text = f"{odd} packets out of range, {endless} not finite"
+            self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)
+
+
+CLOCK_OFF_NS = SECOND_NS
+"""By which the wall clock may differ from the receiver's time."""
+
+
+class Positioning:
+    """Owns the receiver."""
+
+    def __init__(
+        self,
+        receiver: GpsReceiver,
+        accept: Callable[[GpsReading], bool],
+        max_age_ns: int,
+        services: Services,
+    ) -> None:
+        """`accept` returns whether the body uses a fix; without one for `max_age_ns` the receiver is lost."""
+        self._receiver = receiver
+        self._accept = accept
+        self._max_age_ns = max_age_ns
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
+        self._clock = services.clock
+        self._fixed_ns = 0
+
+    def begin(self, time_ns: int) -> None:
+        """Measure the age of the newest fix from `time_ns` on."""
+        self._fixed_ns = time_ns
+
+    def run(self, now_ns: int) -> None:
+        """Accept the fixes since the last call."""
+        error = ""
+        try:
+            readings = self._receiver.poll()
+        except DeviceError as lost:
+            readings, error = [], str(lost)
+        for reading in readings:
+            if not reading.valid:
+                continue
+            self._streams.note("gps", reading.time_ns)
+            if self._accept(reading):
+                self._fixed_ns = reading.time_ns
+                self._compare_clock(reading, now_ns)
+            else:
+                self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
+        age_ns = now_ns - self._fixed_ns
+        text = error or f"no fix of use for {age_ns * 1e-9:.0f} s"
+        lost_now = bool(error) or age_ns > self._max_age_ns
+        self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+
+    def _compare_clock(self, reading: GpsReading, now_ns: int) -> None:
+        """Report a wall clock that is wrong: before the first fix the place was found by it."""
+        clock = self._clock
+        off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
+        text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
+        self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
+
+
+class SunSensing:
+    """Owns the strings."""
+
+    def __init__(
+        self,
+        strings: SolarStrings,
+        accept: Callable[[StringReading], str | None],
+        max_age_ns: int,
+        services: Services,
+    ) -> None:
+        """`accept` is `BodyEstimation.accept_sun`; a reading older than `max_age_ns` is not used."""
+        self._strings = strings
+        self._accept = accept
+        self._max_age_ns = max_age_ns
+        self._facts = services.facts
+        self._read_ns = 0
+
+    def begin(self, time_ns: int) -> None:
+        """Measure the age of the newest reading from `time_ns` on."""
+        self._read_ns = time_ns
+
+    def run(self, now_ns: int) -> None:
+        """Accept the newest reading, once."""
+        reading = self._strings.latest()
+        if reading is not None and reading.time_ns > self._read_ns:
+            self._read_ns = reading.time_ns
+            if now_ns - reading.time_ns <= self._max_age_ns:
+                wrong = self._accept(reading)
+                if wrong is not None:
+                    self._facts.update(facts.SUN_UNCLEAR, bool(wrong), now_ns, wrong or "the Sun is seen")
+        age_ns = now_ns - self._read_ns
+        lost = age_ns > self._max_age_ns
+        text = self._strings.error() or f"no reading for {age_ns * 1e-9:.0f} s"
+        self._facts.update(facts.STRINGS_LOST, lost, now_ns, text if lost else "readings come again")

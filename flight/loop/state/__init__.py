@@ -1,1 +1,0 @@
-"""State that outlives the process: boot count, unclean shutdowns, learned parameters, the last mode."""

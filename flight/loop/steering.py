@@ -1,0 +1,274 @@
+"""Steering: from the estimate and the path to a coil command; zero without a trusted estimate.
+
+The coil drive excludes failed axes and reallocates the current of the others to preserve the torque
+direction. Written commands are compared with the supply current and the body's motion
+(`flight.loop.coil_monitor`). A verdict becomes a fact, the fact an event, and the event's reaction
+excludes the axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flight.link import events
+from flight.loop import facts
+from flight.loop.body import CoilCommand, FlightBody, Steered, SteeringState, WindowedLaw
+from flight.loop.coil_monitor import CoilMonitor, CoilVerdict
+from flight.loop.coil_response import NONE, Axes
+from flight.loop.facts import Services
+from flight.schema.sections import Modes
+from hal.interfaces.devices import CoilState, ImuReading, PowerMonitor, TorqueCoils
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.gnc.control.allocation import allocate
+from knightcube.gnc.estimation.estimate import Estimate
+
+_BROKEN = (facts.COIL_X_BROKEN, facts.COIL_Y_BROKEN, facts.COIL_Z_BROKEN)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoilDriveSettings:
+    """The coils.
+
+    Attributes:
+        dipole_per_ampere: n A of each, m^2.
+        limits: (3,) A.
+        free_axis: (3,) the only axis about which the body can turn; None for a free body.
+    """
+
+    dipole_per_ampere: float
+    limits: FloatArray
+    free_axis: FloatArray | None
+
+
+class CoilDrive:
+    """Commands the coils and watches their response.
+
+    Attributes:
+        command: (3,) A, asked of the driver in this cycle.
+        available: (3,) bool, the axes in use.
+    """
+
+    def __init__(
+        self,
+        coils: TorqueCoils,
+        power: PowerMonitor | None,
+        watch: CoilMonitor,
+        settings: CoilDriveSettings,
+        services: Services,
+    ) -> None:
+        self._coils = coils
+        self._power = power
+        self._watch = watch
+        self._settings = settings
+        self._facts = services.facts
+        self._events = services.events
+        self._verdicts = 0
+        self._braked = NONE
+        self.available = np.ones(3, dtype=bool)
+        self.command: FloatArray = np.zeros(3)
+
+    def state(self) -> CoilState:
+        """Return the command on the wire."""
+        return self._coils.state()
+
+    def off(self) -> None:
+        """Switch all coils off at the driver, at the flight's end."""
+        self._coils.off()
+
+    def fault(self) -> str:
+        """Return why the PWM chip does not take commands; empty while it does."""
+        return self._coils.state().error
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether a coil may carry another current than its command, no verdict being given yet."""
+        return self._watch.doubts_currents
+
+    def look(
+        self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
+    ) -> None:
+        """Compare the command on the wire with the monitor and the motion, once a cycle.
+
+        Unless the currents since the last cycle are `known`, the evidence until now is discarded.
+        """
+        watch = self._watch
+        if in_force.written_ns >= 0:
+            watch.commanded(now_ns, in_force.current, in_force.braked, in_force.written_ns)
+        if not known:
+            watch.interrupted(now_ns)
+        for reading in readings:
+            watch.observe_motion(reading.time_ns, reading.rate, reading.field)
+        answer = self._power.latest() if self._power is not None and not self._power.error() else None
+        if answer is not None:
+            watch.measured(answer)
+        found = watch.verdicts
+        for verdict in found[self._verdicts :]:
+            self._state(verdict, now_ns)
+        self._verdicts = len(found)
+        self._brake(watch.braked)
+        self._facts.update(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
+        self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
+
+    def adopt(self, modes: Modes) -> None:
+        """Go on with other bounds of the modes."""
+        self._watch.tumble_rate = modes.tumble_rate
+
+    def isolate(self) -> None:
+        """Exclude the axes that have a verdict: the reaction to `coil-broken`."""
+        self.available = self._watch.available
+
+    def trust(self, now_ns: int) -> None:
+        """Use all axes again, by command; a lasting fault will be found again."""
+        for axis in range(3):
+            self._watch.forget(axis)
+        self._verdicts = 0
+        self.isolate()
+        self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
+
+    def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
+        """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
+        usable = self.available & ~self._watch.resting
+        if not all(usable.tolist()) and currents.any():
+            currents = self._reallocated(currents, field(), usable)
+        self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
+        self._coils.command(self.command)
+
+    def zero(self) -> None:
+        """Command zero current."""
+        self.command = np.zeros(3)
+        self._coils.command(self.command)
+
+    def _brake(self, axes: Axes) -> None:
+        """Brake bridges: a bridge with a leg stuck high drives its coil even at zero command."""
+        if axes != self._braked:
+            self._coils.brake(axes)
+            self._braked = axes
+
+    def _reallocated(self, currents: FloatArray, field: FloatArray | None, usable: BoolArray) -> FloatArray:
+        """Return currents of the `usable` axes (3,) that make the torque of `currents`."""
+        if field is None:
+            return np.where(usable, currents, 0.0)
+        dipole, limits = self._settings.dipole_per_ampere, self._settings.limits
+        torque = np.cross(dipole * currents, field)
+        return allocate(
+            torque, field, dipole, limits, usable.astype(float), self._settings.free_axis
+        ).currents
+
+    def _state(self, verdict: CoilVerdict, now_ns: int) -> None:
+        self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
+
+
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+class Steering:
+    """Steers the body along its path, brakes it, or rests.
+
+    Control is lost when no reading within its age limit agrees with the estimate, or, while braking, when
+    there is no such reading. The model carries the estimate on over a silence, so that control returns
+    smoothly, but no current flows meanwhile: it is zero within a tenth of a second of the last reading.
+    Without a planner the body is steered along its last path and held at its end (event `holding`). Without a
+    path no current flows.
+    """
+
+    def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
+        self._body = body
+        self._drive = drive
+        self._facts = services.facts
+
+    def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
+        """Follow or hold in this cycle; `estimate` is None unless measured.
+
+        `ever_started`: there was an estimate before, so that None is a loss of control.
+        """
+        control = self._body.control
+        reference = control.paths.sample(now_ns)
+        text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
+        self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
+        state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
+        if estimate is None or reference is None:
+            self._release()
+        else:
+            following = control.paths.is_following(now_ns)
+            state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
+            wanted: CoilCommand = control.tracker.command(estimate, reference)
+            dipole, saturated = wanted.dipole, wanted.saturated
+            self._drive.send(wanted.currents, lambda: self._body.estimation.field(estimate))
+            adrift = not following and control.paths.is_adrift(now_ns)
+        self._facts.update(
+            facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
+        )
+        return self._steered(state, now_ns, reference, dipole, saturated)
+
+    def begin_detumbling(self, now_ns: int) -> None:
+        """Begin the measuring and acting windows of detumbling."""
+        self._body.control.brake.begin(now_ns)
+
+    def begin_sun_acquisition(self, now_ns: int) -> None:
+        """Begin the windows of turning to the Sun, if the body can."""
+        if (acquisition := self._body.control.sun_acquisition) is not None:
+            acquisition.begin(now_ns)
+
+    def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
+        """Detumble in this cycle; `current`: the newest reading is fresh enough."""
+        return self._drive_by(self._body.control.brake, readings, current, now_ns)
+
+    def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
+        """Turn to the Sun in this cycle, without an attitude; rest if the body cannot."""
+        acquisition = self._body.control.sun_acquisition
+        return (
+            self.rest(now_ns)
+            if acquisition is None
+            else self._drive_by(acquisition, readings, current, now_ns)
+        )
+
+    def _drive_by(
+        self, brake: WindowedLaw, readings: Sequence[ImuReading], current: bool, now_ns: int
+    ) -> Steered:
+        """Command the coils by a law that needs no estimate."""
+        for reading in readings:
+            brake.sample(reading.time_ns, reading.field, reading.rate)
+        text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
+        self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
+        if not current:
+            return self.rest(now_ns)
+        self._body.control.tracker.reset()
+        wanted = brake.command(now_ns)
+        self._drive.send(wanted.currents, lambda: brake.field(now_ns))
+        brake.sent(self._drive.command)
+        return self._steered(SteeringState.BRAKING, now_ns, None, wanted.dipole)
+
+    def rest(self, now_ns: int) -> Steered:
+        """Keep the coils at zero in this cycle."""
+        self._release()
+        return self._steered(SteeringState.OFF, now_ns, None, _NO_DIPOLE)
+
+    def zero(self) -> None:
+        """Command zero current."""
+        self._drive.zero()
+
+    def isolate(self) -> None:
+        """Exclude the coils that have a verdict."""
+        self._drive.isolate()
+
+    def _release(self) -> None:
+        self._drive.zero()
+        self._body.control.tracker.reset()
+
+    def _steered(
+        self,
+        state: SteeringState,
+        now_ns: int,
+        reference: Any | None,
+        dipole: FloatArray,
+        saturated: bool = False,
+    ) -> Steered:
+        """Check the PWM chip, which may switch the coils off; return the currents commanded in the end."""
+        error = self._drive.fault()
+        text = error or "the PWM chip takes commands again"
+        self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)
+        return Steered(state, reference, dipole, self._drive.command, saturated)

@@ -1,0 +1,346 @@
+"""A worker process, and the messages between the control process and its workers.
+
+The runner starts a worker as `python -m flight.loop.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD PARENT CORES`.
+The worker serves one function until its socket closes. The function's module may define `prepare`, which is
+called before the first job, for imports that only the worker needs. The kernel kills the process when its
+parent's thread ends, so no worker outlives its flight.
+
+A message is a value whose large arrays lie in shared memory. A worker trusts the control process and
+unpickles its messages. The worker's answer is read as plain values: it may build dataclasses, enumerations
+and arrays of numbers, and call or import nothing. A worker whose memory is damaged can send a wrong value,
+but never run code in the control process or end it. Answers are not pickled, because numpy's unpickling ends
+the process on some damaged messages.
+
+Plain values are MessagePack, read by msgspec. Numbers, texts, bytes and None are themselves; everything else
+is a list that begins with a tag. Arrays of numbers lie in buffers beside the bytes, which name type and
+shape. Dataclasses, named tuples and enumerations are built only of modules that are loaded, and without a
+call of their own code.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import enum
+import importlib
+import math
+import mmap
+import operator
+import os
+import pickle
+import signal
+import socket
+import struct
+import sys
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.errors import FlightError
+
+Array = npt.NDArray[Any]
+_PLAIN = (bool, int, float, str, bytes, type(None))
+_CONTAINERS: dict[type, str] = {list: "list", tuple: "tuple", set: "set", frozenset: "frozenset"}
+_MAKERS: dict[str, Callable[[Any], Any]] = {name: kind for kind, name in _CONTAINERS.items()}
+_DTYPES = {np.dtype(kind).str for kind in "?bBhHiIlLefdFD"}
+_MOST_DIMENSIONS = 32
+
+
+def encode_values(value: Any) -> tuple[bytes, list[Array]]:
+    """Return the bytes of a value, and its arrays beside them. Raises FlightError for other types."""
+    arrays: list[Array] = []
+    tree = _tree(value, arrays)
+    try:
+        return msgspec.msgpack.encode(tree), arrays
+    except (OverflowError, UnicodeError) as error:
+        raise FlightError(f"no value to be sent: {error}") from error
+
+
+def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
+    """Undo `encode_values`, each array a view of its buffer. Damage raises an exception of any kind."""
+    return _Reader(buffers).made(msgspec.msgpack.decode(data))
+
+
+def _tree(value: Any, arrays: list[Array]) -> Any:
+    """Return plain lists and scalars for a value; its arrays are appended to `arrays`."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind in _CONTAINERS:
+        return [_CONTAINERS[kind], [_tree(item, arrays) for item in value]]
+    if kind is dict:
+        return ["dict", [[_tree(key, arrays), _tree(item, arrays)] for key, item in value.items()]]
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.str in _DTYPES:
+        arrays.append(np.ascontiguousarray(value))
+        return ["array" if isinstance(value, np.ndarray) else "scalar", value.dtype.str, list(value.shape)]
+    return _tree_of_class(value, f"{kind.__module__}:{kind.__qualname__}", arrays)
+
+
+def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
+    if isinstance(value, complex):
+        return ["complex", value.real, value.imag]
+    if isinstance(value, enum.Flag):
+        return ["flag", name, value.value]
+    if isinstance(value, enum.Enum):
+        return ["enum", name, value.name]
+    if (parts := _field_names(type(value))) is None:
+        raise FlightError(f"a {name!r} is no value that a worker may send")
+    return ["fields", name, [_tree(getattr(value, part), arrays) for part in parts]]
+
+
+class _Reader:
+    """Makes the value of a tree, whose arrays take the buffers one by one."""
+
+    def __init__(self, buffers: Sequence[bytearray]) -> None:
+        self._buffers = iter(buffers)
+
+    def made(self, tree: Any) -> Any:
+        if type(tree) in _PLAIN:
+            return tree
+        match tree:
+            case [str(tag), list(items)] if tag in _MAKERS:
+                return _MAKERS[tag](map(self.made, items))
+            case ["dict", list(items)]:
+                return {self.made(key): self.made(item) for key, item in items}
+            case ["fields", str(name), list(items)]:
+                return _built(name, [self.made(item) for item in items])
+        return self._single(tree)
+
+    def _single(self, tree: Any) -> Any:
+        match tree:
+            case ["complex", float(real), float(imaginary)]:
+                return complex(real, imaginary)
+            case ["array", str(dtype), list(shape)]:
+                return _array(dtype, shape, next(self._buffers))
+            case ["scalar", str(dtype), []]:
+                return _array(dtype, [], next(self._buffers))[()]
+            case ["flag" | "enum" as tag, str(name), member]:
+                return _member(name, tag, member)
+        raise FlightError(f"{str(tree)[:80]!r} is no value")
+
+
+def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
+    """Return an array of numbers that fills its buffer, and may be written to."""
+    if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
+        raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
+    if not all(type(length) is int and length >= 0 for length in shape):
+        raise FlightError("an array's shape is no list of lengths")
+    kind = np.dtype(dtype)
+    if math.prod(shape) * kind.itemsize != len(buffer):
+        raise FlightError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
+    if kind.kind == "b" and buffer.translate(None, b"\0\1"):
+        raise FlightError("a truth value is neither 0 nor 1")
+    return np.frombuffer(buffer, kind).reshape(shape) if buffer else np.zeros(shape, kind)
+
+
+def _built(name: str, items: list[Any]) -> Any:
+    kind: Any = _class(name)
+    parts = _field_names(kind)
+    if parts is None or len(parts) != len(items):
+        raise FlightError(f"{name!r} is no class of {len(items)} values")
+    if issubclass(kind, tuple):
+        return tuple.__new__(kind, items)
+    value = object.__new__(kind)
+    for part, item in zip(parts, items, strict=True):
+        object.__setattr__(value, part, item)
+    return value
+
+
+def _member(name: str, tag: str, member: Any) -> Any:
+    kind = _class(name)
+    if not issubclass(kind, enum.Enum) or issubclass(kind, enum.Flag) != (tag == "flag"):
+        raise FlightError(f"{name!r} is no {tag}")
+    if tag == "flag":
+        return kind(operator.index(member))
+    return kind[member]
+
+
+def _class(name: str) -> type:
+    module, _, qualified = name.partition(":")
+    found = getattr(sys.modules.get(module), qualified, None)
+    if not isinstance(found, type):
+        raise FlightError(f"{name!r} is no class that the control process has")
+    return found
+
+
+def _field_names(kind: Any) -> tuple[str, ...] | None:
+    """Return the field names of a dataclass or a named tuple; None for any other class."""
+    if dataclasses.is_dataclass(kind):
+        return tuple(field.name for field in dataclasses.fields(kind))
+    return kind._fields if issubclass(kind, tuple) and hasattr(kind, "_fields") else None
+
+
+SLAB_BYTES = 64 * 1024 * 1024
+"""Shared memory for a job's arrays: only address space until used."""
+LONGEST_BYTES = 16 * 1024 * 1024
+"""A message without its arrays that claims to be longer is damaged."""
+
+_HEADER = struct.Struct("<QQI")
+"""Lengths of the arrays' sizes and of the body, and the CRC-32 of both."""
+
+
+def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
+    """Pickle a value: its large buffers go into the slab, the rest is returned with its length in front.
+
+    Raises FlightError where the slab is too small.
+    """
+    buffers: list[pickle.PickleBuffer] = []
+    body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
+    return _framed(body, [buffer.raw() for buffer in buffers], slab)
+
+
+def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
+    """Undo `pack_trusted` of a process that is trusted, copying the buffers out of the slab."""
+    body, buffers = _parts(message, slab)
+    return pickle.loads(body, buffers=buffers)
+
+
+def pack_values(value: Any, slab: mmap.mmap) -> bytes:
+    """Pack a value for a reader that does not trust the sender. Raises FlightError for other types."""
+    body, arrays = encode_values(value)
+    return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
+
+
+def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
+    """Undo `pack_values` of a worker. Raises FlightError for damage."""
+    try:
+        return decode_values(*_parts(message, slab))
+    except FlightError:
+        raise
+    except Exception as error:  # a damaged stream fails in any way
+        raise FlightError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
+
+
+def message_length(data: bytes | bytearray) -> int | None:
+    """Return the length of the message that `data` begins with, None before the header is complete.
+
+    Raises FlightError for a length that no message has.
+    """
+    if len(data) < _HEADER.size:
+        return None
+    head_length, body_length, _ = _HEADER.unpack_from(data)
+    if (length := _HEADER.size + int(head_length) + int(body_length)) > LONGEST_BYTES:
+        raise FlightError(f"a message of {length} bytes is damaged")
+    return length
+
+
+def _framed(body: bytes, views: Sequence[memoryview], slab: mmap.mmap) -> bytes:
+    if sum(view.nbytes for view in views) > len(slab):
+        raise FlightError(f"a job's arrays exceed the {len(slab)} bytes that a worker's memory holds")
+    offset = 0
+    for view in views:
+        slab[offset : offset + view.nbytes] = view
+        offset += view.nbytes
+    head = struct.pack(f"<{len(views)}Q", *(view.nbytes for view in views))
+    return _HEADER.pack(len(head), len(body), zlib.crc32(body, zlib.crc32(head))) + head + body
+
+
+def _parts(message: bytes, slab: mmap.mmap) -> tuple[bytes, list[bytearray]]:
+    head_length, body_length, crc = _HEADER.unpack_from(message)
+    head_end = _HEADER.size + head_length
+    if zlib.crc32(message[_HEADER.size : head_end + body_length]) != crc:
+        raise FlightError("a message with a wrong checksum is damaged")
+    buffers = []
+    offset = 0
+    with memoryview(slab) as view:
+        for (size,) in struct.iter_unpack("<Q", message[_HEADER.size : head_end]):
+            buffers.append(bytearray(view[offset : offset + size]))
+            offset += size
+    return message[head_end : head_end + body_length], buffers
+
+
+_SELDOM = {"char", "core", "ctypeslib", "f2py", "ma", "polynomial", "rec", "strings", "test", "testing"}
+_PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
+    """Announce readiness, then answer each message with (outcome, value, error, execution time in ns)."""
+    line.sendall(pack_values(None, slab))
+    received = bytearray()
+    while chunk := line.recv(1 << 20):
+        received += chunk
+        while (length := message_length(received)) is not None and len(received) >= length:
+            argument = unpack_trusted(bytes(received[:length]), slab)
+            del received[:length]
+            line.sendall(_answer(function, argument, slab))
+            del argument
+            # After the result was sent, so that nothing waits for this.
+            give_back()
+
+
+def _answer(function: Any, argument: Any, slab: mmap.mmap) -> bytes:
+    """Return the message of a job's result, or of its failure where the result cannot be sent."""
+    outcome = _run(function, argument)
+    try:
+        return pack_values(outcome, slab)
+    except FlightError as error:
+        return pack_values(("failed", None, str(error), outcome[3]), slab)
+
+
+def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
+    begun = time.perf_counter_ns()
+    try:
+        value = function(argument)
+    except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
+        return "failed", None, f"{type(error).__name__}: {error}", time.perf_counter_ns() - begun
+    return "done", value, "", time.perf_counter_ns() - begun
+
+
+def _nothing() -> None:
+    """No-op."""
+
+
+def end_with(parent: int) -> None:
+    """Have the kernel kill this process when its parent ends; end now where the parent has ended already."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(0)
+
+
+def give_back() -> None:
+    """Return the heap's free memory to the kernel: tens of MB after a frame, in about 2 ms."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
+
+
+def lean_numpy() -> None:
+    """Keep scipy from importing parts of numpy that no job uses: 11 MiB and 0.2 s of each process.
+
+    scipy copies all that numpy lists, and so imports its masked arrays, its test support and its reader of
+    Fortran (scipy/_lib/array_api_compat). Call before scipy's import; the parts are no longer listed, but
+    still there for a module that names them. With another numpy this has no effect.
+    """
+    np.__all__ = [name for name in np.__all__ if name not in _SELDOM]
+    lazy = getattr(np, "__numpy_submodules__", None)
+    if isinstance(lazy, set):
+        lazy -= _SELDOM
+
+
+def main(arguments: list[str]) -> None:
+    """Import the function, then serve."""
+    function_name, socket_fd, memory_fd, parent, cores = arguments
+    end_with(int(parent))
+    module, _, name = function_name.partition(":")
+    os.nice(5)  # the control loop comes first
+    if cores:
+        os.sched_setaffinity(0, map(int, cores.split(",")))
+    lean_numpy()
+    home = importlib.import_module(module)
+    getattr(home, "prepare", _nothing)()
+    function = getattr(home, name)
+    line = socket.socket(fileno=int(socket_fd))
+    slab = mmap.mmap(int(memory_fd), SLAB_BYTES)
+    try:
+        serve(function, line, slab)
+    except ConnectionError:
+        return  # the control process ended
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,181 @@
+"""The gain of a coil, estimated across stalls of the loop, and on a free body in its coils' own field."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
+from flight.loop.coil_response import CoilResponse, ResponseSettings
+from knightcube.astro.arrays import FloatArray
+
+FIELD = np.array([0.0, 0.0, 60e-6])
+INERTIA, DIPOLE = 0.02, 60.0
+TICK_NS = 25_000_000
+STAND_EVERY = 176
+"""Cycles from one stall of the loop to the next: 4.4 s."""
+STANDS = 36
+STALE = 12
+"""Cycles after which the coil driver, or the guardian, zeroes a command."""
+
+
+def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
+    """Drive coil x with a loop that stalls now and then; its samples arrive in a burst after each stall.
+
+    Meanwhile the driver zeroes the coils, and reports when; or a guardian does without a report, unless the
+    loop is `informed` that the currents of that time are unknown.
+    Returns the trusted gains of coil x, and how often an axis was found reversed.
+    """
+    settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
+    response, noise = CoilResponse(settings), np.random.default_rng(3)
+    believed: list[float] = []
+    rate, wrong, carried = 0.0, 0, 0.0
+    waiting: list[tuple[int, float]] = []
+    for cycle in range(cycles):
+        now_ns = (cycle + 1) * TICK_NS
+        rate += -DIPOLE * carried * FIELD[2] / INERTIA * TICK_NS * 1e-9
+        waiting.append((now_ns, rate + 1e-4 * noise.standard_normal()))
+        stood = cycle % STAND_EVERY if cycle > STAND_EVERY else STAND_EVERY
+        if stood < STANDS:
+            carried = carried if stood < STALE else 0.0
+            continue
+        if stood == STANDS and driver_lets_go:
+            response.commanded(now_ns - (STANDS - STALE) * TICK_NS, (0.0, 0.0, 0.0))
+        elif stood == STANDS and informed:
+            response.interrupted(now_ns)
+        for time_ns, seen in waiting:
+            if response.observe_motion(time_ns, np.array([0.0, seen, 0.0]), FIELD):
+                wrong += len(response.reversed_axes())
+                if response.sigma[0] < settings.sure:
+                    believed.append(float(response.gain[0]))
+        waiting.clear()
+        carried = 0.05 * math.sin(2.0 * math.pi * cycle / 160) - 0.3 * rate
+        response.commanded(now_ns, (carried, 0.0, 0.0))
+    return believed, wrong
+
+
+def test_a_sound_coil_is_not_taken_for_a_broken_one_where_a_guardian_held_it_at_zero() -> None:
+    gains, wrong = _fly(driver_lets_go=False, informed=True)
+    assert wrong == 0
+    assert len(gains) > 20
+    assert np.abs(np.array(gains) - 1.0).max() < 0.2
+    misled, _ = _fly(driver_lets_go=False, informed=False)
+    assert np.abs(np.array(misled) - 1.0).max() > 0.3, "samples of a time in which others held it do mislead"
+
+
+def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() -> None:
+    gains, wrong = _fly(driver_lets_go=True, informed=False)
+    assert wrong == 0
+    assert len(gains) > 100
+    assert np.abs(np.array(gains) - 1.0).max() < 0.1
+
+
+class Orbiting:
+    """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
+
+    def __init__(self, signs: FloatArray, speed: float = 1.0, tumble_rate: float = math.inf) -> None:
+        self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
+        settings = ResponseSettings(
+            INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, model_error=2e-4, torsion=1e-6, damping=1e-4,
+            settle_ns=100_000_000,
+        )  # fmt: skip
+        self.response = CoilResponse(settings)
+        slow = replace(settings, bin_samples=80, bins=20, model_error=3e-5)
+        self.watch = CoilMonitor(
+            CoilMonitorSettings((0.148, 0.148, 0.148), slow=slow, tumble_rate=tumble_rate)
+        )
+        self._noise = np.random.default_rng(4)
+        self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
+
+    def fly(self, seconds: float, weak: bool = False) -> None:
+        """Fly with coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
+        for cycle in range(round(40 * seconds)):
+            now_ns, within, time = cycle * TICK_NS, cycle % 40, cycle / 40
+            wanted = 0.14 * np.sign([math.sin(0.7 * time), math.cos(0.5 * time), 1.0])
+            if weak:
+                wanted = 0.014 * np.sin([0.2 * time, 0.13 * time + 1.0, 0.17 * time + 2.0])
+            currents = wanted if within >= 8 else np.zeros(3)
+            self.response.commanded(now_ns, tuple(currents.tolist()))
+            currents = np.where(self.watch.resting, 0.0, currents)
+            self.watch.commanded(now_ns, currents)
+            for _ in range(5):
+                torque = np.cross(0.65 * self.signs * currents, self._field)
+                self.rate = self.rate + 5e-3 * np.linalg.solve(
+                    INERTIAS, torque - np.cross(self.rate, INERTIAS @ self.rate)
+                )
+                self._field = self._field - 5e-3 * np.cross(self.rate, self._field)
+            seen = self._field + 5e-4 * self.signs * currents
+            noise = 2.8e-4 * self._noise.standard_normal(3)
+            self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
+            self.watch.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
+
+
+INERTIAS = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_magnetometer(axis: int) -> None:
+    sound = Orbiting(np.ones(3))
+    sound.fly(60.0)
+    assert sound.response.reversed_axes() == []
+    assert np.abs(sound.response.gain - 1.0).max() < 0.3
+    signs = np.ones(3)
+    signs[axis] = -1.0
+    broken = Orbiting(signs)
+    broken.fly(60.0)
+    assert broken.response.reversed_axes() == [axis]
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_coil_that_makes_no_torque_is_suspected_at_currents_too_small_for_the_monitor(
+    axis: int, gain: float
+) -> None:
+    signs = np.ones(3)
+    signs[axis] = gain
+    broken = Orbiting(signs, speed=0.02)
+    broken.fly(110.0, weak=True)
+    told = broken.watch.suspicion or broken.watch.verdicts[0].text
+    assert told.startswith(f"coil {'xyz'[axis]}")
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
+    """In the second case rather the gyro or the field is false."""
+    body = Orbiting(np.full(3, gain), speed=0.02)
+    body.fly(120.0, weak=True)
+    assert body.watch.suspicion == ""
+    assert body.watch.verdicts == ()
+
+
+def test_a_gain_that_no_coil_can_have_gives_no_verdict() -> None:
+    body = Orbiting(np.array([-2.5, 1.0, 1.0]))
+    body.fly(60.0)
+    assert body.response.gain[0] < -1.5
+    assert body.response.reversed_axes() == []
+    assert body.response.feeble_axes() == []
+    assert not any(body.response.is_healthy(axis) for axis in range(3)), "the model is wrong for all axes"
+
+
+def test_a_coil_that_looks_reversed_in_a_tumble_rests_and_is_judged_when_the_body_is_slow() -> None:
+    body = Orbiting(np.array([-1.0, 1.0, 1.0]), tumble_rate=0.01)
+    body.fly(60.0)
+    assert body.watch.available.all()
+    assert body.watch.resting.tolist() == [True, False, False]
+    assert body.watch.suspicion.startswith("coil x")
+    assert not body.watch.doubts_currents, "a resting coil carries no current"
+    body.watch.tumble_rate = 10.0  # as if the body were slow
+    body.fly(1.0)
+    assert not body.watch.resting.any()
+    body.fly(60.0)
+    assert [verdict.axis for verdict in body.watch.verdicts] == [0]
+
+
+def test_a_rest_ends_after_ten_minutes_however_fast_the_body_is() -> None:
+    body = Orbiting(np.array([-1.0, 1.0, 1.0]), tumble_rate=0.01)
+    body.fly(60.0)
+    body.watch.observe_motion(700_000_000_000, np.full(3, 0.1), np.full(3, 3e-5))
+    assert not body.watch.resting.any()

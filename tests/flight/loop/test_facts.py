@@ -1,0 +1,212 @@
+"""Facts count after N updates in a row, latch, reset in modes without watch, and report once.
+
+Liveness, rate and validity of a stream are checked separately; a stale stream is never good.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from flight.link import events
+from flight.link.events import EventKind
+from flight.link.modes import Mode
+from flight.loop import facts
+from flight.loop.facts import (
+    FACTS,
+    IMU_POOR,
+    POWER_POOR,
+    EventLog,
+    Facts,
+    StreamLimits,
+    Streams,
+    StreamState,
+    StreamWatch,
+    check,
+    streams_of,
+)
+from flight.loop.modes import SAFING_REACTIONS, Trigger, modes_moved_by
+from knightcube.errors import FlightError
+from tests.support.flights import demo_config
+
+
+class EventRecord:
+    """A sink that records events."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.log = EventLog(lambda kind, *_: self.names.append(kind.name), throttle_ns=0)
+        self.facts = Facts(self.log)
+
+
+def state(record: EventRecord, fact: facts.Fact, *statements: bool | None) -> None:
+    for holds in statements:
+        record.facts.update(fact, holds, 0, "text")
+
+
+def test_the_table_that_flies_is_sound() -> None:
+    check(FACTS, modes_moved_by)
+
+
+def test_a_fact_counts_after_its_number_of_statements_in_a_row_and_not_before() -> None:
+    record = EventRecord()
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7, False, *[True] * 7)
+    assert not record.facts.holds(facts.TUMBLING)
+    state(record, facts.TUMBLING, True)
+    assert record.facts.holds(facts.TUMBLING)
+    assert record.names == ["tumbling"]
+
+
+def test_a_fact_ends_after_its_number_of_statements_with_one_event_each_way() -> None:
+    record = EventRecord()
+    state(record, facts.IMU_POOR, *[True] * 9)
+    state(record, facts.IMU_POOR, *[False] * 7, True, *[False] * 7)
+    assert record.facts.holds(facts.IMU_POOR)
+    state(record, facts.IMU_POOR, False)
+    assert record.names == ["stream-poor", "stream-good"]
+
+
+def test_what_cannot_be_known_neither_counts_nor_mends() -> None:
+    record = EventRecord()
+    state(record, facts.DISK_LOW, True, None, True)
+    assert record.facts.holds(facts.DISK_LOW)
+    state(record, facts.DISK_LOW, False, None, None, False)
+    assert not record.facts.holds(facts.DISK_LOW)
+
+
+def test_a_latched_fact_stays_until_it_is_cleared_by_the_name_of_its_event() -> None:
+    record = EventRecord()
+    state(record, facts.TOO_HOT, True, True, *[False] * 20)
+    assert record.facts.held() == (facts.TOO_HOT,)
+    assert not record.facts.clear("hot")
+    assert record.facts.clear("too-hot")
+    assert record.facts.held() == ()
+    assert not record.facts.clear("too-hot"), "there is nothing left to clear"
+
+
+def test_a_fact_that_is_not_latched_is_not_to_be_cleared_away() -> None:
+    record = EventRecord()
+    state(record, facts.IMU_SILENT, True)
+    assert not record.facts.clear("imu-silent")
+    assert record.facts.holds(facts.IMU_SILENT)
+
+
+def test_in_a_mode_that_does_not_watch_it_a_fact_does_not_count_and_restarts_after() -> None:
+    record = EventRecord()
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7)
+    record.facts.enter(Mode.SAFE)
+    state(record, facts.TUMBLING, *[True] * 50)
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7)
+    assert record.names == []
+    state(record, facts.TUMBLING, True)
+    assert record.names == ["tumbling"]
+
+
+def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_it_back() -> None:
+    reacted: list[tuple[EventKind, str]] = []
+    record: list[str] = []
+    log = EventLog(lambda kind, *_: record.append(kind.name))
+    log.react_by(lambda kind, _, text: reacted.append((kind, text)))
+    for text in ("a", "b"):
+        log.report(events.CONTROL_LOST, 0, text)
+        log.report(events.CYCLE_SLIP, 0, text)
+    assert record == ["control-lost", "cycle-slip"]
+    assert reacted == [(events.CONTROL_LOST, "a"), (events.CONTROL_LOST, "b")]
+
+
+@pytest.mark.parametrize(
+    ("broken", "problem"),
+    [
+        ((facts.BLIND, facts.BLIND), "stands twice"),
+        ((replace(facts.BLIND, after=0),), "at least 1"),
+        ((replace(facts.BLIND, modes=frozenset({Mode.SAFE})),), "does its reaction safe do anything"),
+    ],
+)
+def test_a_table_that_cannot_work_is_refused(broken: tuple[facts.Fact, ...], problem: str) -> None:
+    with pytest.raises(FlightError, match=problem):
+        check(broken, modes_moved_by)
+
+
+def test_codes_and_names_of_events_are_each_used_once() -> None:
+    assert len({kind.code for kind in events.EVENTS}) == len(events.EVENTS)
+    assert len({kind.name for kind in events.EVENTS}) == len(events.EVENTS)
+    assert len(FACTS) <= 64, "they are bits of one field in the health packet"
+
+
+def test_every_safing_event_has_a_trigger() -> None:
+    assert {Trigger.REACT_SAFE, Trigger.REACT_HOLD, Trigger.REACT_DETUMBLE} == set(SAFING_REACTIONS.values())
+
+
+ROW = StreamLimits("imu", 40.0, 0.1, IMU_POOR, 0.0, 1.0)
+PERIOD = 25_000_000
+
+
+def fed(
+    seconds: float, every: int = 1, value: float = 0.5, row: StreamLimits = ROW
+) -> tuple[StreamWatch, int]:
+    """Return a watch that got every n-th sample for some seconds, and the time after them."""
+    watch = StreamWatch(row, 0)
+    count = round(seconds * 40)
+    for k in range(0, count, every):
+        watch.note(k * PERIOD, value)
+    return watch, (count - 1) * PERIOD
+
+
+def test_before_the_first_reading_it_never_came() -> None:
+    assert StreamWatch(ROW, 0).state(0) is StreamState.NEVER
+    assert StreamWatch(ROW, 0).age(0) == math.inf
+
+
+def test_it_is_good_while_it_comes_at_its_rate_and_stale_once_older_than_its_limit() -> None:
+    watch, now = fed(3.0)
+    assert watch.state(now) is StreamState.GOOD
+    assert watch.rate(now) == pytest.approx(40.0, abs=0.5)
+    assert watch.state(now + 100_000_000) is StreamState.GOOD
+    assert watch.state(now + 100_000_001) is StreamState.STALE
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, math.nan, math.inf])
+def test_a_value_out_of_its_range_is_invalid_however_fresh(value: float) -> None:
+    watch, now = fed(3.0, value=value)
+    assert watch.state(now) is StreamState.INVALID
+
+
+def test_half_its_rate_is_slow_once_a_whole_window_has_been_seen() -> None:
+    early, now = fed(1.5, every=2)
+    assert early.state(now) is StreamState.GOOD, "not known yet"
+    late, now = fed(4.0, every=2)
+    assert late.state(now) is StreamState.SLOW
+
+
+def test_after_a_silence_the_rate_is_counted_again() -> None:
+    watch, now = fed(4.0)
+    for k in range(40):
+        watch.note(now + 5_000_000_000 + k * PERIOD, 0.5)
+    assert watch.state(now + 6_000_000_000) is StreamState.GOOD
+
+
+def test_what_is_not_fitted_takes_no_notes() -> None:
+    streams = Streams((ROW,))
+    streams.note("camera", 1)
+    assert streams.state("camera", 2) is StreamState.NOT_FITTED
+    assert streams.state("imu", 2) is StreamState.NEVER
+
+
+def test_silence_that_another_alarm_reports_is_not_reported_twice_and_any_other_is() -> None:
+    quiet = StreamLimits("power", 4.0, 3.0, POWER_POOR, has_silence_alarm=False)
+    streams = Streams((ROW, quiet))
+    for name in ("imu", "power"):
+        streams.note(name, 0, 0.5)
+    imu, power = streams.look(10_000_000_000)
+    assert imu[1:] == (None, "")
+    assert power[1:] == (True, "power: stale, 10.00 s old, 3 s allowed")
+
+
+def test_the_streams_of_a_configuration_are_those_of_its_devices() -> None:
+    assert [row.name for row in streams_of(demo_config(10.0))] == ["imu", "field", "coils", "power", "camera"]
+    assert "camera" not in [row.name for row in streams_of(demo_config(10.0, camera=False))]

@@ -1,0 +1,300 @@
+"""The bench of the executive: its conclusions from known lateness, and a few seconds of a flight.
+
+What the flight is judged by does not depend on the load of the machine: the kernel says for how long the
+control thread had no processor. Its lateness is judged only where the machine was calm.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import sys
+import time
+from array import array
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from flight.app import flight as opening
+from flight.app.composition import workers
+from flight.loop.executive import Worker
+from flight.loop.worker_processes import ProcessRunner
+from flight.schema import reader as configuration
+from hal.buses.clock import SystemClock
+from tests.hal.guardian.live_flight import ROOT
+from tests.studies.bench import bare_loop, busy_jobs
+from tests.studies.bench.executive import Load, fly
+from tests.support import process_watch
+from tests.support.executive_figures import (
+    ASKED,
+    PERIOD_NS,
+    SLOPE_SPAN,
+    judged_slope,
+    misses,
+    table,
+    waits,
+)
+from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
+from tests.support.process_watch import MIB, Look
+
+FIRST = 1000
+CALM = 0.05
+"""Share of the time that the control thread is ready without a processor; beyond it the machine is busy."""
+_IN_TIME = np.full(12, 100_000)
+_kept: list[npt.NDArray[np.float64]] = []
+
+
+def _grid(late_ns: npt.ArrayLike) -> Grid:
+    """Return a loop with the given lateness at each slot; lateness beyond the next slot skips that slot."""
+    late = np.asarray(late_ns, dtype=np.int64)
+    starts = np.maximum.accumulate((FIRST + np.arange(len(late))) * PERIOD_NS + late)
+    return on_grid(np.unique(starts), PERIOD_NS, FIRST, len(late))
+
+
+def test_a_stall_of_two_periods_loses_the_slots_that_the_loop_was_half_a_period_late_for() -> None:
+    stalled = _IN_TIME.copy()
+    stalled[4] = 2 * PERIOD_NS + 1_000_000
+    grid = _grid(stalled)
+    assert np.flatnonzero(grid.lost).tolist() == [4, 5]
+    assert grid.lateness[4:7] == pytest.approx([0.051, 0.026, 0.001], abs=1e-12)
+    assert grid.figures()["max"] == pytest.approx(0.051)
+    assert grid.figures()["p50"] == pytest.approx(1e-4)
+
+
+def test_slots_after_the_end_of_a_loop_are_lost() -> None:
+    starts = (FIRST + np.arange(5)) * PERIOD_NS
+    assert np.flatnonzero(on_grid(starts, PERIOD_NS, FIRST, 7).lost).tolist() == [5, 6]
+
+
+@pytest.mark.parametrize(("machine_at", "beyond"), [(6, 0), (5, 0), (4, 1), (None, 1)])
+def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neighbour(
+    machine_at: int | None, beyond: int
+) -> None:
+    flight, machine = _IN_TIME.copy(), _IN_TIME.copy()
+    flight[6] = 15_000_000
+    if machine_at is not None:
+        machine[machine_at] = 14_000_000
+    lost_beyond = np.count_nonzero(_grid(flight).lost & ~stalled(_grid(machine)))
+    assert lost_beyond == beyond
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "taken_ms", "found"),
+    [
+        (15, 20, True),
+        (15, 10, False),
+        # Lateness of its own is not excused by the small load that is always present.
+        (90, 40, False),
+        (90, 50, True),
+    ],
+)
+def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
+    late_ms: int, taken_ms: int, found: bool
+) -> None:
+    late = _IN_TIME.copy()
+    late[6] = late_ms * 1_000_000
+    noted_ns = (FIRST + np.arange(-2, 16)) * PERIOD_NS + 100_000
+    stolen_ns = 7_000_000_000 + np.where(np.arange(-2, 16) >= 7, taken_ms * 1_000_000, 0)
+    grid = _grid(late)
+    assert bool(robbed(grid, noted_ns, stolen_ns)[6]) is found
+    assert not robbed(grid, noted_ns, stolen_ns)[[0, 1, 2, 3, 4, 11]].any()
+
+
+def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
+    """Half of the samples hold a job of 50 MiB; the 95 % interval covers the truth for at least 16 seeds."""
+    seconds = np.arange(0.0, 600.0, 0.5)
+    held = {0.0: 0, 5.0: 0}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        level = 150.0 + rng.normal(0.0, 0.2, len(seconds)) + 50.0 * (rng.random(len(seconds)) < 0.5)
+        for leak in held:
+            _, low, high = slope_per_hour(seconds, level + leak * seconds / 3600.0)
+            held[leak] += low <= leak <= high
+            assert high - low < 4.0
+    assert min(held.values()) >= 16
+
+
+def test_a_flight_too_short_for_a_slope_has_none() -> None:
+    assert np.isnan(slope_per_hour(np.arange(20.0), np.arange(20.0))).all()
+
+
+def test_the_bare_loop_wakes_at_its_slots_and_never_before() -> None:
+    noted: list[tuple[int, int]] = []
+    stopped: list[int] = []
+
+    class Ending(array):  # type: ignore[type-arg]
+        def extend(self, row: tuple[int, int]) -> None:  # type: ignore[override]
+            noted.append(row)
+            if len(noted) == 20:
+                stopped.append(1)
+
+    begun = time.monotonic_ns()
+    bare_loop.loop(5_000_000, Ending("q"), stopped)
+    assert len(noted) == 20
+    wakes, stolen_ns = np.array(noted).T
+    slots = wakes // 5_000_000
+    assert np.diff(slots).min() >= 1
+    assert slots[0] > begun // 5_000_000
+    assert np.median(wakes % 5_000_000) < 2_500_000
+    # At most all cores can be used.
+    assert 0 <= stolen_ns[-1] - stolen_ns[0] <= (os.cpu_count() or 1) * (wakes[-1] - wakes[0]) + 20_000_000
+
+
+def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> None:
+    """The nearest of three attempts counts, as shared pages change owners when other processes end."""
+    me = {"me": os.getpid()}
+    process_watch.unshared(me)  # includes the memory that sampling itself needs
+    proportional, private = [], []
+    for _ in range(3):
+        before, alone = process_watch.look(me), process_watch.unshared(me)
+        # Mapped, not from the heap, where memory freed by earlier tests would be reused.
+        held = np.frombuffer(mmap.mmap(-1, 32 << 20))
+        spent = time.process_time()
+        while time.process_time() - spent < 0.1:
+            held += 1.0
+        after = process_watch.look(me)
+        proportional.append(abs(after.memory["me"] - before.memory["me"] - (32 << 20)))
+        private.append(abs(process_watch.unshared(me) - alone - (32 << 20)))
+        assert 0.05 < after.processor["me"] - before.processor["me"] < 1.0
+        assert alone >= before.memory["me"] - (1 << 20)
+        del held
+    assert min(proportional) < 6 << 20
+    assert min(private) < 6 << 20
+
+
+def test_a_slope_is_given_from_minutes_on_and_not_before() -> None:
+    seconds = np.arange(0.0, SLOPE_SPAN + 1.0, 0.5)
+    levels = 100.0 + 12.0 * seconds / 3600.0
+    assert judged_slope(seconds.tolist(), levels.tolist()) == pytest.approx((12.0, 12.0, 12.0))
+    assert np.isnan(judged_slope(seconds[:-4].tolist(), levels[:-4].tolist())).all()
+
+
+def test_a_cycle_that_waits_is_blocked_and_one_without_a_processor_is_queued() -> None:
+    """Cycles of 20 ms for 4 s, of which 2 ms are work: the rest is a worker's time, or the machine's."""
+    starts, execution = np.arange(0.0, 4.0, 0.025), np.full(160, 0.02)
+
+    def found(on: float, queued: float) -> dict[str, Any]:
+        looks = [Look(t, {}, {}, {}, {"control": (t * on, t * queued)}) for t in (0.0, 4.0)]
+        return waits(looks, starts, execution)
+
+    assert found(0.08, 0.0) == pytest.approx({"queued": 0.0, "blocked": 0.72}, abs=0.01)
+    assert found(0.08, 0.8) == pytest.approx({"queued": 0.8, "blocked": 0.0}, abs=0.01)
+
+
+def fill_and_free(_: Any) -> tuple[int, float]:
+    """Allocate 48 MiB in pieces and free all but the last: the heap cannot shrink, as after a frame.
+
+    Returns this process and the bytes that it holds then.
+    """
+    pieces = [np.ones(8192) for _ in range(768)]
+    _kept.append(pieces.pop())
+    del pieces
+    return os.getpid(), process_watch.look({"me": os.getpid()}).memory["me"]
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="this libc has no malloc_trim")
+def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
+    with closing(
+        ProcessRunner(SystemClock(), [Worker("filler", fill_and_free, 0, 20_000_000_000)])
+    ) as runner:
+        deadline = time.monotonic() + 20.0
+        assert runner.submit("filler", None)
+        while not (results := runner.collect()) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        process, held = results[0].value
+        rest = held
+        while rest > held - 40 * MIB and time.monotonic() < deadline:
+            time.sleep(0.01)
+            rest = process_watch.look({"filler": process}).memory["filler"]
+    assert rest <= held - 40 * MIB
+
+
+def heavy_parts(_: Any) -> list[str]:
+    """Import scipy and return which parts of numpy it brought that no job uses."""
+    import scipy.linalg  # noqa: F401, PLC0415 - in the worker's process
+
+    return [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]
+
+
+def test_a_worker_holds_no_parts_of_numpy_that_no_job_uses() -> None:
+    with closing(ProcessRunner(SystemClock(), [Worker("lean", heavy_parts, 0, 20_000_000_000)])) as runner:
+        deadline = time.monotonic() + 20.0
+        assert runner.submit("lean", None)
+        while not (results := runner.collect()) and time.monotonic() < deadline:
+            time.sleep(0.005)
+    assert results[0].value is not None
+    assert list(results[0].value) == []
+
+
+runs: list[Any] = []
+
+
+def run(job: Any) -> int:
+    """Note a job: this module stands for a worker's."""
+    runs.append(job)
+    time.sleep(0.001)
+    return len(runs)
+
+
+def test_a_busy_worker_does_its_last_job_again_until_the_next_one_comes() -> None:
+    runs.clear()
+    again = busy_jobs.Again()
+    assert again(__name__, "first") == 1
+    deadline = time.monotonic() + 20.0
+    while runs.count("first") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again(__name__, "second")
+    while runs[-1] != "second" and time.monotonic() < deadline:
+        time.sleep(0.005)
+    begun = runs.index("second")
+    while runs.count("second") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again.rest()
+    assert begun >= 3
+    assert set(runs[begun:]) == {"second"}
+    assert runs.count("second") >= 3
+
+
+@pytest.mark.parametrize("name", ["orbit.yaml", "step_demo.yaml"])
+def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.app.flight.workers", workers)  # restores it at the end
+    busy_jobs.keep_busy()
+    config = configuration.load(ROOT / "config" / name)
+    made, plain = opening.workers(config), workers(config)  # type: ignore[attr-defined]  # one of its imports
+    assert [worker.name for worker in made] == [worker.name for worker in plain]
+    assert len(made) >= 2
+    for busy, worker in zip(made, plain, strict=True):
+        assert busy.function is busy_jobs.BUSY[worker.function.__module__]
+
+
+@pytest.mark.slow
+def test_four_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tmp_path: Path) -> None:
+    flown = fly(tmp_path, Load(4.0, camera_period=1.0, replan_period=0.25, warm_up=0.0), fifo=False)
+    figures = flown.figures
+    assert figures["slots"] >= 130
+    assert figures["slips"] == pytest.approx(figures["slips_computed"], abs=1)
+    # A late cycle is never followed by a burst, and none waits for a worker, however busy the machine is.
+    assert figures["closest_s"] >= 0.499e-9 * PERIOD_NS
+    assert figures["blocked"] < 0.1
+    assert figures["processor_control"] < 0.8
+    assert {"control", "guardian", "planner", "vision"} == figures["memory_mib"].keys()
+    assert 40.0 < figures["memory_median_mib"] < 300.0
+    assert figures["memory_alone_max_mib"] >= figures["memory_max_mib"]
+    assert 0.0 < figures["ready_s"] < figures["first_command_s"]
+    if figures["queued"] < CALM:
+        assert figures["jobs"]["planner"]["done"] >= 3
+        assert figures["lost_beyond_machine"] < 0.4 * figures["slots"]
+        assert figures["lateness_s"]["p50"] < 0.5e-9 * PERIOD_NS
+        assert figures["execution_s"]["p50"] < 1e-9 * PERIOD_NS
+        assert figures["first_command_s"] < 30.0
+    # The same flight with half a core more, and with one more lost cycle, would fail.
+    assert "processor_control" in misses(figures | {"processor_control": 0.36})
+    assert "lost_beyond_machine" in misses(figures | {"lost_beyond_machine": 1})
+    assert "memory_slope_mib_per_hour" in misses(figures | {"memory_slope_interval": (1.5, 3.0)})
+    assert not misses(figures | ASKED | {"memory_slope_interval": (-3.0, 1.5)})
+    assert "MISSED" in table(figures | {"lost_beyond_machine": 1}, "slice")

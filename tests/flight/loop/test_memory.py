@@ -1,0 +1,110 @@
+"""Memory settings of a process, each tested in a process of its own."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+
+import pytest
+
+_LIGHT = """
+import sys
+import flight.app.flight, flight.app.cli.run, flight.link.commands.channel
+import flight.bodies.orbit.body, flight.bodies.testbed.body
+import sim_hal.faults.host, sim_hal.serving.remote
+sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(".")[0] == "scipy")))
+"""
+_WORKING = """
+import sys
+from knightcube.vision import frame_job
+before = "knightcube.vision.streaks.estimate" in sys.modules
+frame_job.prepare()
+sys.stdout.write(f"{before} {'knightcube.vision.streaks.estimate' in sys.modules}")
+"""
+_WORKERS = """
+import sys
+from flight.loop.worker import lean_numpy
+if sys.argv[1] == "lean":
+    lean_numpy()
+import numpy as np, scipy.ndimage, scipy.linalg, scipy.sparse.csgraph, scipy.special
+held = [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]
+assert scipy.ndimage.label(np.ones(3))[1] == 1 and np.ma.ones(3).sum() == 3.0
+sys.stdout.write(" ".join(held))
+"""
+_FRAMES = """
+import gc, sys
+from array import array
+from pathlib import Path
+from flight.app import supervision
+
+def heap():
+    lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+    for line in lines:
+        if line.endswith("[heap]"):
+            return next(int(line.split()[1]) for line in lines if line.startswith("Rss:"))
+
+def frames():  # the threshold has moved up; now each frame is followed by something small that stays
+    kept, grown = [], heap()
+    for number in range(20):
+        frame = array("B", bytes(2 << 20))
+        kept.append(bytes(4096))
+        del frame
+        kept.append(array("B", bytes(3 << 19)))
+    return heap() - grown
+
+for _ in range(3):
+    array("B", bytes(8 << 20))
+assert gc.get_freeze_count() == 0
+if sys.argv[1] == "settled":
+    supervision.settle_memory()
+    assert gc.get_freeze_count() > 1000 and not gc.isenabled()
+sys.stdout.write(str(frames()))
+"""
+
+
+_LOOPS = """
+import gc, sys, weakref
+from flight.app import supervision
+
+class Loop:
+    def __init__(self):
+        self.me = self
+
+supervision.settle_memory()
+collect = supervision.Collector()
+kept = [Loop() for _ in range(1000)]
+collect()
+frozen = gc.get_freeze_count()
+lost = weakref.ref(Loop())
+collect()
+sys.stdout.write(f"{frozen > 1000} {lost() is None} {gc.get_count()[0] < 100} {gc.isenabled()}")
+"""
+
+
+def _said(code: str, *words: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code, *words], check=True, capture_output=True, text=True)
+    return done.stdout
+
+
+def test_the_control_process_names_the_workers_jobs_without_scipy() -> None:
+    assert _said(_LIGHT) == ""
+
+
+def test_a_worker_leaves_out_the_parts_of_numpy_that_scipy_would_import() -> None:
+    assert "numpy.f2py" in _said(_WORKERS, "as it comes")
+    assert _said(_WORKERS, "lean") == ""
+
+
+def test_a_worker_holds_the_estimators_before_its_first_job() -> None:
+    assert _said(_WORKING) == "False True"
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this libc has no mallopt")
+def test_arrays_of_megabytes_do_not_stretch_the_heap_of_a_settled_process() -> None:
+    assert int(_said(_FRAMES, "as it comes")) > 10_000
+    assert int(_said(_FRAMES, "settled")) < 1_000
+
+
+def test_garbage_that_a_failure_made_is_found_and_what_stays_is_looked_at_once() -> None:
+    assert _said(_LOOPS) == "True True True False"
