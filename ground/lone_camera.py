@@ -13,7 +13,7 @@ from flight.app.accepted_config import requested_config
 from flight.app.devices import linux_camera, simulated_camera
 from flight.app.run import RunRequest
 from flight.schema.devices import Camera
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from hal.buses.clock import SystemClock
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.wires import Clock

@@ -80,7 +80,7 @@ def _coil_settings(config: Config, section: Simulation) -> CoilSettings:
     coils = config.coils
     resistance = section.truth.resistance or coils.resistance
     supply = section.truth.supply_voltage or coils.supply_voltage
-    wired = wirings(coils.channels, resistance, coils.signs, coils.enable_channels)
+    wired = wirings(coils.channels, resistance, coils.signs)
     return CoilSettings(wired, supply, coils.current_limit, coils.stale_after)
 
 

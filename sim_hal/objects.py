@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, earth_velocity

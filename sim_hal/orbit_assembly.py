@@ -8,7 +8,7 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from flight.schema.orbit_devices import SolarStrings, WideCamera
+from flight.schema.devices import SolarStrings, WideCamera
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from knightcube.astro.arrays import FloatArray, Image

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.sections import Config
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.guardian import CoilReach

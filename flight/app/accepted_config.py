@@ -26,8 +26,7 @@ from flight.app.devices import corrupted_text
 from flight.app.run import RunRequest
 from flight.loop.state import LARGEST_FILE, LinuxFiles, replace_file, service_folder
 from flight.schema import reader as configuration
-from flight.schema.document import checked_length, no_such_file, read_text
-from flight.schema.errors import ConfigError, UnreadConfigError
+from flight.schema.document import ConfigError, UnreadConfigError, checked_length, no_such_file, read_text
 from flight.schema.sections import Config
 from hal.interfaces.wires import Clock, Ticker
 from knightcube.errors import UsageError

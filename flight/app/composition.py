@@ -35,12 +35,10 @@ from flight.loop.modes import ModeControl, ModeSettings
 from flight.loop.navigation import Navigation, NavigationSettings, Positioning, SunSensing
 from flight.loop.state import Learned, StateKeeper
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
-from flight.schema.camera_model import camera_model, likelihood_settings
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
 from flight.schema.devices import ObjectTracking as TrackingSection
-from flight.schema.errors import ConfigError
-from flight.schema.orbit_devices import WideCamera
-from flight.schema.sections import Config, Executive
+from flight.schema.document import ConfigError
+from flight.schema.sections import CONTROL_RATE_HZ, Config, Executive
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.gnc.tracking.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
@@ -78,7 +76,7 @@ def navigation_settings(config: Config) -> NavigationSettings:
     return NavigationSettings(
         round(config.inertial_unit.max_age * SECOND_NS),
         round(section.coast * SECOND_NS),
-        round(SECOND_NS / config.executive.control_rate_hz),
+        round(SECOND_NS / CONTROL_RATE_HZ),
     )
 
 

@@ -24,9 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.loop.state import state_folder
-from flight.schema.devices import AravisDevice, Camera, V4l2Device
-from flight.schema.errors import ConfigError
-from flight.schema.orbit_devices import WideCamera
+from flight.schema.devices import AravisDevice, Camera, V4l2Device, WideCamera
+from flight.schema.document import ConfigError
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
 from hal.buses.serial_port import PySerialPort
@@ -182,7 +181,7 @@ def check_settings(config: Config) -> None:
 def coil_settings(config: Config) -> CoilSettings:
     """Return the settings of the coil driver."""
     coils = config.coils
-    wired = wirings(coils.channels, coils.resistance, coils.signs, coils.enable_channels)
+    wired = wirings(coils.channels, coils.resistance, coils.signs)
     return CoilSettings(wired, coils.supply_voltage, coils.current_limit, coils.stale_after)
 
 

@@ -29,8 +29,7 @@ from flight.loop.health import Board
 from flight.loop.state import open_state, service_folder
 from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
-from flight.schema.document import read_text
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, read_text
 from flight.schema.sections import Config
 from hal.buses.linux_process import worker_cores
 from hal.interfaces.wires import SECOND_NS, Clock, Rig

@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 
 from flight.loop.flight_loop import FlightLoop
 from flight.loop.state import LinuxFiles, replace_file, service_folder
-from flight.schema.errors import UnreadConfigError
+from flight.schema.document import UnreadConfigError
 from hal.buses.clock import SystemClock
 from hal.buses.linux_process import ServiceManager
 from hal.interfaces.errors import DeviceError

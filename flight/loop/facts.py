@@ -26,7 +26,7 @@ from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
 from flight.schema.devices import Camera
-from flight.schema.sections import Config
+from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.wires import Clock
 from knightcube.errors import FlightError
 
@@ -265,11 +265,10 @@ class StreamLimits:
 def streams_of(config: Config) -> tuple[StreamLimits, ...]:
     """Return the streams of the devices that a configuration has."""
     unit, coils, field = config.inertial_unit, config.coils, config.field_range()
-    control_hz = config.executive.control_rate_hz
     rows = [
         StreamLimits("imu", float(unit.rate_hz), unit.max_age, IMU_POOR),
         StreamLimits("field", float(unit.rate_hz), unit.max_age, FIELD_POOR, *field),
-        StreamLimits("coils", control_hz, coils.stale_after, COILS_POOR),
+        StreamLimits("coils", CONTROL_RATE_HZ, coils.stale_after, COILS_POOR),
     ]
     if config.power_monitor is not None:
         most = 1.5 * sum(coils.supply_voltage / resistance for resistance in coils.resistance)

@@ -21,7 +21,7 @@ from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
 from flight.loop.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Facts, Services
 from flight.loop.health import CONTROL, ResourceReader
 from flight.loop.state import StateKeeper
-from flight.schema.sections import Config
+from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import CoilState
 from hal.interfaces.wires import SECOND_NS
 
@@ -256,7 +256,7 @@ class FlightLoop:
         """Return the rate groups in order of importance, control first."""
         config, tasks = self._config, self._tasks
         camera, replan_period = config.camera, config.replan_period()
-        control_ns = round(SECOND_NS / config.executive.control_rate_hz)
+        control_ns = round(SECOND_NS / CONTROL_RATE_HZ)
         groups = [RateGroup(CONTROL, control_ns, self._run_control)]
         if replan_period is not None:
             planner = self._body.control.planner

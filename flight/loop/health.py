@@ -137,13 +137,16 @@ class ResourceMonitor:
         return float(time @ (memory - memory.mean()) / (time @ time))
 
 
+_CLOCK_STEP_NS = 500_000_000
+"""Smallest step of the wall clock that is reported, ns."""
+
+
 class ClockWatch:
     """Detects steps of the wall clock by comparing UTC with monotonic time."""
 
-    def __init__(self, clock: Clock, threshold: float) -> None:
-        """Watch `clock` for steps larger than `threshold` s."""
+    def __init__(self, clock: Clock) -> None:
+        """Watch `clock` for steps larger than 0.5 s."""
         self._clock = clock
-        self._threshold_ns = round(threshold * 1e9)
         self._offset_ns: int | None = None
         self.steps = 0
 
@@ -151,7 +154,7 @@ class ClockWatch:
         """Return the step in s since the last call, None without one; slow drift is followed."""
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
-        if before_ns is None or abs(offset_ns - before_ns) <= self._threshold_ns:
+        if before_ns is None or abs(offset_ns - before_ns) <= _CLOCK_STEP_NS:
             return None
         self.steps += 1
         return (offset_ns - before_ns) * 1e-9
@@ -450,7 +453,7 @@ class HealthWatch:
         """Watch `inputs`; `feed` is called while every rate group and worker makes progress."""
         self._inputs = inputs
         self._monitor = ResourceMonitor(limits)
-        self._clock_watch = ClockWatch(services.clock, limits.clock_step)
+        self._clock_watch = ClockWatch(services.clock)
         self._clock = services.clock
         self._recorder = services.recorder
         self._events = services.events

@@ -23,8 +23,9 @@ from flight.link.telemetry.definitions import MODE
 from flight.loop import facts
 from flight.loop.body import BodyTargets, FlightBody, Target
 from flight.loop.facts import Facts, Services
+from flight.loop.state import CRASH_WINDOW
 from flight.loop.steering import Steering
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.sections import Modes
 from knightcube.errors import FlightError, UsageError
 from knightcube.gnc.estimation.estimate import Estimate
@@ -603,7 +604,7 @@ class ModeControl:
     def _boot(self, good: bool, now_ns: int) -> None:
         waited = (now_ns - self._machine.since_ns) * 1e-9
         if self._too_many_crashes:
-            text = f"{self._crashed} unclean shutdowns within {self._settings.crash_window:g} s of operation"
+            text = f"{self._crashed} unclean shutdowns within {CRASH_WINDOW:g} s of operation"
             self._events.report(events.CRASHED_OFTEN, now_ns, text)
             self._fire(Trigger.START_SAFE, text, now_ns)
         elif good:

@@ -234,6 +234,10 @@ def end_cleanly(state: StoredState) -> StoredState:
     return msgspec.structs.replace(state, running=False)
 
 
+CRASH_WINDOW = 600.0
+"""Operating time (s) in which unclean shutdowns count as recent."""
+
+
 def boot_record(begun: StoredState, window: float) -> BootRecord:
     """Return the boot record of the state of a new boot; `window` in s of operating time."""
     recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
@@ -706,7 +710,7 @@ def open_state(
         StateStore(folder, notices.report),
         notices,
         clock,
-        window=config.modes.crash_window,
+        window=CRASH_WINDOW,
         devices=digest_of(config),
         period_ns=round(config.state.period * 1e9),
         boots=newest_boot([folder, *runs]),

@@ -1,22 +1,20 @@
-"""Checks between values of a configuration that are each within their own limits."""
+"""Checks of configuration values against each other, and the networks that the link accepts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from ipaddress import IPv4Address, IPv4Network
 
-from flight.schema.aim import check_aim
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, SolarStrings
 from flight.schema.document import Document
 from flight.schema.orbit import OrbitConfig
-from flight.schema.orbit_devices import SolarStrings
-from flight.schema.peers import is_loopback, peer_networks
-from flight.schema.sections import Commands, Config, Link
+from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
 from flight.schema.testbed import TestbedConfig
-from flight.schema.values import Quaternion
+from flight.schema.values import Quaternion, check_aim
 
 Refuse = Callable[[str, str], None]
-"""Raises the complaint about the value of a dotted name."""
+"""Function of a dotted name and a problem that raises the error about the value."""
 
 PIXEL_BITS = {
     "GREY": range(8, 9),
@@ -28,11 +26,14 @@ PIXEL_BITS = {
     "Y16": range(9, 17),
     "Mono16": range(9, 17),
 }
-"""Bits of each pixel format; a converter of fewer bits may fill the formats of 16."""
+"""Bits per pixel that each pixel format can hold."""
+LOOPBACK = IPv4Network("127.0.0.0/8")
+_PREFIX = 24
+"""Default prefix length of the network around an address of the link."""
 
 
 def check_consistency(config: Config, document: Document) -> None:
-    """Refuse values that are each possible but contradict each other. Raises ConfigError."""
+    """Refuse values that contradict each other. Raises ConfigError."""
 
     def refuse(dotted: str, problem: str) -> None:
         raise document.error(dotted, problem)
@@ -45,7 +46,12 @@ def check_consistency(config: Config, document: Document) -> None:
     if config.link is not None:
         _check_link(config.link, config.commands, refuse)
     _check_coils(config, refuse)
-    _check_times(config, refuse)
+    unit = config.inertial_unit
+    # A reading waits for its cycle, and the current that follows from it flows until the next cycle.
+    least = 1.0 / unit.rate_hz + 2.0 / CONTROL_RATE_HZ
+    if unit.max_age < least:
+        problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
+        refuse("inertial_unit.max_age", problem)
     telemetry = config.telemetry
     if telemetry.budget_bytes < 2 * telemetry.segment_bytes:
         refuse("telemetry.budget_bytes", f"is {telemetry.budget_bytes}: must hold two segments")
@@ -101,7 +107,7 @@ def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
 
 
 def _check_coils(config: Config, refuse: Refuse) -> None:
-    used = [c for pair in config.coils.channels for c in pair] + list(config.coils.enable_channels or ())
+    used = [c for pair in config.coils.channels for c in pair]
     if len(set(used)) != len(used):
         refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
     if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
@@ -126,15 +132,6 @@ def _check_strings(config: Config, strings: SolarStrings, refuse: Refuse) -> Non
             refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
 
 
-def _check_times(config: Config, refuse: Refuse) -> None:
-    # A reading waits for its cycle, and the current that it leads to flows until the next.
-    unit = config.inertial_unit
-    least = 1.0 / unit.rate_hz + 2.0 / config.executive.control_rate_hz
-    if unit.max_age < least:
-        problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
-        refuse("inertial_unit.max_age", problem)
-
-
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
     norm = math.sqrt(sum(c * c for c in quaternion))
     if abs(norm - 1.0) > 1e-6:
@@ -150,7 +147,7 @@ def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> Non
         if step.point is not None and on_testbed:
             refuse(f"{dotted}.point", "is of a satellite: the testbed turns by `slew`")
         check_aim(dotted, step, step.point, refuse)
-    if not is_loopback(commands):
+    if not _is_loopback(commands):
         problem = "is plain and open beyond this machine: give `link` with keys, and here a loopback address"
         refuse("commands.udp", f"{commands.udp} {problem}")
 
@@ -191,8 +188,35 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
     if camera.device is not None:
         pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
         if camera.bits not in possible:
-            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {_span(possible)}")
+            span = f"{possible[0]}" if len(possible) == 1 else f"{possible[0]} to {possible[-1]}"
+            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {span}")
 
 
-def _span(numbers: range) -> str:
-    return f"{numbers[0]}" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
+def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
+    """Return the networks from which the link accepts frames, none without UDP and TCP.
+
+    The sandbox of the service (`deploy/board_dropin.py`) blocks all other packets. Raises ValueError for an
+    impossible network, and for an address that requires `link.peers`.
+    """
+    hosts = [address.rpartition(":")[0] for address in (link.udp, link.tcp) if address is not None]
+    if hosts and link.peers is not None:
+        return tuple(map(IPv4Network, link.peers))
+    networks = []
+    for host in hosts:
+        try:
+            own = IPv4Address("127.0.0.1" if host == "localhost" else host)
+        except ValueError as error:
+            raise ValueError(f"{host} may be anywhere: say who may connect in `link.peers`") from error
+        if own.is_unspecified:
+            raise ValueError(f"{host} is every network: say who may connect in `link.peers`")
+        networks.append(LOOPBACK if own.is_loopback else IPv4Network((own, _PREFIX), strict=False))
+    return tuple(dict.fromkeys(networks))
+
+
+def _is_loopback(commands: Commands) -> bool:
+    """Return whether plain UDP commands, if any, can come from this machine only."""
+    host = (commands.udp or "localhost:0").rpartition(":")[0]
+    try:
+        return host == "localhost" or IPv4Address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,4 +1,4 @@
-"""From plain values to a typed section; a complaint names file, line, value and the nearest known key."""
+"""Conversion of plain values to typed sections; an error names file, line, value and what is permitted."""
 
 from __future__ import annotations
 
@@ -7,13 +7,24 @@ import re
 from typing import Any, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from flight.schema.document import Document, join
-from flight.schema.expectation import expectation, steps_of
 
 T = TypeVar("T")
 
-_ABSENT = object()
+_NOUNS = {
+    "`object`": "a section",
+    "`array`": "a list",
+    "`str`": "a text",
+    "`int`": "a whole number",
+    "`float`": "a number",
+    "`bool`": "true or false",
+    "`null`": "nothing",
+}
+"""Plain nouns for msgspec's names of types."""
+_LONGEST = 200
+"""Largest number of characters of a value in a message."""
 
 
 def convert(document: Document, shape: type[T], section: str = "") -> T:
@@ -33,27 +44,24 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
         missing = re.match(r"Object missing required field `(.+)`", message)
         if missing:
             raise document.error(join(dotted, missing.group(1)), "is missing") from error
-        value = _lookup(tree, path)
-        message = expectation(message, shape, path)
-        if value is not _ABSENT:
-            message = f"is {_shown(value)}: {message}"
+        message = _permitted(message, shape, path)
+        value = tree
+        try:
+            for key, index in _steps_of(path):
+                value = value[key] if key else value[int(index)]
+        except (KeyError, IndexError, TypeError, ValueError):
+            pass  # msgspec writes [...] for an element whose index it does not know
+        else:
+            if not isinstance(value, dict):
+                text = repr(value)
+                cut = text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
+                message = f"is {cut}: {message}"
         raise document.error(dotted, message) from error
 
 
-def _shown(value: Any) -> str:
-    """Return a value as a complaint shows it, cut to 200 characters."""
-    text = repr(value)
-    return text if len(text) <= 200 else text[:200] + "..."
-
-
-def _lookup(tree: Any, path: str) -> Any:
-    """Return the value at a msgspec path such as `.coils.channels[1]`; _ABSENT for a section."""
-    for key, index in steps_of(path):
-        try:
-            tree = tree[key] if key else tree[int(index)]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return _ABSENT
-    return tree if not isinstance(tree, dict) else _ABSENT
+def _steps_of(path: str) -> list[tuple[str, str]]:
+    """Return the steps of a msgspec path such as `.coils.channels[1]`: (key, "") or ("", index)."""
+    return re.findall(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]", path)
 
 
 def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
@@ -72,7 +80,7 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
 def _struct_of(annotation: Any, tree: Any) -> Any:
     """Return the struct inside an annotation such as `Camera | None` or `tuple[Step, ...]`.
 
-    Of several tagged structs it is the one whose tag stands in `tree`.
+    Of several tagged structs it is the one whose tag is in `tree`.
     """
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         config = annotation.__struct_config__
@@ -82,3 +90,46 @@ def _struct_of(annotation: Any, tree: Any) -> Any:
         if (found := _struct_of(inner, tree)) is not None:
             return found
     return None
+
+
+def _permitted(message: str, shape: Any, path: str) -> str:
+    """Return msgspec's message about the value at a `path` of a `shape`, with the permitted values."""
+    kinds: list[inspect.Type] = _alternatives(inspect.type_info(shape))
+    for key, index in _steps_of(path):
+        kinds = [
+            inner for kind in kinds for each in _within(kind, key, index) for inner in _alternatives(each)
+        ]
+    choices = [value for kind in kinds if isinstance(kind, inspect.LiteralType) for value in kind.values]
+    if choices:
+        return "expected one of " + ", ".join(map(str, choices))
+    schemas = [kind.extra_json_schema or {} for kind in kinds if isinstance(kind, inspect.Metadata)]
+    hints = [str(schema["description"]) for schema in schemas if "description" in schema]
+    if "matching regex" in message and hints:
+        return f"expected {' or '.join(hints)}"
+    plain = message[0].lower() + message[1:]
+    for technical, noun in _NOUNS.items():
+        plain = plain.replace(technical, noun)
+    return plain
+
+
+def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
+    """Return the members of a union, with the descriptions of each."""
+    if isinstance(kind, inspect.Metadata):
+        return [kind, *_alternatives(kind.type)]
+    if isinstance(kind, inspect.UnionType):
+        return [inner for each in kind.types for inner in _alternatives(each)]
+    return [kind]
+
+
+def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
+    """Return the types at a key or an index of a type; the tag of a union's section is a choice."""
+    if isinstance(kind, inspect.StructType) and key:
+        if key == kind.tag_field:
+            return [inspect.LiteralType((kind.tag,))]
+        return [field.type for field in kind.fields if field.encode_name == key]
+    if isinstance(kind, inspect.TupleType) and index:
+        position = int(index) if index.isdigit() else 0
+        return list(kind.item_types[position : position + 1])
+    if isinstance(kind, inspect.VarTupleType) and index:
+        return [kind.item_type]
+    return []

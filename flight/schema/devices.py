@@ -1,13 +1,18 @@
-"""The devices' sections of a configuration: how they are wired, and what the flight believes of them."""
+"""The devices' sections of a configuration: their wiring, and what the flight assumes about them.
+
+SI units unless the name says otherwise.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from flight.schema.values import (
     Address,
+    BaudRate,
     Bus,
     Channel,
     Estimator,
@@ -16,18 +21,23 @@ from flight.schema.values import (
     Quaternion,
     Section,
     Sign,
+    Vector,
 )
-from knightcube.vision.camera.lens import CameraKnowledge
+from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
+from knightcube.vision.streaks.settings import LikelihoodSettings
+
+_KNOWN = CameraKnowledge()
+ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
 class InertialUnit(Section, frozen=True, kw_only=True):
-    """The VN-100 and its line.
+    """The VN-100 and its serial line.
 
-    No coil is driven by a reading that would be older than `max_age` s before the next one is used.
+    The coils stay off when a reading would be older than `max_age` s before the next reading is used.
     """
 
     device: str = "/dev/knightcube-imu"
-    baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = 115200
+    baud_rate: BaudRate = 115200
     output: Literal["binary", "ascii"] = "binary"
     rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = 40
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -38,7 +48,7 @@ class InertialUnit(Section, frozen=True, kw_only=True):
 
 
 class Coils(Section, frozen=True, kw_only=True):
-    """The PWM chip, the H-bridges and the coils behind them; `bus` is its number or its device file."""
+    """The PWM chip, the H-bridges and the coils; `bus` is the number or the device file of the I2C bus."""
 
     bus: Bus = 1
     address: Address = 0x40
@@ -47,7 +57,6 @@ class Coils(Section, frozen=True, kw_only=True):
         (2, 3),
         (4, 5),
     )
-    enable_channels: tuple[Channel, Channel, Channel] | None = None
     signs: tuple[Sign, Sign, Sign] = (1, 1, 1)
     resistance: tuple[Positive, Positive, Positive]
     supply_voltage: Positive
@@ -63,7 +72,11 @@ class PowerMonitor(Section, frozen=True, kw_only=True):
 
 
 class CameraLens(Section, frozen=True, kw_only=True):
-    """What `python -m flight calibrate` found: px, the pixel (x, y) on the axis, and radial distortion."""
+    """The lens as `python -m flight calibrate` reports it.
+
+    `focal_length` in px, `centre` is the pixel (x, y) on the optical axis, `k1` and `k2` are the radial
+    distortion.
+    """
 
     focal_length: Positive
     centre: tuple[float, float]
@@ -71,15 +84,12 @@ class CameraLens(Section, frozen=True, kw_only=True):
     k2: float = 0.0
 
 
-_KNOWN = CameraKnowledge()
-
-
 class CameraAccuracy(Section, frozen=True, kw_only=True):
-    """How well the camera is known, standard deviations: what streaks may claim of a rate depends on it.
+    """Standard deviations of the camera model, on which the reported uncertainty of a streak's rate depends.
 
-    `focal_length` as a share of itself, `centre` of the axis along x and y in px, `distortion` as the share
-    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an
-    emulated camera; without a `line_time` that of the camera is exact where it is stated.
+    `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of a corner
+    relative to its radius, `line_time` is in s. Zero is exact, as in an emulated camera. Without a
+    `line_time` here, a `line_time` of the camera counts as exact.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
@@ -89,22 +99,23 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
 
 
 class StarTracker(Section, frozen=True, kw_only=True):
-    """The star tracker: its sky index (default: the one in the cache folder), and its trust in the lens.
+    """The star tracker.
 
-    `scale_error` is the part by which the focal length may be wrong; 0 for a calibrated camera. `velocity`,
-    m/s with respect to the Sun in the axes of the attitude, is that of stellar aberration; none on a testbed.
+    `index` is the file of the sky index, by default the one in the cache folder. `scale_error` is the
+    largest relative error of the focal length, 0 for a calibrated camera. `velocity` (m/s with respect to
+    the Sun, in the axes of the attitude) corrects stellar aberration; a testbed has none.
     """
 
     index: str | None = None
     scale_error: Annotated[float, Meta(ge=0.0, lt=0.5)] = 0.0
-    velocity: tuple[float, float, float] | None = None
+    velocity: Vector | None = None
 
 
 class ObjectTracking(Section, frozen=True, kw_only=True):
-    """Search for objects among the stars of each frame, and their tracks.
+    """Search for moving objects among the stars of each frame, and their tracks.
 
-    Nothing fainter than `faintest` (V) is one. A track begins after `needed` sightings in `within` frames and
-    ends after `coast` s without one.
+    Detections fainter than magnitude `faintest` (V) are ignored. A track begins after `needed` sightings in
+    `within` frames and ends after `coast` s without a sighting.
     """
 
     faintest: Annotated[float, Meta(ge=-5.0, le=8.0)] = 7.0
@@ -114,7 +125,7 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
 
 
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
-    """A camera of Video for Linux (`hal.drivers.v4l2_camera`); gain in its own steps, `stamp_delay` in s."""
+    """A Video for Linux camera (`hal.drivers.v4l2_camera`); `gain` in its own steps, `stamp_delay` in s."""
 
     path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"
     pixel_format: Literal["GREY", "Y10", "Y12", "Y16"] = "GREY"
@@ -131,18 +142,15 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="ar
     gain: float | None = None
 
 
-ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
-"""s."""
-
-
 class Camera(Section, frozen=True, kw_only=True):
-    """The star camera: what flight must know to read its frames; `device` is the real one.
+    """The star camera: properties that are needed to read its frames; `device` is the real camera.
 
-    A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
-    `vision_slow_after` s. Beyond `max_rate` rad/s of the body, where it is given, no exposure is begun. While
-    the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too. The newest
-    `keep_frames` frames are kept in `frames` of the run's folder. Stars that streak are exposed for a time
-    within `streak_exposure` s that follows the rate; without it for `exposure` s as points are.
+    The stars of a streaked frame are exposed for a time within `streak_exposure` s that follows the rate, all
+    other frames and those without `streak_exposure` for `exposure` s. While the attitude is fine, a frame is
+    taken every `fine_period` s, if that is given, else every `period` s. No exposure begins while the body
+    rotates faster than `max_rate` rad/s, if that is given. A frame is late `late_after` s after the end of
+    its exposure; vision is slow after `vision_slow_after` s. The newest `keep_frames` frames are kept in the
+    folder `frames` of the run.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -172,3 +180,108 @@ class Camera(Section, frozen=True, kw_only=True):
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0
     keep_frames: Annotated[int, Meta(ge=0, le=1000)] = 0
+
+
+class Gps(Section, frozen=True, kw_only=True):
+    """The u-blox receiver on its own serial line.
+
+    It reports a fix every `period` s; the position is unknown when no fix arrives for `max_age` s.
+    """
+
+    device: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-gps"
+    baud_rate: BaudRate = 115200
+    period: Annotated[float, Meta(ge=0.1, le=60.0)] = 1.0
+    max_age: Positive = 60.0
+
+
+class SolarString(Section, frozen=True, kw_only=True):
+    """A string of solar cells and the ADC input that measures its current.
+
+    `normal` is its outward unit vector in body axes, `peak` its current (A) at perpendicular sunlight. An
+    amplifier of `volt_per_ampere` feeds input `channel` of the ADS1115 at `address`.
+    """
+
+    normal: Vector
+    address: Address = 0x48
+    channel: Annotated[int, Meta(ge=0, le=3)]
+    peak: Positive = 0.5
+    volt_per_ampere: Positive = 2.0
+
+
+class SolarStrings(Section, frozen=True, kw_only=True):
+    """The solar strings, measured every `period` s; a reading is stale after `max_age` s."""
+
+    strings: Annotated[tuple[SolarString, ...], Meta(min_length=4, max_length=16)]
+    period: Annotated[float, Meta(ge=0.04, le=60.0)] = 0.5
+    max_age: Positive = 2.0
+
+
+class WideCamera(Section, frozen=True, kw_only=True):
+    """A wide-angle camera for Sun and horizon.
+
+    A logarithmic `response` spreads `decades` of intensity over the counts above `pedestal`; all cameras
+    have the same response. All cameras are triggered together at the shortest `period`, or at the shortest
+    `fine_period` while the attitude is known to 0.05 deg. `lens_error_deg` is the residual error of the
+    calibrated lens and mounting.
+    """
+
+    device: V4l2Device | AravisDevice | None = None
+    columns: Annotated[int, Meta(ge=64, le=2048)] = 384
+    rows: Annotated[int, Meta(ge=64, le=2048)] = 384
+    field_of_view_deg: Annotated[float, Meta(gt=10.0, lt=150.0)] = 67.0
+    lens: CameraLens | None = None
+    response: Literal["logarithmic", "linear"] = "logarithmic"
+    decades: Annotated[float, Meta(ge=1.0, le=12.0)] = 6.0
+    bits: Annotated[int, Meta(ge=8, le=16)] = 8
+    pedestal: Annotated[float, Meta(ge=0.0, le=200.0)] = 8.0
+    exposure: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.005
+    period: Annotated[float, Meta(ge=2.0)] = 5.0
+    fine_period: Annotated[float, Meta(ge=2.0)] = 60.0
+    max_age: Positive = 30.0
+    lens_error_deg: NotNegative = 0.02
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    def counts_per_decade(self) -> float:
+        """Return the increase of the counts at ten times the intensity, for a logarithmic response."""
+        return float((1 << self.bits) - 1 - self.pedestal) / self.decades
+
+
+def camera_model(camera: Camera | WideCamera) -> CameraModel:
+    """Return the calibrated camera if the section has a lens, else the pinhole of its field of view.
+
+    Raises LensError for an impossible lens.
+    """
+    if camera.lens is None:
+        return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
+    lens = camera.lens
+    return Lens(camera.columns, camera.rows, lens.focal_length, lens.centre, lens.k1, lens.k2)
+
+
+def camera_knowledge(camera: Camera) -> CameraKnowledge:
+    """Return the uncertainty of the pinhole that represents the camera in the fit of streaks.
+
+    The fit has no lens model, so the deviation of a calibrated lens from the pinhole adds to the uncertainty.
+    """
+    accuracy = camera.accuracy
+    centre, distortion = accuracy.centre, accuracy.distortion
+    if camera.lens is not None:
+        lens = camera.lens
+        middle = 0.5 * (camera.columns - 1), 0.5 * (camera.rows - 1)
+        square = math.hypot(*middle) ** 2 / lens.focal_length**2
+        centre = math.hypot(centre, math.dist(lens.centre, middle))
+        distortion = math.hypot(distortion, square * (lens.k1 + square * lens.k2))
+    line_time = accuracy.line_time
+    if line_time is None and camera.line_time is not None:
+        line_time = 0.0
+    return CameraKnowledge(accuracy.focal_length, centre, distortion, line_time)
+
+
+def likelihood_settings(camera: Camera) -> LikelihoodSettings:
+    """Return the settings of the streak fit for the camera's frames."""
+    return LikelihoodSettings(
+        gain=camera.gain,
+        saturation=camera.saturation,
+        psf_sigma=camera.psf_sigma,
+        line_time=camera.line_time,
+        knowledge=camera_knowledge(camera),
+    )

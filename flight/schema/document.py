@@ -1,27 +1,34 @@
-"""A YAML file as plain values, with the line of each for complaints.
+"""YAML text of a configuration as plain values, and errors that name the file and line of a value.
 
-Numbers follow YAML 1.2 (1e-5 is one). Aliases, duplicate keys and numbers that are not finite are refused.
+Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
+Aliases, duplicate keys, application tags and numbers that are not finite are refused.
 """
 
 from __future__ import annotations
 
-import io
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-from ruamel.yaml import YAML
-from ruamel.yaml.composer import Composer, ComposerError
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.events import AliasEvent
-from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
+import yaml
 
-from flight.schema.carried import names
-from flight.schema.errors import ConfigError, UnreadConfigError
+from knightcube.errors import InputError
 
+FOLDER = Path(__file__).parent / "configurations"
+"""Folder of the configurations inside the package, a link to config/ of the repository."""
 _LONGEST = 1 << 20
+"""Largest length of a configuration file, in characters."""
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be flown; `where` is the file and, if known, the line of the value."""
+
+
+class UnreadConfigError(ConfigError):
+    """A configuration with unchecked values: it could not be read whole, or is not the accepted one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +40,70 @@ class Document:
     lines: dict[str, int]
 
     def error(self, dotted: str, problem: str) -> ConfigError:
-        """Return the complaint about a value, with its line or that of the nearest section above it."""
+        """Return an error about a value, with its line or the line of the nearest section above it."""
         known = dotted
         while known and known not in self.lines:
             known = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", known)
         where = f"{self.name}:{self.lines[known]}" if known else self.name
         return ConfigError(where, f"`{dotted or 'configuration'}` {problem}")
+
+
+class _Loader(yaml.SafeLoader):
+    """Loads the core schema of YAML 1.2 and refuses aliases.
+
+    A few lines of aliases can stand for more values than the memory holds.
+    """
+
+    # PyYAML resolves and constructs plain scalars by YAML 1.1, hence tables of our own.
+    yaml_implicit_resolvers: ClassVar[dict[Any, Any]] = {}
+    yaml_constructors: ClassVar[dict[Any, Any]] = {
+        tag: yaml.SafeLoader.yaml_constructors[tag]
+        for tag in (None, *(f"tag:yaml.org,2002:{kind}" for kind in ("map", "seq", "str", "null", "bool")))
+    }
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Return the next node. Raises ComposerError for an alias."""
+        if self.check_event(yaml.AliasEvent):
+            mark = self.get_event().start_mark
+            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value out", mark)
+        return super().compose_node(parent, index)  # type: ignore[no-untyped-call]  # PyYAML's stub
+
+    def construct_integer(self, node: yaml.ScalarNode) -> int:
+        """Return a decimal, octal (0o) or hexadecimal (0x) number. Raises ValueError."""
+        text = self.construct_scalar(node)
+        return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
+
+    def construct_number(self, node: yaml.ScalarNode) -> float:
+        """Return a floating-point number; `.inf` and `.nan` are spelled as in YAML. Raises ValueError."""
+        text = self.construct_scalar(node)
+        return float(re.sub(r"\.(?=inf|nan)", "", text.lower()))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes the texts that the core schema of YAML 1.2 would read as another kind of value."""
+
+    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+
+for _kind, _pattern in (
+    ("null", r"(?:null|Null|NULL|~|)$"),
+    ("bool", r"(?:true|True|TRUE|false|False|FALSE)$"),
+    ("int", r"(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$"),
+    ("float", r"(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?)$"),
+    ("float", r"(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", re.compile(_pattern), None)
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_integer)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
+
+
+def config_path(text: str) -> Path:
+    """Return the file that an argument names: a configuration of the package by its bare name, or a path.
+
+    `step_demo` is a name; `step_demo.yaml` and `./step_demo` are paths.
+    """
+    packaged = FOLDER / f"{text}.yaml"
+    return packaged if re.fullmatch(r"\w+", text) and packaged.is_file() else Path(text)
 
 
 def read_text(path: Path) -> str:
@@ -55,8 +120,13 @@ def read_text(path: Path) -> str:
     return checked_length(text, path)
 
 
+def names() -> list[str]:
+    """Return the bare names of the package's configurations."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
 def no_such_file() -> str:
-    """Return the complaint about a file that is not there, with the names that would be right."""
+    """Return the message about a missing file, with the names of the package's configurations."""
     return f"no such file; by name there are {', '.join(names())}"
 
 
@@ -68,18 +138,20 @@ def checked_length(text: str, path: Path) -> str:
 
 
 def read_document(text: str, name: str) -> Document:
-    """Return the values of YAML text; `name` stands for the file in complaints. Raises ConfigError."""
+    """Return the values of YAML text; `name` stands for the file in messages. Raises ConfigError."""
     lines: dict[str, int] = {}
-    yaml = YAML(typ="safe", pure=True)
-    yaml.Composer = _Composer
     try:
-        node = yaml.compose(text)
-        _note_lines(node, "", lines, name)
-        values = None if node is None else yaml.constructor.construct_document(node)
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        for child, line in _lines_of(node, ""):
+            if child in lines:
+                raise ConfigError(f"{name}:{line}", f"`{child}` stands twice, first in line {lines[child]}")
+            lines[child] = line
+        values = None if node is None else loader.construct_document(node)
     except RecursionError as error:
         raise ConfigError(name, "is nested too deeply") from error
-    # The others come from a value that does not fit its explicit tag, such as `!!int x`.
-    except (YAMLError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError) as error:
+    # The other exceptions come from a value that does not fit its explicit tag, such as `!!int x`.
+    except (yaml.YAMLError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark else name
         problem = getattr(error, "problem", None) or str(error)
@@ -93,12 +165,8 @@ def read_document(text: str, name: str) -> Document:
 
 def to_yaml(values: dict[str, Any]) -> str:
     """Return plain values as YAML text, in their order."""
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # its annotation is of None
-    text = io.StringIO()
-    yaml.dump(values, text)
-    return text.getvalue()
+    # ASCII only: PyYAML folds some Unicode line breaks that it does not escape.
+    return yaml.dump(values, Dumper=_Dumper, default_flow_style=False, sort_keys=False)
 
 
 def join(prefix: str, key: str) -> str:
@@ -106,31 +174,17 @@ def join(prefix: str, key: str) -> str:
     return f"{prefix}.{key}" if prefix and key and not key.startswith("[") else prefix + key
 
 
-class _Composer(Composer):
-    """Refuses aliases: a few lines of them can stand for more values than memory holds."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return the next node."""
-        if self.parser.check_event(AliasEvent):
-            mark = self.parser.get_event().start_mark
-            raise ComposerError(None, None, "an alias (*): write the value out", mark)
-        return super().compose_node(parent, index)
-
-
-def _note_lines(node: Node | None, dotted: str, lines: dict[str, int], name: str) -> None:
-    """Note the line of every value; refuse a duplicate key."""
-    if isinstance(node, MappingNode):
-        for key, value in node.value:
-            child = join(dotted, str(key.value))
-            line = key.start_mark.line + 1
-            if child in lines:
-                raise ConfigError(f"{name}:{line}", f"`{child}` stands twice, first in line {lines[child]}")
-            lines[child] = line
-            _note_lines(value, child, lines, name)
-    elif isinstance(node, SequenceNode):
-        for index, value in enumerate(node.value):
-            lines[f"{dotted}[{index}]"] = value.start_mark.line + 1
-            _note_lines(value, f"{dotted}[{index}]", lines, name)
+def _lines_of(node: yaml.Node | None, dotted: str) -> Iterator[tuple[str, int]]:
+    """Yield the dotted name and the line of every value under a node."""
+    if isinstance(node, yaml.MappingNode):
+        children = [(join(dotted, str(key.value)), key, value) for key, value in node.value]
+    elif isinstance(node, yaml.SequenceNode):
+        children = [(f"{dotted}[{index}]", value, value) for index, value in enumerate(node.value)]
+    else:
+        return
+    for name, first, value in children:
+        yield name, first.start_mark.line + 1
+        yield from _lines_of(value, name)
 
 
 def _refuse_not_finite(value: Any, dotted: str, document: Document) -> None:

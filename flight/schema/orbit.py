@@ -1,4 +1,4 @@
-"""The shape of the configuration of a satellite in orbit: its own sections beside those of every body."""
+"""The configuration of a satellite in orbit: its own sections beside those of every body."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from flight.schema.aim import Aim, GoalName
-from flight.schema.errors import ConfigError
-from flight.schema.orbit_devices import Normal
+from flight.schema.document import ConfigError
 from flight.schema.sections import Config, Detumble, Estimation
-from flight.schema.values import NotNegative, Positive, Section
+from flight.schema.values import Aim, GoalName, NotNegative, Positive, Section, Share, Vector
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
-"""T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
-
+"""Range of valid magnetometer readings, T: 1.5e-5 to 6.5e-5 in a low orbit, and as much from the coils."""
 
 ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
@@ -24,7 +21,8 @@ ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 class Craft(Section, frozen=True, kw_only=True):
     """The flight application's model of the satellite.
 
-    `inertia` kg m^2 of the body axes; `dipole_per_ampere` m^2, n A of every coil.
+    `inertia` are the moments of inertia about the body axes, kg m^2; `dipole_per_ampere` is turns times area
+    of each coil, m^2.
     """
 
     inertia: tuple[Positive, Positive, Positive]
@@ -34,10 +32,10 @@ class Craft(Section, frozen=True, kw_only=True):
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control.three_axes`).
 
-    `field_noise` T of an axis of a sample, constant errors of the magnetometer included; `torque_noise`
-    rad/s per sqrt(s), from torques that are not modelled. Times in s: the plan looks `horizon` ahead and is
-    made again every `replan`. A body that turned by less than `gentle` rad/s when its braking began is never
-    made faster than then, a faster one up to `spin_up` times its first rate.
+    `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. `torque_noise` (rad/s
+    per sqrt(s)) stands for unmodelled torques. The plan covers `horizon` s and is renewed every `replan` s. A
+    body slower than `gentle` rad/s at the start never exceeds its initial rate; a faster body may reach
+    `spin_up` times its initial rate.
     """
 
     field_noise: Positive = 5.0e-7
@@ -51,48 +49,47 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
 class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     """The filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
 
-    `bias_walk` rad/s per sqrt(s), of the gyro's bias; `field_noise` T of an axis of a sample of the
-    magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of
-    drag at 500 km, twice that of sunlight, before any is learned; `torque_walk` N m per sqrt(s). Of a
-    light craft they are smaller: what is taken for a torque along the field is planned for an hour ahead.
-    Since the last boot the gyro's bias may have `changed` by 10 deg/h, the dipole by a twentieth.
+    `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s); `field_noise` the noise per axis of a
+    magnetometer sample, T. `torque_start` is the torque expected before any is estimated, N m: drag at 500 km
+    and twice the solar pressure. `torque_walk` is its random walk, N m per sqrt(s). Both are smaller for a
+    light satellite, because an estimated torque along the field enters plans for an hour. Since the last boot
+    the gyro bias may have changed by 10 deg/h, the dipole by the part `changed` of its initial deviation.
     """
 
     bias_walk: NotNegative = 2.0e-6
     field_noise: Positive = 1.0e-7
-    field_error: Positive = 5.0e-8
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
     history: Positive = 12.0
-    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
+    changed: Share = 0.05
     torque_start: Positive = 3.0e-9
     torque_walk: Positive = 5.0e-12
 
 
 class ExclusionCones(Section, frozen=True, kw_only=True):
-    """How far the star camera's boresight stays from `sun` and `moon`, and from the limb of the `earth`."""
+    """Smallest angles between the star camera's boresight and the Sun, the Moon and the limb of the Earth."""
 
     sun_deg: ConeAngle | None = None
     earth_deg: ConeAngle | None = None
     moon_deg: ConeAngle | None = None
 
     def angles(self) -> dict[str, float]:
-        """Return the angles, rad, of the cones that are kept, by their bodies' names."""
+        """Return the angles of the given cones, rad, by the name of the body."""
         found = {"sun": self.sun_deg, "earth": self.earth_deg, "moon": self.moon_deg}
         return {name: math.radians(angle) for name, angle in found.items() if angle is not None}
 
 
 class PointingSection(Section, frozen=True, kw_only=True):
-    """How a satellite points (`knightcube.gnc.control.three_axes`).
+    """Pointing of a satellite (`knightcube.gnc.control.three_axes`).
 
-    `axis` of the body points; a given roll is measured from `across`, normal to it. `turn` rad, `rate` rad/s
-    and `dipole` A m^2 are the errors and the dipole that cost the same, as does `roll` rad of a turn about
-    `axis`; without it that costs as any other turn. The coils act for `act` s between
-    pauses as long as those of detumbling. A plan is made again every `replan_period` s. From far off a target
-    is slewed to in `slew` s, where that suffices, with the star camera outside the `cones`.
+    `axis` of the body points at the target; a given roll is measured from `across`, perpendicular to it.
+    Errors of `turn` rad and `rate` rad/s and a dipole of `dipole` A m^2 have equal cost, as does a rotation
+    of `roll` rad about `axis`; without `roll` this costs as any other rotation. The coils act for `act` s
+    between pauses as long as the detumbler's. Plans are renewed every `replan_period` s. A slew to a distant
+    target takes `slew` s, if that suffices, with the star camera outside the `cones`.
     """
 
-    axis: Normal = (0.0, 0.0, 1.0)
-    across: Normal = (1.0, 0.0, 0.0)
+    axis: Vector = (0.0, 0.0, 1.0)
+    across: Vector = (1.0, 0.0, 0.0)
     turn: Positive = 0.0175
     rate: Positive = 1.0
     dipole: Positive = 1.0e-4
@@ -104,22 +101,22 @@ class PointingSection(Section, frozen=True, kw_only=True):
 
 
 class TargetStep(Aim, frozen=True, kw_only=True):
-    """From `at` s of mission time point to a goal."""
+    """A goal to point to from `at` s of mission time on."""
 
     at: NotNegative
     point: GoalName
 
     def target(self) -> PointingTarget:
-        """Return the target. Raises UsageError for values that do not belong to the goal, or lack."""
+        """Return the target. Raises UsageError for a missing value or one of another goal."""
         return self.target_at(self.point)
 
 
 class Requirements(Section, frozen=True, kw_only=True):
-    """What `flight report` judges an orbit flight by; what is left out is not judged.
+    """Requirements that `flight report` checks for an orbit flight; an absent requirement is not checked.
 
-    `slow_within` s from the start to the end of the braking; `fine_within` s from there to a fine attitude.
-    In deg, rms: `knowledge_deg` of the attitude with stars, three axes; `pointing_deg` of the pointed axis,
-    once a target was pointed to for ten minutes.
+    `slow_within` s is the longest time from the start to the end of detumbling, `fine_within` s from there to
+    a fine attitude. `knowledge_deg` limits the rms error of the attitude with stars, all axes; `pointing_deg`
+    limits the rms error of the pointed axis after a target was pointed to for ten minutes.
     """
 
     slow_within: Positive | None = None
@@ -129,7 +126,7 @@ class Requirements(Section, frozen=True, kw_only=True):
 
 
 class OrbitConfig(Config, frozen=True, kw_only=True):
-    """The configuration of a satellite in orbit; `elements` are the two lines of its orbit, where known."""
+    """The configuration of a satellite in orbit; `elements` are its two-line elements, if known."""
 
     craft: Craft
     elements: tuple[str, str] | None = None
@@ -145,20 +142,20 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         return camera is not None and camera.star_tracker is not None and camera.objects is not None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest strength of a valid magnetometer reading, T."""
+        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
         return LEAST_FIELD, LARGEST_FIELD
 
     def replan_period(self) -> float:
-        """Return how often the pointing is planned again, s."""
+        """Return the period of planning, s."""
         return self.pointing.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of body and devices for which learned parameters hold."""
+        """Return the sections of the hardware to which learned parameters apply."""
         return (self.craft, *super().hardware())
 
 
 def as_orbit(config: Config) -> OrbitConfig:
-    """Return a configuration as that of a satellite in orbit. Raises ConfigError for another body's."""
+    """Return the configuration of a satellite in orbit. Raises ConfigError for another body."""
     if not isinstance(config, OrbitConfig):
         raise ConfigError("body", f"is {config.body}: this needs the configuration of a satellite in orbit")
     return config

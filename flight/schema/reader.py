@@ -1,6 +1,6 @@
-"""Reading a configuration: YAML in, a validated `flight.schema.sections.Config` out, or one clear line.
+"""Reading of a configuration: from YAML to a validated `flight.schema.sections.Config`.
 
-Every complaint names the file, the line, the value and what would be right.
+Each error is one line with the file, the line, the value and its cure.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import msgspec
 from flight.schema.consistency import check_consistency
 from flight.schema.conversion import convert
 from flight.schema.devices import Camera
-from flight.schema.document import read_document, read_text
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
@@ -23,10 +22,8 @@ from knightcube.errors import UsageError
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
 
-_SHAPES: dict[str, type[Config]] = {"orbit": OrbitConfig}
-"""The shape of a body's configuration; a body that is not here has the testbed's."""
-_EVERY: tuple[type[Config], ...] = (TestbedConfig, *_SHAPES.values())
-_FIELDS = {name for shape in _EVERY for name in shape.__struct_fields__}
+_FIELDS = {*TestbedConfig.__struct_fields__, *OrbitConfig.__struct_fields__}
+"""Names of the sections of all bodies."""
 
 
 def load(path: Path) -> Config:
@@ -35,13 +32,14 @@ def load(path: Path) -> Config:
 
 
 def parse(text: str, name: str = "configuration") -> Config:
-    """Validate configuration text; `name` stands for the file in complaints. Raises ConfigError."""
+    """Validate configuration text; `name` stands for the file in messages. Raises ConfigError."""
     document = read_document(text, name)
     for optional in ("camera", "power_monitor", "gps", "solar_strings"):
         if document.values.get(optional) == "none":
             document.values[optional] = None
-    shape = _SHAPES.get(str(document.values.get("body")), TestbedConfig)
-    config = convert(document, shape)
+    # A body outside this repository has the testbed's sections.
+    shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
+    config: Config = convert(document, shape)
     check_consistency(config, document)
     return config
 
@@ -55,7 +53,7 @@ def load_testbed(path: Path) -> TestbedConfig:
 
 
 def load_camera(path: Path) -> Camera:
-    """Read the camera of a whole configuration, or of a file that holds nothing but a `camera` section.
+    """Read the camera of a configuration, or of a file with only a `camera` section.
 
     Raises ConfigError, also when there is no camera.
     """
@@ -70,7 +68,7 @@ def load_camera(path: Path) -> Camera:
 
 
 def placed(error: UsageError, text: str, name: str) -> UsageError:
-    """Return a complaint that begins with a value's dotted name with file and line; others as they are."""
+    """Add file and line to an error that begins with the dotted name of a value; return others unchanged."""
     where, _, problem = str(error).partition(": ")
     if where.partition(".")[0].partition("[")[0] not in _FIELDS:
         return error

@@ -1,8 +1,8 @@
-"""The shape of a flight configuration: the sections of every body, each value with unit and bounds.
+"""The sections of every body's configuration, each value with its bounds.
 
-A configuration says what the flight application believes and how its devices are wired. What the simulated
-world really does stands in its `simulation` section, whose shape is sim_hal's own (`sim_hal.settings`).
-SI units unless the name says otherwise.
+A configuration holds what the flight application assumes and how its devices are wired. The simulated world
+is described by the `simulation` section, whose shape belongs to sim_hal (`sim_hal.settings`). SI units unless
+the name says otherwise.
 """
 
 from __future__ import annotations
@@ -12,16 +12,36 @@ from typing import Annotated, Any, Literal, Self
 import msgspec
 from msgspec import Meta
 
-from flight.schema.aim import Aim, GoalName
-from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
-from flight.schema.orbit_devices import Gps, SolarStrings, WideCamera
-from flight.schema.values import Q2, CommandedMode, HostPort, NotNegative, Peer, PlainMode, Positive, Section
+from flight.schema.devices import (
+    Camera,
+    Coils,
+    Gps,
+    InertialUnit,
+    PowerMonitor,
+    SolarStrings,
+    WideCamera,
+)
+from flight.schema.values import (
+    Q2,
+    Aim,
+    CommandedMode,
+    GoalName,
+    HostPort,
+    NotNegative,
+    Peer,
+    PlainMode,
+    Positive,
+    Section,
+    Share,
+)
+
+CONTROL_RATE_HZ = 40.0
+"""Rate of the control loop, Hz."""
 
 
 class Executive(Section, frozen=True, kw_only=True):
-    """Rates of the loop and bounds of its workers."""
+    """Time limits of the workers, s."""
 
-    control_rate_hz: Annotated[float, Meta(ge=1.0, le=200.0)] = 40.0
     planner_timeout: Positive = 2.0
     vision_timeout: Positive = 10.0
 
@@ -29,12 +49,11 @@ class Executive(Section, frozen=True, kw_only=True):
 class Estimation(Section, frozen=True, kw_only=True):
     """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance.
 
-    `*_start` are initial standard deviations of the other states: the gyro's bias, rad/s; the coils' gain;
-    and the age, s, that the inertial unit's samples have at their stamp, which may walk by `latency_walk`,
-    s per sqrt(s). Zero: known.
-    `coast` is for how long, s, the model carries the estimate on without a measurement; no coil is driven by
-    what it carries (`inertial_unit.max_age`). Since an earlier boot learned a value it may have `changed` by
-    this part of its standard deviation at the start.
+    `bias_start` (rad/s, gyro bias), `gain_start` (coils) and `latency_start` (s, age of the inertial unit's
+    samples at their stamp) are initial standard deviations; zero fixes the state. The latency walks by
+    `latency_walk` s per sqrt(s). For `coast` s without a measurement the model propagates the estimate, but
+    drives no coil (`inertial_unit.max_age`). A value that an earlier boot learned may have changed by the
+    part `changed` of its initial standard deviation.
     """
 
     current_noise: NotNegative = 2.0e-3
@@ -46,24 +65,23 @@ class Estimation(Section, frozen=True, kw_only=True):
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 15.0
     history: Positive = 6.0
     coast: Positive = 1.2
-    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.3
+    changed: Share = 0.3
 
 
 class Modes(Section, frozen=True, kw_only=True):
-    """Where the start leads, and what leads on from mode to mode (`flight.loop.modes`).
+    """The first mode, and the conditions for mode changes (`flight.loop.modes`).
 
-    After `crash_limit` unclean shutdowns within `crash_window` s of operation the start leads to safe instead
-    of `initial`. A slew has arrived within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s;
-    it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s;
-    a target of the demonstration is to be held from the end of the first path to it on. A body turns too fast
-    to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s the mode is safe.
-    A body that acquires its attitude goes on to `acquired` once the attitude has been known for `known_for`
+    After `crash_limit` recent unclean shutdowns the first mode is safe instead of `initial`. A slew has
+    arrived when it stays within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s; it is late
+    after `slew_limit` s. Holding fails when the error exceeds `hold_error` rad for `hold_patience` s; in the
+    demonstration this is checked from the end of the first path to a target. Above `tumble_rate` rad/s the
+    body rotates too fast to hold or slew. After `blind_limit` s without an estimate the mode is safe. A body
+    that acquires its attitude changes to the mode `acquired` when the attitude has been known for `known_for`
     s, and acquires the attitude again after `lost_for` s without it.
     """
 
     initial: PlainMode = "testbed-demo"
     crash_limit: Annotated[int, Meta(ge=1, le=16)] = 3
-    crash_window: Positive = 600.0
     boot_patience: Positive = 10.0
     arrived_angle: Positive = 0.01
     arrived_rate: Positive = 0.01
@@ -79,10 +97,10 @@ class Modes(Section, frozen=True, kw_only=True):
 
 
 class Detumble(Section, frozen=True, kw_only=True):
-    """Detumbling by the magnetometer: windows with the coils off, and its end.
+    """Detumbling by the magnetometer, which measures while the coils are off.
 
-    Times in s: `settle` after the coils went off until the field is trusted, `measure` while it is averaged,
-    `act` with the coils on. Detumbling is over when the rate has been below `low_rate` rad/s for `low_for` s.
+    Each cycle waits `settle` s for the coils' field to decay, averages the field for `measure` s and drives
+    the coils for `act` s. Detumbling ends when the rate has been below `low_rate` rad/s for `low_for` s.
     """
 
     settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
@@ -93,10 +111,11 @@ class Detumble(Section, frozen=True, kw_only=True):
 
 
 class Health(Section, frozen=True, kw_only=True):
-    """Bounds of what the flight may take of its board (`flight.loop.health`); looked at in real time.
+    """Limits of the board's resources (`flight.loop.health`), checked every `look_period` s.
 
-    `cpu_share` of one core, `memory` and `disk_free` in bytes, `memory_slope` in bytes an hour over at least
-    `slope_window` s after `warm_up` s; temperatures in degree C; `clock_step` in s.
+    `cpu_share` is relative to one core. `memory` and `disk_free` are in bytes. `memory_slope` is in bytes per
+    hour over at least `slope_window` s, from `warm_up` s on. Temperatures are in degree C: `temperature`
+    causes a warning, `hottest` is too hot.
     """
 
     look_period: Annotated[float, Meta(ge=0.5, le=600.0)] = 5.0
@@ -108,13 +127,12 @@ class Health(Section, frozen=True, kw_only=True):
     disk_free: Positive = 2.0e8
     temperature: float = 80.0
     hottest: float = 95.0
-    clock_step: Positive = 0.5
 
 
 class CommandStep(Aim, frozen=True, kw_only=True):
-    """One command of a time line, at `at` s of mission time.
+    """One command of a time line, sent at `at` s of mission time.
 
-    A mode, a slew to q2, a goal to point to with its values, or an event to clear.
+    The command is a mode, a slew to q2, a goal to point to with its values, or an event to clear.
     """
 
     at: NotNegative
@@ -125,9 +143,9 @@ class CommandStep(Aim, frozen=True, kw_only=True):
 
 
 class Commands(Section, frozen=True, kw_only=True):
-    """Where commands come from: a UNIX datagram socket, UDP on a bench, and a time line.
+    """Sources of commands: a UNIX datagram socket, UDP on a bench, and a time line.
 
-    `udp` (HOST:PORT) must be a loopback address: beyond the machine commands come by the `link`, with keys.
+    `udp` (HOST:PORT) must be a loopback address; other machines send commands through the `link`, with keys.
     """
 
     socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
@@ -143,13 +161,13 @@ class LinkSerial(Section, frozen=True, kw_only=True):
 
 
 class Link(Section, frozen=True, kw_only=True):
-    """The link process (`python -m flight link`): protected frames to and from the ground.
+    """The link process (`python -m flight link`), which exchanges protected frames with the ground.
 
     `keys` is the folder of keys and counters (`python -m ground keys`), `spacecraft` the identifier in each
-    frame. Lines: `udp` and `tcp` listen at HOST:PORT, open to `peers` only (without them the machine itself
-    where the address is a loopback address, the 256 addresses around it where it is another); `serial` is a
-    radio's. Telemetry goes to authentic senders, to `telemetry_to` (HOST:PORT, UDP), to all of `tcp` and to
-    `serial`: frames of `frame_bytes`, at most `rate` bytes/s of each line.
+    frame. `udp` and `tcp` listen at HOST:PORT and accept frames from `peers` only. Without `peers`, a
+    loopback address accepts this machine, any other address its network of 256 addresses. `serial` is the
+    line of a radio. Telemetry goes to authenticated senders, to `telemetry_to` (HOST:PORT, UDP), to all
+    clients of `tcp` and to `serial`, in frames of `frame_bytes` bytes and at most `rate` bytes/s per line.
     """
 
     keys: Annotated[str, Meta(min_length=1)]
@@ -164,7 +182,7 @@ class Link(Section, frozen=True, kw_only=True):
 
 
 class Telemetry(Section, frozen=True, kw_only=True):
-    """Sizes of the flight log and of the performance log, of each; and of all the runs of an archive."""
+    """Largest sizes of a log segment, of all segments of a log, and of all runs of an archive."""
 
     segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
     budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
@@ -172,9 +190,9 @@ class Telemetry(Section, frozen=True, kw_only=True):
 
 
 class State(Section, frozen=True, kw_only=True):
-    """What outlives the process (`flight.loop.state`): its folder, and the period of its writing, s.
+    """Storage of the state that outlives the process (`flight.loop.state`), written every `period` s.
 
-    Without a folder it is kept in systemd's STATE_DIRECTORY where real devices are flown, else nowhere.
+    Without a `folder`, a flight of real devices uses systemd's STATE_DIRECTORY and any other stores nothing.
     """
 
     folder: Annotated[str, Meta(min_length=1)] | None = None
@@ -182,9 +200,9 @@ class State(Section, frozen=True, kw_only=True):
 
 
 class Config(Section, frozen=True, kw_only=True):
-    """The sections of every body's configuration; each body has a shape of its own with more of them.
+    """The sections of every body's configuration; the configuration of a body adds its own.
 
-    `body` is the body that is flown, or a third party's as `module:object`.
+    `body` names the body; a body outside this repository is named as `module:object`.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
@@ -209,15 +227,15 @@ class Config(Section, frozen=True, kw_only=True):
     simulation: dict[str, Any] | None = None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest strength of a valid magnetometer reading, T."""
+        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
         return 0.0, self.inertial_unit.field_range
 
     def replan_period(self) -> float | None:
-        """Return how often a path is planned from the newest estimate, s; None for a body that plans none."""
+        """Return the period of planning from the newest estimate, s; None for a body that plans nothing."""
         return None
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of body and devices for which learned parameters hold."""
+        """Return the sections of the hardware to which learned parameters apply."""
         return (self.coils, self.inertial_unit)
 
     def shortened(self, duration: float) -> Self:

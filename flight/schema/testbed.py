@@ -1,4 +1,4 @@
-"""The shape of the testbed's configuration: its own sections beside those of every body."""
+"""The configuration of the testbed: its own sections beside those of every body."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Annotated, Literal, Self
 import msgspec
 from msgspec import Meta
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.sections import Config, Detumble, Estimation
 from flight.schema.values import Q2, NotNegative, Positive, Section
 
 
 class Plant(Section, frozen=True, kw_only=True):
-    """What the flight application believes about the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
+    """The flight application's model of the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
 
     inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
     coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
@@ -24,7 +24,7 @@ class Plant(Section, frozen=True, kw_only=True):
 
 
 class ThreadEstimation(Estimation, frozen=True, kw_only=True):
-    """The filter on the thread: also the thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's."""
+    """The filter on the thread, which also estimates torsion (1/s^2) and damping (1/s) beyond the plant's."""
 
     torsion_start: NotNegative = 0.02
     damping_start: NotNegative = 4.0e-3
@@ -33,8 +33,8 @@ class ThreadEstimation(Estimation, frozen=True, kw_only=True):
 class BdotDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by B-dot (`knightcube.gnc.control.detumble`).
 
-    `share` of the rate is to go in each window, as far as the coils can. Where the field's direction turns by
-    `field_turn` rad/s the share follows from that; zero where it stands, as on the testbed.
+    Each cycle removes the part `share` of the rate, as far as the coils can. If the direction of the field
+    rotates by `field_turn` rad/s, the share follows from that; a testbed without a cage has zero.
     """
 
     share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
@@ -42,9 +42,9 @@ class BdotDetumble(Detumble, frozen=True, kw_only=True):
 
 
 class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies.
+    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.guidance` explains the strategies.
 
-    `cost` is the energy that paths save: R I^2 of the mean current, or V |I| taken from the supply.
+    `cost` is the energy that paths minimise: heat R I^2 of the mean current, or V |I| taken from the supply.
     """
 
     strategy: Literal["goal", "receding", "step"] = "goal"
@@ -54,12 +54,11 @@ class Guidance(Section, frozen=True, kw_only=True):
     current_share: Annotated[float, Meta(ge=0.5, le=1.0)] = 0.95
     replan_period: Positive = 5.0
     late_after: Positive = 1.0
-    max_horizon: Positive = 60.0
     nodes: Annotated[int, Meta(ge=8, le=40)] | None = None
 
 
 class PidGains(Section, frozen=True, kw_only=True):
-    """Free gains of the PID controller on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
+    """Gains of the PID controller on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
 
     proportional: Positive
     integral: Positive
@@ -69,9 +68,9 @@ class PidGains(Section, frozen=True, kw_only=True):
 class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
-    `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
-    and `adaptive` the bandwidth and what follows it; `gains` replace the bandwidth of `pid`. `excitation` is
-    flown by `python -m flight identify`.
+    `lq` and `thesis` use the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight. `pid` and
+    `adaptive` use the bandwidth and the values after it; `gains` replace the bandwidth of `pid`.
+    `python -m flight identify` flies `excitation`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
@@ -85,23 +84,19 @@ class Control(Section, frozen=True, kw_only=True):
 
 
 class Identification(Section, frozen=True, kw_only=True):
-    """How `python -m flight identify` moves the body, and how well the plant is known beforehand.
+    """Motion of the body during `python -m flight identify`.
 
-    `*_error` are relative standard deviations of what stands in `plant`: the inertia, the coils' dipole per
-    ampere (turns, area and what the resistance makes of it), the field; and of the magnetometer's scale.
+    The coils use the part `current_share` of their current. The body stays within `largest_q2`; each free
+    swing lasts `swing` s.
     """
 
     current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
     largest_q2: Annotated[float, Meta(ge=0.05, le=0.5)] = 0.4
     swing: Positive = 45.0
-    inertia_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
-    dipole_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
-    field_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
-    magnetometer_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.02
 
 
 class Step(Section, frozen=True, kw_only=True):
-    """One commanded attitude: from `at` seconds of mission time reach q2 at `rate` rad/s; zero holds it."""
+    """One commanded attitude: q2 from `at` s of mission time on, at `rate` rad/s; rate 0 holds it."""
 
     at: NotNegative
     q2: Q2
@@ -109,10 +104,10 @@ class Step(Section, frozen=True, kw_only=True):
 
 
 class Cage(Section, frozen=True, kw_only=True):
-    """A Helmholtz cage that plays an orbit's field (`bodies.testbed.cage`), by UTC.
+    """A Helmholtz cage that reproduces the field of an orbit (`bodies.testbed.cage`), by UTC.
 
-    `elements` are the two lines of that orbit, `scale` how many times as strong the cage makes its field.
-    `plant.field` is then the weakest field that plans count on.
+    `elements` are two-line elements of the orbit, `scale` is the ratio of the cage's field to the orbit's.
+    `plant.field` is then the weakest field that plans assume.
     """
 
     elements: tuple[str, str]
@@ -122,7 +117,7 @@ class Cage(Section, frozen=True, kw_only=True):
 class TestbedConfig(Config, frozen=True, kw_only=True):
     """The testbed's configuration."""
 
-    __test__ = False  # pytest: not a test, in spite of its name
+    __test__ = False  # pytest would collect a class of this name
 
     plant: Plant
     estimation: ThreadEstimation = ThreadEstimation()
@@ -134,15 +129,15 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
     cage: Cage | None = None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest strength of a valid magnetometer reading, T."""
+        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
         return 0.2 * self.plant.field, 3.0 * self.plant.field
 
     def replan_period(self) -> float:
-        """Return how often a path is planned from the newest estimate, s."""
+        """Return the period of planning from the newest estimate, s."""
         return self.guidance.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of body and devices for which learned parameters hold."""
+        """Return the sections of the hardware to which learned parameters apply."""
         return (self.plant, *super().hardware())
 
     def shortened(self, duration: float) -> Self:
@@ -152,7 +147,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
 
 
 def as_testbed(config: Config) -> TestbedConfig:
-    """Return a configuration as the testbed's. Raises ConfigError for another body's."""
+    """Return the configuration of the testbed. Raises ConfigError for another body."""
     if not isinstance(config, TestbedConfig):
         raise ConfigError("body", f"is {config.body}: this needs a configuration of the testbed")
     return config

@@ -1,16 +1,22 @@
-"""The values that sections of a configuration are made of, with their bounds."""
+"""Types of the values in a configuration, with their bounds, and the values of a pointing goal."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+from knightcube.gnc.guidance.three_axes.pointing_target import ROLLS, Goal, PointingTarget
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
+Share = Annotated[float, Meta(gt=0.0, le=1.0)]
+Longitude = Annotated[float, Meta(ge=-360.0, le=360.0)]
+Latitude = Annotated[float, Meta(ge=-90.0, le=90.0)]
 Q2 = Annotated[float, Meta(ge=-Q2_LIMIT, le=Q2_LIMIT)]
 Address = Annotated[int, Meta(ge=0x08, le=0x77)]
 Bus = (
@@ -29,18 +35,71 @@ Peer = Annotated[
 HostPort = Annotated[
     str,
     Meta(
-        # Ports above 65535 are none, and waiting would not make them so.
         pattern=r"^[^:\s]+:([0-5]?[0-9]{1,4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])$",
         description="HOST:PORT, such as 127.0.0.1:5005, PORT 65535 at most",
     ),
 ]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
+BaudRate = Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
+Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
 CommandedMode = Literal[PlainMode, "sun", "point"]
+GoalName = Literal["nadir", "velocity", "sun", "inertial", "ground", "object"]
+
+_OWN = {
+    "inertial": ("quaternion",),
+    "ground": ("latitude_deg", "longitude_deg"),
+    "object": ("right_ascension_deg", "declination_deg"),
+}
+"""Keys that a goal requires and no other goal accepts; `object` accepts both of its keys or none."""
+_LENGTH_ERROR = 1e-3
+"""Largest deviation of a commanded quaternion from unit length."""
 
 
 class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     """One section of the configuration; unknown keys are refused."""
+
+
+class Aim(Section, frozen=True, kw_only=True):
+    """The values of a pointing goal.
+
+    The goal `inertial` requires `quaternion` (ICRS into body, scalar last), and `ground` latitude and
+    longitude. Right ascension and declination tell the goal `object` where to search. Without `roll_deg` the
+    roll is free.
+    """
+
+    quaternion: Quaternion | None = None
+    latitude_deg: Latitude | None = None
+    longitude_deg: Longitude | None = None
+    right_ascension_deg: Longitude | None = None
+    declination_deg: Latitude | None = None
+    roll_deg: Longitude | None = None
+
+    def target_at(self, goal: str) -> PointingTarget:
+        """Return the target at a goal. Raises UsageError for a missing value or one of another goal."""
+        angles = (self.latitude_deg, self.longitude_deg, self.right_ascension_deg, self.declination_deg)
+        numbers = tuple(math.radians(value) for value in angles if value is not None)
+        roll = None if self.roll_deg is None else math.radians(self.roll_deg)
+        return PointingTarget(Goal.named(goal), (*numbers, *(self.quaternion or ())), roll)
+
+
+def check_aim(dotted: str, aim: Aim, goal: str | None, refuse: Callable[[str, str], None]) -> None:
+    """Refuse missing values and values of another goal; without a goal, refuse all values."""
+    for owner, names in _OWN.items():
+        needed = owner == goal and (
+            owner != "object" or any(getattr(aim, name) is not None for name in names)
+        )
+        for name in names:
+            given = getattr(aim, name) is not None
+            if given and goal != owner:
+                refuse(f"{dotted}.{name}", f"belongs to `point: {owner}`, not to {goal or 'this command'}")
+            if not given and needed:
+                refuse(f"{dotted}.point", f"is {goal}: needs `{name}`")
+    if aim.roll_deg is not None and (goal is None or Goal.named(goal) in ROLLS):
+        refuse(f"{dotted}.roll_deg", ROLLS[Goal.named(goal)] if goal else "belongs to `point`")
+    if aim.quaternion is not None and abs(math.hypot(*aim.quaternion) - 1.0) > _LENGTH_ERROR:
+        length = math.hypot(*aim.quaternion)
+        refuse(f"{dotted}.quaternion", f"has length {length:.6g}: a quaternion must have length 1")

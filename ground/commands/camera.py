@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flight.schema.camera_model import camera_model
-from flight.schema.carried import config_path
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, camera_model
+from flight.schema.document import config_path
 from ground.commands.options import finite
 from ground.truth import sky_truth, write_truth
 from hal.interfaces.devices import Frame, FrameSource

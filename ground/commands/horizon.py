@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model
+from flight.schema.devices import camera_model
 from ground.commands import paper_horizon
 from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.horizon import draw_horizon

@@ -13,7 +13,7 @@ from typing import Any
 from flight.app.cli.run import progress_on, seed_number
 from flight.app.run import RunRequest
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path
+from flight.schema.document import config_path
 from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, write_new
 from ground.identification.fit import NAMES, UNITS, PlantFit, fit

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model
+from flight.schema.devices import camera_model
 from ground.commands.options import add_field
 from knightcube.errors import UsageError
 from knightcube.vision.star_tracker import field_of_view

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from flight.schema.carried import config_path
+from flight.schema.document import config_path
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image, read_raw

@@ -12,7 +12,7 @@ import numpy as np
 
 from flight.bodies.testbed.guidance import plant_of
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path
+from flight.schema.document import config_path
 from ground.commands import plan_orbit
 from ground.commands.options import finite, positive
 from knightcube import plan_step

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path
+from flight.schema.document import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive
 from knightcube import plan_slew

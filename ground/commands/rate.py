@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model, likelihood_settings
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, camera_model, likelihood_settings
 from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
 from knightcube.astro.arrays import FloatArray, Image

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model, likelihood_settings
+from flight.schema.devices import camera_model, likelihood_settings
 from ground.commands.date import date
 from ground.commands.options import (
     add_field,

@@ -15,7 +15,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.loop.facts import FACTS, StreamState
 from flight.schema import reader
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.report.orbit import detumbling, knowledge, objects, pointing, requirements
 from ground.report.signals import (

@@ -27,7 +27,6 @@ from hal.drivers.h_bridge import (
     brake,
     counts_for,
     current_step,
-    enable_for,
     inputs_for,
     largest_counts,
     mean_current,
@@ -236,10 +235,8 @@ class CoilOutputs:
     def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, list[PwmCounts]]]:
         """Return (first channel, counts from there on) of each block for signed counts of the coils."""
         pins: list[PwmCounts] = []
-        for coil, value, held in zip(self._settings.coils, counts, braked, strict=True):
+        for value, held in zip(counts, braked, strict=True):
             pins += brake() if held else inputs_for(value)
-            if coil.enable_channel is not None:
-                pins.append(enable_for(value))
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:

@@ -27,14 +27,12 @@ class CoilWiring:
         channel_b: PWM channel of input B.
         resistance: ohm, of the coil.
         sign: +1, or -1 for a coil with its leads swapped.
-        enable_channel: PWM channel of the bridge's enable input, None when it is tied high.
     """
 
     channel_a: int
     channel_b: int
     resistance: float
     sign: int = 1
-    enable_channel: int | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.resistance < math.inf:
@@ -43,26 +41,20 @@ class CoilWiring:
             raise OutOfRange(DEVICE, "coil sign", self.sign, -1, 1, "(-1 or +1)")
 
     @property
-    def channels(self) -> tuple[int, ...]:
-        """The PWM channels in use: A, B and, when wired, enable."""
-        enable = () if self.enable_channel is None else (self.enable_channel,)
-        return (self.channel_a, self.channel_b, *enable)
+    def channels(self) -> tuple[int, int]:
+        """The PWM channels of inputs A and B."""
+        return self.channel_a, self.channel_b
 
 
 Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
 
 
 def wirings(
-    channels: Sequence[tuple[int, int]],
-    resistance: Sequence[float],
-    signs: Sequence[int],
-    enable_channels: Sequence[int] | None,
+    channels: Sequence[tuple[int, int]], resistance: Sequence[float], signs: Sequence[int]
 ) -> Wirings:
     """Return the wiring of the three coils from three values of each kind. Raises OutOfRange."""
-    enables = enable_channels or (None, None, None)
     x, y, z = (
-        CoilWiring(a, b, ohm, sign, enable)
-        for (a, b), ohm, sign, enable in zip(channels, resistance, signs, enables, strict=True)
+        CoilWiring(a, b, ohm, sign) for (a, b), ohm, sign in zip(channels, resistance, signs, strict=True)
     )
     return x, y, z
 
@@ -165,11 +157,6 @@ def brake() -> tuple[PwmCounts, PwmCounts]:
     Both ends of the coil are then at the upper rail, for either leg and for a sound bridge.
     """
     return FULL_ON, FULL_ON
-
-
-def enable_for(counts: int) -> PwmCounts:
-    """Return the PWM counts of a wired enable input: low at zero, so that the coil floats, not brakes."""
-    return FULL_ON if counts else FULL_OFF
 
 
 def _pulse(counts: int) -> PwmCounts:

@@ -2,10 +2,10 @@
 
 The mean current over a PWM period moves the body: coil L/R is 0.1 ms, the period 20 ms (SN754410 and PCA9685
 data sheets). While the two inputs of a bridge differ, V/R drives the coil in one direction. Equal inputs
-brake the coil, and an enable input that is low lets it coast; neither makes a current.
+brake the coil.
 
-The supply's current is chopped: a bridge draws its coil's current only while its inputs differ and its
-enable input is high. `ChoppedSupply` integrates the current of three bridges exactly over any window.
+The supply's current is chopped: a bridge draws its coil's current only while its inputs differ.
+`ChoppedSupply` integrates the current of three bridges exactly over any window.
 """
 
 from __future__ import annotations
@@ -30,31 +30,27 @@ _HISTORY_NS = 500_000_000
 
 
 class Bridge(NamedTuple):
-    """The pulses on inputs A and B of a bridge, and on its enable input."""
+    """The pulses on inputs A and B of a bridge, whose enable input is tied high."""
 
     a: Pulse
     b: Pulse
-    enable: Pulse
 
     def net_counts(self) -> int:
         """Return for how many counts of a period, signed, the coil is driven; both inputs high brake."""
-        if self.enable[1] == COUNTS:
-            return self.a[1] - self.b[1]
-        return common_counts(self.a, self.enable) - common_counts(self.b, self.enable)
+        return self.a[1] - self.b[1]
 
     def driven(self) -> list[tuple[int, int]]:
         """Return the spans of counts [begin, end) in which the coil is driven either way."""
         if self.a == self.b:
             return []
-        pulses = (self.a, self.b, self.enable)
         edges = {0, COUNTS}
-        for first, length in pulses:
+        for first, length in self:
             edges |= {first, (first + length) % COUNTS}
         ordered = sorted(edges)
         spans = []
         for begin, end in pairwise(ordered):
-            a, b, enabled = ((begin - first) % COUNTS < length for first, length in pulses)
-            if enabled and a != b:
+            a, b = ((begin - first) % COUNTS < length for first, length in self)
+            if a != b:
                 spans.append((begin, end))
         return spans
 
@@ -111,20 +107,11 @@ class ChoppedSupply:
         return total
 
 
-def common_counts(a: Pulse, b: Pulse) -> int:
-    """Return for how many counts of a period two pulses are high together."""
-    lag = (b[0] - a[0]) % COUNTS
-    # b's pulse as a sees it starts at lag, and what runs over the period's end comes back at its beginning.
-    first = min(a[1], lag + b[1]) - lag
-    wrapped = min(a[1], lag + b[1] - COUNTS)
-    return max(0, first) + max(0, wrapped)
-
-
 CURRENT_UNCERTAINTY = 3.5e-3
 """A; the thesis's bound on the error of a coil's current."""
 
 _LOW, _HIGH = (0, 0), (0, COUNTS)
-_OFF = Bridge(_LOW, _LOW, _HIGH)
+_OFF = Bridge(_LOW, _LOW)
 
 
 class CoilCondition(Enum):
@@ -243,12 +230,7 @@ class CoilCircuit:
 
     def _bridge(self, coil: CoilWiring, stuck_a: Pulse | None, stuck_b: Pulse | None) -> Bridge:
         """Return the pulses that a bridge's legs follow: their inputs', or those at which they are stuck."""
-        high, enable = self._chip.high, coil.enable_channel
-        return Bridge(
-            stuck_a or high(coil.channel_a),
-            stuck_b or high(coil.channel_b),
-            _HIGH if enable is None else high(enable),
-        )
+        return Bridge(stuck_a or self._chip.high(coil.channel_a), stuck_b or self._chip.high(coil.channel_b))
 
     def _remember(self) -> None:
         # Without a clock the outputs are constant, and any frequency is right.

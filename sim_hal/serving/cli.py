@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path, names
+from flight.schema.document import config_path, names
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import Clock
 from knightcube.errors import UsageError

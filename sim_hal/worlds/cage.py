@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.testbed import as_testbed
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import CageTruth, Disturbances

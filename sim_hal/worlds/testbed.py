@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.testbed import TestbedConfig, as_testbed
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation

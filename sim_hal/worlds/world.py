@@ -16,7 +16,7 @@ import numpy as np
 
 from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUTH
 from flight.link.telemetry.packets import Packer
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import DAY

@@ -12,7 +12,7 @@ import pytest
 
 from flight.app.flight import fly
 from flight.app.run import RunRequest
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from hal.interfaces.errors import NotResponding
 from tests.deploy.scripts import (
     DEPLOY,

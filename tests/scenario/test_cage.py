@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, config_path
 from flight.schema.sections import Config
 from ground.report.signals import true_attitude
 from ground.telemetry import Run

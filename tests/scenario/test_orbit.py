@@ -10,7 +10,7 @@ import pytest
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise

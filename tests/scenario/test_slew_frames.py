@@ -7,7 +7,7 @@ import pytest
 
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model
+from flight.schema.devices import camera_model
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix

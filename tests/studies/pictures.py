@@ -17,7 +17,7 @@ from flight.app.flight import fly
 from flight.app.run import RunRequest
 from flight.bodies.testbed.guidance import plant_of
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model
+from flight.schema.devices import camera_model
 from flight.schema.testbed import as_testbed
 from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution

@@ -14,8 +14,7 @@ import numpy as np
 from msgspec import Meta
 
 from flight.schema.conversion import convert
-from flight.schema.document import read_document, read_text
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, read_document, read_text
 from flight.schema.values import NotNegative, Positive, Quaternion, Section
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix

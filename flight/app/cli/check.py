@@ -24,9 +24,8 @@ from flight.app.cli.run import counts_text, summary_facts
 from flight.app.devices import linux_camera, unit_settings
 from flight.app.run import RunRequest, RunResult
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path, names
-from flight.schema.devices import Camera
-from flight.schema.orbit_devices import WideCamera
+from flight.schema.devices import Camera, WideCamera
+from flight.schema.document import config_path, names
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus, device_file

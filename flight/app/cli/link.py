@@ -21,9 +21,8 @@ from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
 from flight.link.process.station import Station, StationSettings
 from flight.link.process.verification import ControlLine, Sent
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
-from flight.schema.carried import config_path
-from flight.schema.errors import ConfigError
-from flight.schema.peers import peer_networks
+from flight.schema.consistency import peer_networks
+from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock

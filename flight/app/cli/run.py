@@ -14,7 +14,7 @@ from typing import Any, TextIO
 from flight.app.cli import PROGRAM
 from flight.app.run import RunRequest, RunResult
 from flight.loop.flight_loop import FlightEnding, FlightProgress
-from flight.schema.carried import config_path, names
+from flight.schema.document import config_path, names
 from knightcube.errors import FlightError
 
 

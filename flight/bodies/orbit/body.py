@@ -34,11 +34,11 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned
-from flight.schema.camera_model import camera_model
-from flight.schema.errors import ConfigError
+from flight.schema.devices import SolarStrings as StringsSection
+from flight.schema.devices import camera_model
+from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
-from flight.schema.orbit_devices import SolarStrings as StringsSection
-from flight.schema.sections import Config
+from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.devices import GpsReading, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
@@ -329,14 +329,18 @@ def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
     return [(step.at, step.target()) for step in config.targets]
 
 
+_FIELD_ERROR = 5.0e-8
+"""Error of the magnetic field model, per axis, T."""
+
+
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
     """Return the configured noises of the filter's states."""
-    section, rate_hz = config.estimation, config.executive.control_rate_hz
+    section = config.estimation
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
-        coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(rate_hz),
+        coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(CONTROL_RATE_HZ),
         torque=(section.torque_start, section.torque_walk),
-        field=section.field_error,
+        field=_FIELD_ERROR,
         gate_sigma=section.gate_sigma,
     )
 

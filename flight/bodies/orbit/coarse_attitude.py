@@ -18,8 +18,7 @@ import numpy as np
 
 from flight.bodies.orbit.environment import OrbitEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
-from flight.schema.camera_model import camera_model
-from flight.schema.orbit_devices import WideCamera
+from flight.schema.devices import WideCamera, camera_model
 from hal.interfaces.devices import Frame, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import chi_square

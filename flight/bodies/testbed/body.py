@@ -49,7 +49,7 @@ from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned, start_from
 from flight.schema.devices import InertialUnit
-from flight.schema.sections import Config
+from flight.schema.sections import CONTROL_RATE_HZ, Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -237,7 +237,7 @@ def _tracker(
     config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
 ) -> Tracker:
     """Return the tracker: of the coil on body x, in a cage of those on x and z."""
-    period, dipole = 1.0 / config.executive.control_rate_hz, dipole_per_ampere(config)
+    period, dipole = 1.0 / CONTROL_RATE_HZ, dipole_per_ampere(config)
     controller = controller_of(config.control, plant, period, config.identification)
     tracker = ThreadTracker(controller, reader, dipole)
     return tracker if cage is None else CageTracker(tracker, reader, plant, cage, dipole)
@@ -274,7 +274,7 @@ def attitude_filter(
     )
     settings = FilterSettings(
         current_noise=section.current_noise,
-        control_period=1.0 / config.executive.control_rate_hz,
+        control_period=1.0 / CONTROL_RATE_HZ,
         disturbance_walk=section.disturbance_walk,
         bias_start=section.bias_start,
         torsion_start=section.torsion_start,
@@ -324,7 +324,6 @@ def planning_settings(config: TestbedConfig) -> PlanningSettings:
     section = config.guidance
     return PlanningSettings(
         horizon=section.horizon,
-        max_horizon=section.max_horizon,
         late_after_ns=round(section.late_after * SECOND_NS),
         nodes=section.nodes or NODES,
         strategy=Strategy(section.strategy),

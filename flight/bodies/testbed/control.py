@@ -20,7 +20,7 @@ import numpy as np
 
 from flight.bodies.testbed.guidance import ThreadReader
 from flight.loop.body import CoilCommand, Tracker
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.testbed import Cage, Control, Identification
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.astro.arrays import FloatArray

@@ -22,6 +22,7 @@ from flight.link.telemetry.definitions import MAX_NODES, PLAN
 from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
+from flight.schema.sections import CONTROL_RATE_HZ
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
@@ -53,7 +54,7 @@ def plant_of(config: TestbedConfig) -> SingleAxisPlant:
 def angular_acceleration_psd_of(config: TestbedConfig, plant: SingleAxisPlant) -> float:
     """Return the power spectral density of the angular acceleration due to current noise, rad^2/s^3."""
     noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
-    return noise**2 / config.executive.control_rate_hz
+    return noise**2 / CONTROL_RATE_HZ
 
 
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
@@ -144,6 +145,8 @@ def law_of(target: Target) -> ThreadLaw:
 
 
 _AGAIN_NS = 1_000_000_000
+_MAX_HORIZON = 60.0
+"""Longest horizon of a path, s."""
 
 
 class Strategy(StrEnum):
@@ -160,7 +163,6 @@ class PlanningSettings:
 
     Attributes:
         horizon: s, requested for a new target; an initial guess where time has a price.
-        max_horizon: s, the longest allowed.
         late_after_ns: planning time after which a plan is late.
         nodes: number of nodes of the path.
         strategy: see the module.
@@ -172,7 +174,6 @@ class PlanningSettings:
     """
 
     horizon: float
-    max_horizon: float
     late_after_ns: int
     nodes: int
     strategy: Strategy
@@ -294,7 +295,7 @@ class Planning:
             end_q2,
             law.rate,
             horizon,
-            settings.max_horizon,
+            _MAX_HORIZON,
             settings.nodes,
             None if begun else settings.time_price,
             self._guidance.remains(now_ns) if begun else None,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray

@@ -22,7 +22,7 @@ from flight.app.flight import fly
 from flight.app.run import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError, UnreadConfigError
+from flight.schema.document import ConfigError, UnreadConfigError
 from flight.schema.testbed import as_testbed
 from ground.telemetry import read_run
 from sim_hal.faults.host import corrupted

@@ -15,7 +15,7 @@ from flight.app.run import RunRequest
 from flight.app.service import StartRetry, StoppedError, pauses, retried_start
 from flight.link.telemetry.packets import to_text
 from flight.loop.state import StateStore
-from flight.schema.errors import ConfigError, UnreadConfigError
+from flight.schema.document import ConfigError, UnreadConfigError
 from ground.telemetry import read_run
 from hal.interfaces.errors import NotResponding
 from knightcube.errors import UsageError

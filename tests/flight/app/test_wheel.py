@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import flight
-from flight.schema.carried import FOLDER, config_path, names
+from flight.schema.document import FOLDER, config_path, names
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -100,7 +100,7 @@ def test_the_installed_wheel_flies_the_demonstration_from_any_folder(
 
 
 def test_the_installed_wheel_carries_the_sensor_suites(environment: Path, tmp_path: Path) -> None:
-    script = "from flight.schema.carried import FOLDER as f; print(*sorted(p.name for p in f.glob('*/*')))"
+    script = "from flight.schema.document import FOLDER as f; print(*sorted(p.name for p in f.glob('*/*')))"
     carried = _type(environment, tmp_path, "python", "-c", script).split()
     assert carried == sorted(path.name for path in (ROOT / "config" / "sensors").iterdir())
 

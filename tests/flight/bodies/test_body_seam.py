@@ -11,7 +11,7 @@ from msgspec import structs
 from flight.app.composition import body_kind
 from flight.loop.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.testbed import as_testbed
 from ground.telemetry import Run
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y

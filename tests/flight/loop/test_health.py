@@ -102,7 +102,7 @@ class TwoClocks:
 
 def test_a_step_of_the_wall_clock_is_seen_either_way_and_slow_drift_is_not() -> None:
     clocks = TwoClocks()
-    watch = ClockWatch(clocks, 0.5)  # type: ignore[arg-type]  # of a clock it asks the time only
+    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # of a clock it asks the time only
     seen = []
     for k in range(200):
         clocks.go(0.25, drift=2e-4)

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from flight.link.commands.codec import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
-from flight.schema.camera_model import camera_knowledge
-from flight.schema.document import read_document, to_yaml
-from flight.schema.errors import ConfigError
+from flight.schema.devices import camera_knowledge
+from flight.schema.document import ConfigError, read_document, to_yaml
 from flight.schema.orbit import as_orbit
 from flight.schema.testbed import as_testbed
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget

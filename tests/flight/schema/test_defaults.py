@@ -17,7 +17,7 @@ import flight
 import hal
 import knightcube
 import sim_hal
-from flight.schema import devices, orbit, orbit_devices, sections, testbed
+from flight.schema import devices, orbit, sections, testbed
 from hal.interfaces.wires import SECOND_NS
 
 OF_CAMERA = (devices.Camera, devices.StarTracker)
@@ -49,7 +49,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
     "Vn100Settings": (devices.InertialUnit,),
-    "HorizonCameraSettings": (orbit_devices.WideCamera,),
+    "HorizonCameraSettings": (devices.WideCamera,),
 }
 """The sections that a flight fills each settings class from."""
 

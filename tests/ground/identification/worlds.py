@@ -58,19 +58,19 @@ def believed() -> TestbedConfig:
 def drawn(rng: np.random.Generator) -> World:
     """Draw a world: scale as believed with the stated errors, a thread of up to three times the usual."""
     config = believed()
-    plant, known = config.plant, config.identification
+    plant = config.plant
 
     def about(value: float, error: float) -> float:
         return value * math.exp(error * float(np.clip(rng.standard_normal(), -3.0, 3.0)))
 
     return World(
-        inertia=about(plant.inertia, known.inertia_error),
-        dipole=about(plant.coil_turns * plant.coil_area, known.dipole_error),
-        field=about(plant.field, known.field_error),
+        inertia=about(plant.inertia, INERTIA_ERROR),
+        dipole=about(plant.coil_turns * plant.coil_area, DIPOLE_ERROR),
+        field=about(plant.field, FIELD_ERROR),
         stiffness=rng.uniform(0.0, 3.0e-5),
         damping=rng.uniform(0.0, 6.0e-6),
         bias=1e-4 * rng.standard_normal(),
-        magnetometer=about(1.0, known.magnetometer_error),
+        magnetometer=about(1.0, MAGNETOMETER_ERROR),
         seed=int(rng.integers(1, 2**31)),
     )
 

@@ -11,7 +11,7 @@ import pytest
 from flight.app.cli import main
 from flight.schema import reader as configuration
 from flight.schema.devices import AravisDevice, V4l2Device
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.vision.camera.images import read_image
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import kernel_in

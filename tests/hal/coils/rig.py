@@ -26,7 +26,7 @@ UNEQUAL = dataclasses.replace(
     coils=(
         CoilWiring(0, 1, 23.0),
         CoilWiring(3, 2, 17.0, sign=-1),
-        CoilWiring(8, 9, 25.0, enable_channel=10),
+        CoilWiring(8, 9, 25.0),
     ),
 )
 

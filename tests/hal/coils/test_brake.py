@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
-from hal.drivers.h_bridge import CoilWiring, brake
+from hal.drivers.h_bridge import brake
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.errors import Refused
 from sim_hal.emulators.coil_circuit import CoilCondition
-from tests.hal.coils.rig import PCA, THESIS, Rig
+from tests.hal.coils.rig import PCA, Rig
 
 MS = 1_000_000
 FULL = 3.4 / 23.0
@@ -116,14 +114,3 @@ def test_a_start_begins_without_brakes() -> None:
     rig.coils.start()
     assert rig.coils.state().braked == (False, False, False)
     assert rig.duties == [0.0] * 16
-
-
-def test_an_enable_that_is_wired_lets_a_braked_coil_coast() -> None:
-    """Low at zero it cuts both legs off, whatever the inputs are."""
-    wiring = CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0, enable_channel=6), CoilWiring(4, 5, 23.0)
-    rig = Rig(replace(THESIS, coils=wiring))
-    rig.coils.start()
-    rig.wire.circuit.become(1, CoilCondition.A_HIGH)
-    assert rig.currents() == [0.0, 0.0, 0.0]
-    rig.coils.brake(Y)
-    assert rig.currents() == [0.0, 0.0, 0.0]

@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 
 from hal.drivers.h_bridge import CoilWiring
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
-from sim_hal.emulators.coil_circuit import Bridge, Chopping, CoilCircuit, common_counts
+from sim_hal.emulators.coil_circuit import Bridge, Chopping, CoilCircuit
 from tests.hal.coils.rig import THESIS, THESIS_COILS, Rig
 
 FULL = 3.4 / 23.0
-WITH_ENABLE = replace(
-    THESIS, coils=(CoilWiring(0, 1, 23.0, enable_channel=2), CoilWiring(3, 4, 23.0), CoilWiring(5, 6, 23.0))
-)
 PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
 
 
@@ -39,31 +36,6 @@ def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current
     rig.pca.configure()
     rig.pca.write_channels(0, [input_a, input_b])
     assert rig.currents() == pytest.approx([current, 0.0, 0.0], abs=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("enable", "current"),
-    [
-        (FULL_ON, FULL / 2),
-        (FULL_OFF, 0.0),  # X: coast
-        ((0, 1024), FULL / 4),
-        ((1024, 3072), FULL / 4),
-        ((2048, 4095), 0.0),
-    ],
-)
-def test_a_low_enable_lets_the_coil_coast(enable: PwmCounts, current: float) -> None:
-    rig = Rig(WITH_ENABLE)
-    rig.pca.configure()
-    rig.pca.write_channels(0, [(0, 2048), FULL_OFF, enable])
-    assert rig.currents()[0] == pytest.approx(current, abs=1e-15)
-
-
-@given(a=PULSE, b=PULSE)
-def test_common_counts_agrees_with_counting(a: tuple[int, int], b: tuple[int, int]) -> None:
-    high_a, high_b = (np.zeros(4096, dtype=bool) for _ in range(2))
-    high_a[(a[0] + np.arange(a[1])) % 4096] = True
-    high_b[(b[0] + np.arange(b[1])) % 4096] = True
-    assert common_counts(a, b) == np.count_nonzero(high_a & high_b)
 
 
 def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
@@ -145,22 +117,21 @@ def test_a_sleeping_or_browned_out_chip_carries_no_current() -> None:
 @given(
     a=PULSE,
     b=PULSE,
-    enable=PULSE,
     begin=st.integers(0, 100_000_000),
     span=st.integers(100_000, 68_100_000),
 )
 def test_the_chopped_charge_agrees_with_sampling_the_bridge(
-    a: tuple[int, int], b: tuple[int, int], enable: tuple[int, int], begin: int, span: int
+    a: tuple[int, int], b: tuple[int, int], begin: int, span: int
 ) -> None:
     """Sampled in the middle of 20,000 slices; each edge of a period may miss by one slice."""
     period = 20_000_000.0
-    chopping = Chopping(0, 0, period, ((Bridge(a, b, enable), 0.148),))
+    chopping = Chopping(0, 0, period, ((Bridge(a, b), 0.148),))
     count = 20_000
     times = begin + span * (np.arange(count) + 0.5) / count
     at = times / period % 1.0 * 4096
-    on_a, on_b, enabled = ((at - first) % 4096 < length for first, length in (a, b, enable))
-    sampled = 0.148 * np.mean(enabled & (on_a != on_b))
-    edges = 6 * (span / period + 2)
+    on_a, on_b = ((at - first) % 4096 < length for first, length in (a, b))
+    sampled = 0.148 * np.mean(on_a != on_b)
+    edges = 4 * (span / period + 2)
     assert chopping.charge(begin, begin + span) / span == pytest.approx(sampled, abs=0.148 * edges / count)
 
 

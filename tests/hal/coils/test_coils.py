@@ -28,7 +28,7 @@ USUAL = st.floats(-0.25, 0.25)
 def test_the_world_feels_what_was_commanded_within_half_a_count(
     command: tuple[float, float, float], limit: float
 ) -> None:
-    """Coils of unequal resistance, one of them wired backwards, one with an enable input."""
+    """Coils of unequal resistance, one of them wired backwards."""
     rig = Rig(limited_to(limit))
     rig.coils.start()
     rig.command(*command)
@@ -67,25 +67,6 @@ def test_both_inputs_are_low_at_zero_and_the_idle_one_otherwise(rig: Rig) -> Non
     assert [b_x, a_y, a_z, b_z, *others] == [0.0] * 14
     rig.command(0.0, 0.0, 0.0)
     assert rig.duties == [0.0] * 16
-
-
-def test_a_wired_enable_coasts_at_zero_and_drives_otherwise() -> None:
-    rig = Rig(UNEQUAL)
-    rig.coils.start()
-    rig.command(0.0, 0.0, -0.02)
-    assert rig.wire.chip.duty(10) == 1.0
-    rig.command(0.0, 0.0, 0.0)
-    assert rig.wire.chip.duty(10) == 0.0
-
-
-def test_three_coils_with_enable_take_nine_channels_in_two_blocks() -> None:
-    wiring = tuple(CoilWiring(3 * axis, 3 * axis + 1, 23.0, enable_channel=3 * axis + 2) for axis in range(3))
-    rig = Rig(replace(THESIS, coils=(wiring[0], wiring[1], wiring[2])))
-    assert [(first, len(pins)) for first, pins in rig.settings.blocks()] == [(0, 8), (8, 1)]
-    rig.coils.start()
-    rig.command(0.1, -0.1, 0.03)
-    half = 0.5 * current_step(23.0, 3.4)
-    assert rig.currents() == pytest.approx([0.1, -0.1, 0.03], abs=half)
 
 
 def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:

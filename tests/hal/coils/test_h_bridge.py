@@ -9,7 +9,6 @@ import pytest
 from hal.drivers.h_bridge import (
     counts_for,
     current_step,
-    enable_for,
     inputs_for,
     largest_counts,
     mean_current,
@@ -41,10 +40,6 @@ def test_no_counts_are_ever_equal_and_both_inputs_are_never_driven_at_once() -> 
         pins = inputs_for(counts)
         assert all(on != off for on, off in pins)
         assert FULL_OFF in pins
-
-
-def test_enable_is_low_only_at_zero() -> None:
-    assert [enable_for(counts) for counts in (-3, 0, 3)] == [FULL_ON, FULL_OFF, FULL_ON]
 
 
 def test_full_drive_is_the_thesis_maximum_current() -> None:

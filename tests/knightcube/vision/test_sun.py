@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flight.schema.orbit_devices import WideCamera
+from flight.schema.devices import WideCamera
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import from_matrix, from_rotation_vector

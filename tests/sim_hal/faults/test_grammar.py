@@ -8,7 +8,7 @@ import pytest
 
 from flight.app.cli import main
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.errors import UsageError
 from sim_hal.faults.bench import FaultKind
 from sim_hal.faults.catalogue import CATALOGUE, listing

@@ -13,7 +13,7 @@ import pytest
 
 from flight.loop.executive import JobResult, LockStepRunner, Worker
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from sim_hal.clock import SimClock
 from sim_hal.faults.host import ProcessFaults, Task, corrupted, corrupted_by, perform, without_numbers
 from sim_hal.faults.schedule import parse

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.schema.carried import config_path
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import load, simulation_section
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray, Image

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema import reader
-from flight.schema.orbit_devices import Gps, SolarString, SolarStrings, WideCamera
+from flight.schema.devices import Gps, SolarString, SolarStrings, WideCamera
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray

@@ -10,7 +10,7 @@ import pytest
 
 from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from ground.telemetry import scan
 from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.errors import NotResponding

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flight.schema import reader
-from flight.schema.carried import config_path
+from flight.schema.document import config_path
 from flight.schema.testbed import as_testbed
 from sim_hal.worlds.testbed import helmholtz_field
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from tests.sim_hal.worlds.spinning_world import RATE
 from tests.support.flights import demo_config, demo_world, fly
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.astro.arrays import FloatArray
 from tests.support import sensor_suite
 from tests.support.orbit_geometry import SUITES, suite

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig

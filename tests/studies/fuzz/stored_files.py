@@ -26,7 +26,7 @@ from flight.link.process.scheduling import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed
 from flight.loop.state import Learned, StoredState, UncleanShutdown, decode, encode
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
 from knightcube.errors import UsageError
 from tests.studies.fuzz.configurations import FOLDER as CONFIGURATIONS

@@ -11,8 +11,7 @@ from flight.bodies.testbed.control import CageField, CageTracker, local_frame
 from flight.bodies.testbed.guidance import ThreadEstimate, plant_of
 from flight.loop.body import CoilCommand
 from flight.schema import reader as configuration
-from flight.schema.carried import config_path
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError, config_path
 from flight.schema.testbed import Cage, TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray

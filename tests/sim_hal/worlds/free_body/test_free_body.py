@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.schema import reader
-from flight.schema.errors import ConfigError
+from flight.schema.document import ConfigError
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Disturbances, FreeBodySection, OrbitSection, Simulation, TipOff

@@ -9,8 +9,8 @@ import pytest
 
 from flight.link.commands.channel import open_udp
 from flight.link.commands.codec import CommandPacker, Ping
-from flight.schema.errors import ConfigError
-from flight.schema.peers import peer_networks
+from flight.schema.consistency import peer_networks
+from flight.schema.document import ConfigError
 from flight.schema.reader import parse
 from tests.support.flights import CONFIG
 

@@ -1,0 +1,151 @@
+"""YAML text is read by the core schema of YAML 1.2, as another library reads it, or refused with its line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+
+from flight.schema.document import ConfigError, config_path, join, read_document, read_text, to_yaml
+
+FOLDER = Path(__file__).resolve().parents[3] / "config"
+FILES = sorted(FOLDER.rglob("*.yaml"))
+
+_PLAIN = st.sampled_from(
+    """true True FALSE yes no on off null ~ none x y N -x- a:b 12:30 1:30:00 1.2.3
+    1e-3 1E5 -1.5e+3 .5 -.5 1. +7 017 0o17 0x1F 1e e5 0x 0o8 .e1 .""".split()  # noqa: SIM905 - a list is longer
+)
+_SCALARS = (
+    _PLAIN
+    | st.integers(-(10**30), 10**30).map(str)
+    | st.floats(allow_nan=False, allow_infinity=False).map(repr)
+    | st.text(st.characters(exclude_categories=["Cs", "Cc", "Cn"]), max_size=12).map(json.dumps)
+)
+_KEYS = st.from_regex(r"[a-z_]{1,8}", fullmatch=True).filter(lambda key: key not in {"null", "true", "false"})
+_TREES = st.dictionaries(
+    _KEYS,
+    st.recursive(
+        _SCALARS, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(_KEYS, inner, max_size=3)
+    ),
+    min_size=1,
+    max_size=4,
+)
+
+
+def other_reader(text: str) -> Any:
+    return YAML(typ="safe", pure=True).load(text)
+
+
+def written(tree: Any, indent: int, flow: bool) -> str:
+    """Return YAML text of nested lists and mappings, whose scalars are YAML text already."""
+    if not tree or isinstance(tree, str):
+        return f" {tree}" if isinstance(tree, str) else " []" if isinstance(tree, list) else " {}"
+    if flow:
+        inner = (
+            [written(each, 0, flow) for each in tree]
+            if isinstance(tree, list)
+            else [f"{key}:{written(each, 0, flow)}" for key, each in tree.items()]
+        )
+        return f" [{','.join(inner)} ]" if isinstance(tree, list) else f" {{{','.join(inner)} }}"
+    pad = "\n" + "  " * indent
+    if isinstance(tree, list):
+        return "".join(f"{pad}-{written(each, indent + 1, flow)}" for each in tree)
+    return "".join(f"{pad}{key}:{written(each, indent + 1, flow)}" for key, each in tree.items())
+
+
+def typed(value: Any) -> Any:
+    """Return a value with the type of each scalar, so that 1, 1.0 and true differ."""
+    if isinstance(value, dict):
+        return {key: typed(inner) for key, inner in value.items()}
+    return [typed(inner) for inner in value] if isinstance(value, list) else (type(value), repr(value))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_both_readers_agree_about_every_shipped_file_and_its_lines(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    document = read_document(text, path.name)
+    assert typed(document.values) == typed(other_reader(text))
+    compared = 0
+
+    def compare(tree: Any, dotted: str) -> None:
+        nonlocal compared
+        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+        for key, inner in pairs:
+            name = join(dotted, key) if isinstance(tree, dict) else f"{dotted}[{key}]"
+            place = tree.lc.key(key) if isinstance(tree, dict) else tree.lc.item(key)
+            assert document.lines[name] == place[0] + 1
+            compared += 1
+            compare(inner, name)
+
+    compare(YAML(typ="rt", pure=True).load(text), "")
+    assert compared == len(document.lines) > 3
+
+
+@given(_TREES, st.booleans())
+def test_both_readers_agree_about_documents_of_plain_and_quoted_scalars(tree: Any, flow: bool) -> None:
+    text = written(tree, 0, flow).strip() + "\n"
+    assert typed(read_document(text, "made").values) == typed(other_reader(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3),
+        (".5e3", 500.0),
+        ("1.", 1.0),
+        ("017", 17),
+        ("0o17", 15),
+        ("0x1F", 31),
+        ("-7", -7),
+        ("TRUE", True),
+        ("~", None),
+        ("", None),
+        ("yes", "yes"),
+        ("off", "off"),
+        ("1:30", "1:30"),
+        ("1_000", "1_000"),
+        ("2026-11-26", "2026-11-26"),
+        ("<<", "<<"),
+        ("'1'", "1"),
+        ("!!str 1", "1"),
+        ("!!float 1", 1.0),
+        ("!!int 0x10", 16),
+    ],
+)
+def test_scalars_follow_the_core_schema_of_yaml_1_2(text: str, value: object) -> None:
+    assert typed(read_document(f"a: {text}\n", "x").values["a"]) == typed(value)
+
+
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.text(), lambda v: st.lists(v, max_size=3)))
+def test_values_that_are_written_are_read_back_by_both_readers(value: Any) -> None:
+    text = to_yaml({"a": value})
+    assert typed(read_document(text, "written").values["a"]) == typed(value)
+    assert typed(other_reader(text)["a"]) == typed(value)
+
+
+@pytest.mark.parametrize(
+    "tag", ["!!set {x}", "!!binary eA==", "!!timestamp 2026-11-26", "!own 1", "!!omap []"]
+)
+def test_tags_beyond_the_core_schema_are_refused_with_their_line(tag: str) -> None:
+    with pytest.raises(ConfigError, match=r"^x:2: is not YAML: could not determine a constructor"):
+        read_document(f"b: 1\na: {tag}\n", "x")
+
+
+def test_a_file_is_read_up_to_its_largest_length(tmp_path: Path) -> None:
+    path = tmp_path / "long.yaml"
+    path.write_text("#" * (1 << 20), encoding="utf-8")
+    assert len(read_text(path)) == 1 << 20
+    path.write_text("#" * ((1 << 20) + 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match="is longer than 1048576 characters"):
+        read_text(path)
+
+
+def test_a_bare_name_is_a_configuration_of_the_package_and_everything_else_a_path() -> None:
+    assert config_path("step_demo").resolve() == FOLDER / "step_demo.yaml"
+    for text in ("step_demo.yaml", "./step_demo", "nothing"):
+        assert config_path(text) == Path(text)
