@@ -58,7 +58,6 @@ FILLED = {"DetectionSettings"}
 
 OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
-    "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
     "EdgeSettings": "horizon cameras",
     "EndpointSettings": "limits of the method; gain and saturation come from the star tracker's settings",
     "HorizonSettings": "horizon cameras",
