@@ -54,8 +54,6 @@ class _Loader(yaml.SafeLoader):
     A few lines of aliases can stand for more values than the memory holds.
     """
 
-    # PyYAML resolves and constructs plain scalars by YAML 1.1, hence tables of our own.
-    yaml_implicit_resolvers: ClassVar[dict[Any, Any]] = {}
     yaml_constructors: ClassVar[dict[Any, Any]] = {
         tag: yaml.SafeLoader.yaml_constructors[tag]
         for tag in (None, *(f"tag:yaml.org,2002:{kind}" for kind in ("map", "seq", "str", "null", "bool")))
@@ -64,9 +62,9 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         """Return the next node. Raises ComposerError for an alias."""
         if self.check_event(yaml.AliasEvent):
-            mark = self.get_event().start_mark
+            mark = self.get_event().start_mark  # type: ignore[no-untyped-call]  # of PyYAML's stubs
             raise yaml.composer.ComposerError(None, None, "an alias (*): write the value out", mark)
-        return super().compose_node(parent, index)  # type: ignore[no-untyped-call]  # PyYAML's stub
+        return super().compose_node(parent, index)
 
     def construct_integer(self, node: yaml.ScalarNode) -> int:
         """Return a decimal, octal (0o) or hexadecimal (0x) number. Raises ValueError."""
@@ -82,9 +80,9 @@ class _Loader(yaml.SafeLoader):
 class _Dumper(yaml.SafeDumper):
     """Quotes the texts that the core schema of YAML 1.2 would read as another kind of value."""
 
-    yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
 
-
+# PyYAML resolves plain scalars by YAML 1.1.
+_Loader.yaml_implicit_resolvers = _Dumper.yaml_implicit_resolvers = {}
 for _kind, _pattern in (
     ("null", r"(?:null|Null|NULL|~|)$"),
     ("bool", r"(?:true|True|TRUE|false|False|FALSE)$"),

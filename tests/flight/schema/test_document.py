@@ -74,11 +74,11 @@ def test_both_readers_agree_about_every_shipped_file_and_its_lines(path: Path) -
 
     def compare(tree: Any, dotted: str) -> None:
         nonlocal compared
-        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-        for key, inner in pairs:
-            name = join(dotted, key) if isinstance(tree, dict) else f"{dotted}[{key}]"
-            place = tree.lc.key(key) if isinstance(tree, dict) else tree.lc.item(key)
-            assert document.lines[name] == place[0] + 1
+        mapping, listed = isinstance(tree, dict), isinstance(tree, list)
+        for key, inner in tree.items() if mapping else enumerate(tree) if listed else ():
+            name = join(dotted, str(key)) if mapping else f"{dotted}[{key}]"
+            line, _ = tree.lc.key(key) if mapping else tree.lc.item(key)
+            assert document.lines[name] == line + 1
             compared += 1
             compare(inner, name)
 
