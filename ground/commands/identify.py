@@ -20,6 +20,7 @@ from ground.identification.fit import NAMES, UNITS, PlantFit, fit
 from ground.identification.record import Record, read_record
 from ground.identification.scale import (
     DURATION,
+    MAGNETOMETER_ERROR,
     AbsolutePlant,
     absolute,
     config_text,
@@ -206,9 +207,8 @@ def _text(made: _Identified) -> str:
     if field is None:
         lines += ["", "field:  not measured because the coils were never off long enough: as configured"]
     else:
-        error = 100.0 * made.config.identification.magnetometer_error
         measured = f"{1e4 * field.magnitude:.4f} gauss from the magnetometer"
-        lines += ["", f"field:  {measured}, with a scale error of {error:g} %"]
+        lines += ["", f"field:  {measured}, with a scale error of {100.0 * MAGNETOMETER_ERROR:g} %"]
     verdict = "are white" if found.whiteness.passed else "are NOT white: the errors are increased accordingly"
     lines.append(
         f"noise:  current {1e3 * noise.current:.2f} mA, angle {1e3 * noise.angle:.2f} mrad, "

@@ -22,6 +22,11 @@ from ground.identification.fit import NAMES, MotionConstants, MotionNoise, Plant
 from ground.identification.record import HorizontalField
 from knightcube.astro.arrays import FloatArray
 
+INERTIA_ERROR = 0.1
+DIPOLE_ERROR = 0.05
+FIELD_ERROR = 0.1
+MAGNETOMETER_ERROR = 0.02
+"""Prior relative errors of inertia, dipole per ampere, field, and the magnetometer's scale factor."""
 DURATION = 200.0
 """Usual duration of the flight (s): each manoeuvre once in either direction, with pauses."""
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
@@ -175,12 +180,12 @@ def config_text(config: TestbedConfig) -> str:
 
 def prior_of(config: TestbedConfig) -> PlantPrior:
     """Return the prior values of a configuration with their errors."""
-    plant, known = config.plant, config.identification
+    plant = config.plant
     return PlantPrior(
-        inertia=PriorValue(plant.inertia, known.inertia_error),
-        dipole=PriorValue(plant.coil_turns * plant.coil_area, known.dipole_error),
-        field=PriorValue(plant.field, known.field_error),
-        magnetometer_error=known.magnetometer_error,
+        inertia=PriorValue(plant.inertia, INERTIA_ERROR),
+        dipole=PriorValue(plant.coil_turns * plant.coil_area, DIPOLE_ERROR),
+        field=PriorValue(plant.field, FIELD_ERROR),
+        magnetometer_error=MAGNETOMETER_ERROR,
     )
 
 

@@ -13,7 +13,14 @@ from flight.schema import reader as configuration
 from flight.schema.testbed import Identification, TestbedConfig
 from ground.identification.fit import MotionConstants
 from ground.identification.record import HorizontalField, Record, read_record
-from ground.identification.scale import AbsolutePlant, excitation_config
+from ground.identification.scale import (
+    DIPOLE_ERROR,
+    FIELD_ERROR,
+    INERTIA_ERROR,
+    MAGNETOMETER_ERROR,
+    AbsolutePlant,
+    excitation_config,
+)
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
 from knightcube.gnc.guidance.one_axis.path import PathSample
