@@ -17,24 +17,48 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from knightcube.astro.almanac import magnetic_field as magnetic_field
+    from knightcube.astro.almanac import magnetic_field_on_ground as magnetic_field_on_ground
+    from knightcube.astro.almanac import orbit_state as orbit_state
+    from knightcube.astro.almanac import propagate_elements as propagate_elements
+    from knightcube.astro.almanac import propagate_orbit as propagate_orbit
+    from knightcube.astro.almanac import sun_direction as sun_direction
+    from knightcube.astro.almanac import sunlit_fraction as sunlit_fraction
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant as SingleAxisPlant
     from knightcube.gnc.guidance.planners import plan_slew as plan_slew
     from knightcube.gnc.guidance.planners import plan_step as plan_step
     from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
     from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget as PointingTarget
+    from knightcube.vision.camera.lens import Lens as Lens
+    from knightcube.vision.camera.lens import Pinhole as Pinhole
+    from knightcube.vision.horizon.nadir import find_nadir as find_nadir
+    from knightcube.vision.horizon.settings import HorizonKnowledge as HorizonKnowledge
     from knightcube.vision.star_tracker import MatchedStars as MatchedStars
     from knightcube.vision.star_tracker import StarSolution as StarSolution
     from knightcube.vision.star_tracker import StarTracker as StarTracker
+    from knightcube.vision.sun import find_sun as find_sun
 
 _MODULE_OF = {
     "Goal": "knightcube.gnc.guidance.three_axes.pointing_target",
+    "HorizonKnowledge": "knightcube.vision.horizon.settings",
+    "Lens": "knightcube.vision.camera.lens",
     "MatchedStars": "knightcube.vision.star_tracker",
+    "Pinhole": "knightcube.vision.camera.lens",
     "PointingTarget": "knightcube.gnc.guidance.three_axes.pointing_target",
     "SingleAxisPlant": "knightcube.gnc.guidance.one_axis.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
+    "find_nadir": "knightcube.vision.horizon.nadir",
+    "find_sun": "knightcube.vision.sun",
+    "magnetic_field": "knightcube.astro.almanac",
+    "magnetic_field_on_ground": "knightcube.astro.almanac",
+    "orbit_state": "knightcube.astro.almanac",
     "plan_slew": "knightcube.gnc.guidance.planners",
     "plan_step": "knightcube.gnc.guidance.planners",
+    "propagate_elements": "knightcube.astro.almanac",
+    "propagate_orbit": "knightcube.astro.almanac",
+    "sun_direction": "knightcube.astro.almanac",
+    "sunlit_fraction": "knightcube.astro.almanac",
 }
 __all__ = list(_MODULE_OF)
 

@@ -127,3 +127,12 @@ def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> 
     assert found is not None
     theta = 2.0 * math.asin(0.3)
     assert float(found[1]) == pytest.approx(math.degrees(1e-5 * theta / (1.05e-3 * 0.6**2)), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("page", "script"), [("horizon-and-sun", "horizon_and_sun"), ("orbit", "orbit_and_field")]
+)
+def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
+    printed = run([str(EXAMPLES / f"{script}.py")], ROOT).stdout.rstrip()
+    shown = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
+    assert f"```\n{printed}\n```" in shown
