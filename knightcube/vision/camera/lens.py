@@ -25,7 +25,12 @@ from knightcube.errors import FlightError
 
 @dataclass(frozen=True, slots=True)
 class Pinhole:
-    """An ideal camera: `columns` x `rows` pixels, focal length in pixels."""
+    """An ideal camera without distortion.
+
+    Attributes:
+        columns, rows: number of pixels.
+        focal_length: px. `from_field_of_view` computes it from the field of view.
+    """
 
     columns: int
     rows: int
