@@ -11,8 +11,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from flight.link.commands.definitions import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.telemetry.form import Field, Range
+from flight.link.commands import LAYOUTS as COMMAND_LAYOUTS
+from flight.link.telemetry.definitions import Field, Range
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 
 _FOREWORD = """\

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     LAYOUTS,

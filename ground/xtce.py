@@ -14,12 +14,11 @@ import sys
 from collections.abc import Iterator, Mapping
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from flight.link.commands.definitions import LAYOUTS as COMMANDS
+from flight.link.commands import LAYOUTS as COMMANDS
+from flight.link.process.commanding import Stage
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
 from flight.link.process.directives import NEW_KEY
-from flight.link.process.verification import Stage
-from flight.link.telemetry.definitions import STAGES
-from flight.link.telemetry.form import Field
+from flight.link.telemetry.definitions import STAGES, Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 
 SPACE = "KnightCube"

@@ -18,9 +18,9 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from flight.link.files.entity import FOREIGN, SATELLITE
+from flight.link.files.transfer import FOREIGN, SATELLITE
 from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UP
-from flight.link.process.lines import host_port
+from flight.link.process.station import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS
 from ground.link.token_file import token_path

@@ -8,7 +8,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from flight.link.commands.codec import CommandPacker, Note
+from flight.link.commands import CommandPacker, Note
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import to_text
 from ground.commands.command import exchange

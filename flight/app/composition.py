@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.app.devices import Devices
-from flight.link.commands.channel import Channel
+from flight.link.commands import Channel
 from flight.link.telemetry.log import Recorder
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task

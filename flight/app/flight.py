@@ -21,7 +21,7 @@ from flight.app.run import RunRequest, RunResult, begin_folder, open_log
 from flight.app.service import EndingSignals, FlownRelease, StartRetry, retried_start
 from flight.app.supervision import start_guardian, supervise
 from flight.link import events
-from flight.link.commands.channel import Channel, open_udp, open_unix
+from flight.link.commands import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog, Recorder
 from flight.loop.executive import JobResult, JobRunner, LockStepRunner
 from flight.loop.flight_loop import FlightLoop, FlightProgress, RunLabel, Supervisors, nothing

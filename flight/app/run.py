@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs, open_segment
-from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.log import DISK_TROUBLE, FlightLog, begin_run, find_runs, open_segment
 from flight.loop.flight_loop import FlightEnding
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock

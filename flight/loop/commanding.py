@@ -17,9 +17,11 @@ from typing import Any, TypeVar
 import msgspec
 
 from flight.link import events
-from flight.link.commands.channel import Channel
-from flight.link.commands.codec import (
+from flight.link.commands import (
+    DUMP_PARAMETERS,
+    PING,
     ChangeMode,
+    Channel,
     Clear,
     Command,
     CommandError,
@@ -31,11 +33,16 @@ from flight.link.commands.codec import (
     Slew,
     unpack,
 )
-from flight.link.commands.definitions import DUMP_PARAMETERS, PING
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import COMMAND, PARAMETERS
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    PARAMETER_FIELDS,
+    PARAMETER_KEYS,
+    PARAMETERS,
+    crc_of,
+    problem_of,
+)
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.loop.executive import Cycle
 from flight.loop.facts import Services
 from flight.loop.modes import ModeControl
@@ -69,7 +76,7 @@ class ParameterTable:
         self._keeper = keeper
         self._recorder = services.recorder
         self._events = services.events
-        self._configured = {key: float(_value(config, key)) for key in KEYS}
+        self._configured = {key: float(_value(config, key)) for key in PARAMETER_KEYS}
         self._values: Mapping[str, float] = self._configured
         self._table = KeptTable() if keeper is None else keeper.table
         self._loaded_ns = 0
@@ -106,7 +113,9 @@ class ParameterTable:
 
     def dump(self, now_ns: int) -> None:
         """Record the table."""
-        named = {field.name: self._values[key] for field, key in zip(FIELDS, KEYS, strict=True)}
+        named = {
+            field.name: self._values[key] for field, key in zip(PARAMETER_FIELDS, PARAMETER_KEYS, strict=True)
+        }
         fields: dict[str, Any] = {
             "loads": self._table.loads,
             "crc": self._crc,
@@ -117,7 +126,7 @@ class ParameterTable:
 
     @property
     def _crc(self) -> int:
-        return crc_of([self._values[key] for key in KEYS])
+        return crc_of([self._values[key] for key in PARAMETER_KEYS])
 
     def _keep(self, table: KeptTable) -> None:
         self._table = table

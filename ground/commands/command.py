@@ -13,15 +13,26 @@ from dataclasses import replace
 from pathlib import Path
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import Command, CommandError, CommandPacker, Ping, Point, command_of, shown
-from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
+from flight.link.commands import (
+    COMMANDS,
+    LAYOUTS,
+    PING,
+    POINT,
+    SAFE,
+    Command,
+    CommandError,
+    CommandPacker,
+    Ping,
+    Point,
+    command_of,
+    shown,
+)
 from flight.link.modes import Mode
 from flight.link.process import directives
+from flight.link.process.commanding import Report
 from flight.link.process.directives import Deletion, Listing, Play, Scheduled, Stop
-from flight.link.process.verification import Report
-from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
-from flight.link.telemetry.definitions import COMMAND
-from flight.link.telemetry.form import Field, Packet
+from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
+from flight.link.telemetry.definitions import COMMAND, Field, Packet
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
 from ground.documentation import meaning_of
 from ground.link.commanding import change_key, obeyed

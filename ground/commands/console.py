@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flight.link.telemetry.archive import find_runs
+from flight.link.telemetry.log import find_runs
 from ground.link.options import add_link_options, terminal_of
 from ground.watch.tail import LogTail
 from knightcube.errors import FlightError, UsageError

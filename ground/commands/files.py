@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from flight.app.service import EndingSignals
-from flight.link.files.entity import Progress
 from flight.link.files.store import Store, files_folder
+from flight.link.files.transfer import Progress
+from flight.link.process.commanding import Stage
 from flight.link.process.directives import CancelFile, DeleteFile, Directive, ListFiles, SendFile, UseFile
 from flight.link.process.filing import KINDS, LISTING
-from flight.link.process.verification import Stage
-from flight.link.security.associations import COMMAND_SPIS
+from flight.link.security import COMMAND_SPIS
 from ground.link.files import FileSession, failed, sum_of
 from ground.link.options import add_link_options, terminal_of
 from ground.link.terminal import Terminal

@@ -13,12 +13,19 @@ from typing import Any
 import numpy as np
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import Command, CommandPacker, DumpParameters, LoadParameters, shown
-from flight.link.process.verification import Stage
-from flight.link.security.associations import COMMAND_SPIS
-from flight.link.telemetry.definitions import COMMAND, PARAMETERS, VERIFICATION
+from flight.link.commands import Command, CommandPacker, DumpParameters, LoadParameters, shown
+from flight.link.process.commanding import Stage
+from flight.link.security import COMMAND_SPIS
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    PARAMETER_FIELDS,
+    PARAMETER_KEYS,
+    PARAMETERS,
+    VERIFICATION,
+    crc_of,
+    problem_of,
+)
 from flight.link.telemetry.packets import LAYOUTS, to_text
-from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of, problem_of
 from flight.schema.document import read_document, read_text, to_yaml
 from ground.commands.command import exchange
 from ground.link.options import add_link_options, terminal_of
@@ -76,9 +83,9 @@ def parameters(options: argparse.Namespace) -> int:
         raise UsageError(problem)
     flown, refused = before, ""
     if wanted != before.values:
-        _, refused = _ask(options, LoadParameters(before.crc, tuple(wanted[key] for key in KEYS)))
+        _, refused = _ask(options, LoadParameters(before.crc, tuple(wanted[key] for key in PARAMETER_KEYS)))
         flown = (_ask(options, DumpParameters())[0] or before) if not refused else before
-        if not refused and flown.crc != crc_of([wanted[key] for key in KEYS]):
+        if not refused and flown.crc != crc_of([wanted[key] for key in PARAMETER_KEYS]):
             raise FlightError(f"table {flown.crc:08x} flies, not the one that was sent: look again")
     _show(flown, before, refused, options.json)
     if options.save is not None:
@@ -133,7 +140,9 @@ def _named(packets: Iterator[tuple[int, bytes]]) -> Iterator[tuple[str, bytes]]:
 
 def _reported(row: np.void) -> Table:
     """Return the table of a packet."""
-    values = {key: float(row[field.name]) for key, field in zip(KEYS, FIELDS, strict=True)}
+    values = {
+        key: float(row[field.name]) for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
+    }
     origin = _ORIGINS["table"].get(int(row["table"]), "unknown")
     return Table(values, int(row["crc"]), int(row["loads"]), origin, bool(row["kept"]))
 
@@ -150,7 +159,7 @@ def _show(table: Table, before: Table, refused: str, as_json: bool) -> None:
         }
         sys.stdout.write(json.dumps(facts) + "\n")
         return
-    for key, field in zip(KEYS, FIELDS, strict=True):
+    for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
         low, high = field.valid or (-np.inf, np.inf)
         old = "" if table.values[key] == before.values[key] else f"   was {before.values[key]:g}"
         sys.stdout.write(f"{key:22s} {table.values[key]:<10g} {field.unit:9s} {low:g} to {high:g}{old}\n")
@@ -163,8 +172,8 @@ def _show(table: Table, before: Table, refused: str, as_json: bool) -> None:
 def _change(text: str) -> tuple[str, float]:
     """Return name and value of NAME=VALUE. Raises UsageError."""
     key, _, value = text.partition("=")
-    if key not in KEYS:
-        raise UsageError(f"{key} is no parameter: {', '.join(KEYS)}")
+    if key not in PARAMETER_KEYS:
+        raise UsageError(f"{key} is no parameter: {', '.join(PARAMETER_KEYS)}")
     try:
         return key, float(value)
     except ValueError as error:

@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from flight.link.telemetry.archive import find_runs
+from flight.link.telemetry.log import find_runs
 from ground import report as reporting
 from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
 from ground.telemetry import read_run

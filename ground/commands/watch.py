@@ -13,8 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from flight.link.telemetry.archive import find_runs
 from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
+from flight.link.telemetry.log import find_runs
 from ground.commands.options import positive
 from ground.watch.plain import PlainLines, attitude_text, event_line, state_line
 from ground.watch.socket import answers

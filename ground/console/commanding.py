@@ -7,14 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from flight.app.run import utc_ns
-from flight.link.commands import codec
-from flight.link.commands.codec import CommandError
-from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS
+from flight.link import commands
+from flight.link.commands import LAYOUTS, LOAD_PARAMETERS, CommandError
 from flight.link.process import directives
-from flight.link.telemetry.form import Field
+from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
+from flight.link.telemetry.definitions import Field, crc_of
 from flight.link.telemetry.packets import Layout, Packer, TelemetryError
-from flight.link.telemetry.parameters import FIELDS as PARAMETERS
-from flight.link.telemetry.parameters import crc_of
 from ground.commands.command import exchange
 from ground.console.instant import values
 from ground.telemetry import decode
@@ -83,7 +81,7 @@ class Commanding:
 def _words(data: bytes) -> str:
     """Return the words of a command's packet. Raises CommandError for values that are none."""
     directive = directives.unpack(data)
-    return codec.unpack(data).text if directive is None else str(directive)
+    return commands.unpack(data).text if directive is None else str(directive)
 
 
 def _crc(given: Object) -> int:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from flight.schema.document import read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands

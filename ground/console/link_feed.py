@@ -8,10 +8,10 @@ import time
 import numpy as np
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands import CommandPacker, Ping
+from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import LIST
 from flight.link.process.downlink import LIVE
-from flight.link.process.verification import Report, Stage
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import PacketArray
 from ground.console.commanding import Object

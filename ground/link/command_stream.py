@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from flight.link.files.units import PACKET_VERSION, UP
-from flight.link.frames import telecommand
-from flight.link.security.associations import OVERHEAD_BYTES
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER
+from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import FlightError
@@ -25,7 +25,7 @@ _TOKEN_BYTES = 32
 _CHECKED_BYTES = HEADER_BYTES + 1
 """Length of the primary header and the version of the packet's definition."""
 _UNSEGMENTED = 0b11
-_LONGEST_PACKET = telecommand.LONGEST_FRAME - telecommand.HEADER.size - OVERHEAD_BYTES - CRC_BYTES
+_LONGEST_PACKET = LONGEST_FRAME - TELECOMMAND_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
 _SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import CommandPacker, Ping
-from flight.link.frames import telecommand
+from flight.link.commands import CommandPacker, Ping
+from flight.link.frames import TELECOMMAND_MASK
 from flight.link.process import directives
+from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import NewKey
-from flight.link.process.verification import Report, Stage
-from flight.link.security.associations import COMMAND_SPIS, Association, Vault
-from flight.link.security.gate import NEXT, Sealer, new_key
+from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, new_key
 from ground.link.terminal import Terminal
 from knightcube.errors import FlightError, UsageError
 
@@ -43,7 +42,7 @@ def change_key(
         raise UsageError(f"both copies of SPI {changed} are lost here too: make new keys")
     following = vault.read(name)
     if following is not None and changed in COMMAND_SPIS:
-        reports = _try(terminal, Sealer(vault, name, telecommand.AUTHENTICATED), changed, seconds)
+        reports = _try(terminal, Sealer(vault, name, TELECOMMAND_MASK), changed, seconds)
         if obeyed(reports):
             _promote(vault, changed)
             return reports

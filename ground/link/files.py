@@ -11,16 +11,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flight.app.run import utc_ns
-from flight.link.files.entity import GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.files.store import Store
-from flight.link.files.transfer import CRC32
+from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.files.units import DOWN, UP, Metadata, PduError, UnitPacker, is_unit, unit_of
-from flight.link.frames import telecommand
-from flight.link.frames.telecommand import HEADER
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER
 from flight.link.process import directives
+from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Directive
-from flight.link.process.verification import Report, Stage
-from flight.link.security.associations import OVERHEAD_BYTES
+from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from ground.link.terminal import Terminal, report_of
@@ -30,7 +28,7 @@ _BLOCK = 64
 """Counters reserved at once: another process's command in between costs what is left of them."""
 _AGAIN_NS = 5_000_000_000
 _BURST_S = 0.05
-_FRAME_BYTES = HEADER.size + OVERHEAD_BYTES + CRC_BYTES
+_FRAME_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
 _REPORTED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TRANSFER = LAYOUTS[TRANSFER.name]
 
@@ -85,7 +83,7 @@ class FileSession:
         if self._asked is not None and now_ns >= self._asked[1]:
             self.ask(self._asked[0], now_ns)
         self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
-        self._credit = min(self._credit, max(self._rate * _BURST_S, 2.0 * telecommand.LONGEST_FRAME))
+        self._credit = min(self._credit, max(self._rate * _BURST_S, 2.0 * LONGEST_FRAME))
         self._credit_ns = now_ns
         while self._credit > 0.0 and (unit := self.entity.unit(now_ns)) is not None:
             packet = self._units.pack(unit, utc_ns())

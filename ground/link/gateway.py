@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Address
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import CommandPacker, Ping
-from flight.link.process.lines import host_port
+from flight.link.commands import CommandPacker, Ping
+from flight.link.process.station import host_port
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
 from ground.link.command_stream import CommandStream, StreamError

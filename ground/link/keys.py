@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.link.security.associations import COMMAND_SPIS, COPIES, TELEMETRY_SPIS, Association, Vault
-from flight.link.security.gate import new_key
+from flight.link.security import COMMAND_SPIS, COPIES, TELEMETRY_SPIS, Association, Vault, new_key
 from knightcube.errors import UsageError
 
 ENDS = ("satellite", "ground")

@@ -14,13 +14,21 @@ from typing import Protocol
 
 import serial
 
-from flight.link.frames import telecommand, telemetry
-from flight.link.frames.stream import SYNC, FrameStream, telemetry_stream
-from flight.link.frames.telemetry import PacketAssembler
-from flight.link.process.lines import host_port
-from flight.link.process.verification import Report, Request, Stage
-from flight.link.security.associations import OVERHEAD_BYTES, TELEMETRY_SPIS, Vault
-from flight.link.security.gate import Gate, RefusedError, Sealer
+from flight.link.frames import (
+    SYNC,
+    TELECOMMAND_HEADER,
+    TELECOMMAND_MASK,
+    TELEMETRY_MASK,
+    FrameStream,
+    PacketAssembler,
+    TelecommandHeader,
+    close_frame,
+    open_telemetry,
+    telemetry_stream,
+)
+from flight.link.process.commanding import Report, Request, Stage
+from flight.link.process.station import host_port
+from flight.link.security import OVERHEAD_BYTES, TELEMETRY_SPIS, Gate, RefusedError, Sealer, Vault
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from flight.schema.sections import Link
@@ -74,9 +82,7 @@ class Terminal:
         self._sequence = 0
         self._sealers: dict[int, Sealer] = {}
         self._channels: dict[int, PacketAssembler] = {}
-        self.gate = Gate(
-            vault, TELEMETRY_SPIS, self._parse, telemetry.AUTHENTICATED, _ANY_AHEAD, _STORE_EVERY
-        )
+        self.gate = Gate(vault, TELEMETRY_SPIS, self._parse, TELEMETRY_MASK, _ANY_AHEAD, _STORE_EVERY)
 
     @property
     def lost_frames(self) -> int:
@@ -89,20 +95,20 @@ class Terminal:
 
     def send(self, packet: bytes, spi: int = 1) -> int:
         """Send a command packet; return the counter of its frame. Raises FlightError."""
-        sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, telecommand.AUTHENTICATED))
+        sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, TELECOMMAND_MASK))
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> Sealer:
         """Return what protects frames to be sent by `send_by`, with `block` counters reserved at once."""
-        return Sealer(self._vault, spi, telecommand.AUTHENTICATED, block)
+        return Sealer(self._vault, spi, TELECOMMAND_MASK, block)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
         """Send a command packet under the key of a sealer."""
-        header = telecommand.TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
-        length = telecommand.HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
+        header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
+        length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
         body, counter = sealer.seal(header.pack(length), packet)
         self._sequence += 1
-        self._line.send(telecommand.close_frame(body))
+        self._line.send(close_frame(body))
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
@@ -135,7 +141,7 @@ class Terminal:
         self._line.close()
 
     def _parse(self, frame: bytes) -> tuple[bytes, bytes]:
-        header, protected, _ = telemetry.open_frame(frame, self._settings.spacecraft)
+        header, protected, _ = open_telemetry(frame, self._settings.spacecraft)
         return header, protected
 
     def _open(self, frame: bytes) -> Iterator[tuple[int, bytes]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.link import events
-from flight.link.telemetry.archive import find_runs
+from flight.link.telemetry.log import find_runs
 from flight.link.telemetry.packets import to_text
 from flight.schema.document import read_document, read_text
 from ground.report.text import ARCSECONDS, number, provenance, table

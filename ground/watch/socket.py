@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands import CommandPacker, Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT
 from flight.link.telemetry.packets import PacketArray, TelemetryError
 from ground.commands.command import exchange

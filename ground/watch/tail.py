@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import scan
 from knightcube.errors import UsageError

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from flight.link import events
-from flight.link.telemetry.definitions import MODES
-from flight.link.telemetry.form import States
+from flight.link.telemetry.definitions import MODES, States
 from flight.link.telemetry.packets import PacketArray, to_text
 from knightcube.astro.quaternion import angle_between
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
-from flight.link.commands.definitions import LAYOUTS as COMMANDS
+from flight.link.commands import LAYOUTS as COMMANDS
+from flight.link.commands import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LAYOUTS, to_text

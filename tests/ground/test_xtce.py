@@ -7,13 +7,12 @@ from xml.etree.ElementTree import Element, fromstring
 import pytest
 
 from flight.bodies.orbit.body import LEVELS
-from flight.link.commands.definitions import COMMANDS
+from flight.link.commands import COMMANDS
 from flight.link.events import Severity
+from flight.link.process.commanding import Stage
 from flight.link.process.directives import DIRECTIVES, NEW_KEY
-from flight.link.process.verification import Stage
 from flight.link.telemetry import definitions
-from flight.link.telemetry.definitions import PACKETS
-from flight.link.telemetry.form import Field, Limits, Packet
+from flight.link.telemetry.definitions import PACKETS, Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
 from flight.loop.body import SteeringState
 from flight.loop.facts import FACTS, StreamState

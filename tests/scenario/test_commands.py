@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.commands import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import Run, decode

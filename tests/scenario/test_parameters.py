@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from flight.link.commands.codec import CommandPacker, DumpParameters, LoadParameters
+from flight.link.commands import CommandPacker, DumpParameters, LoadParameters
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, crc_of
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from ground.telemetry import decode
 from tests.scenario.mode_flights import commanded
 from tests.scenario.test_commands import said
@@ -22,7 +22,9 @@ def configured() -> dict[str, float]:
     """Return the table of the configuration."""
     config = commanded(4.0)
     sections = {"modes": config.modes, "health": config.health}
-    return {key: float(getattr(sections[key.partition(".")[0]], key.partition(".")[2])) for key in KEYS}
+    return {
+        key: float(getattr(sections[key.partition(".")[0]], key.partition(".")[2])) for key in PARAMETER_KEYS
+    }
 
 
 def load(changes: dict[str, float], replaced: int | None = None) -> bytes:
@@ -66,7 +68,7 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
 def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
     """And the configuration's own value lies within them: it flies where nothing is loaded."""
     config = commanded(4.0)
-    for (key, value), field in zip(configured().items(), FIELDS, strict=True):
+    for (key, value), field in zip(configured().items(), PARAMETER_FIELDS, strict=True):
         assert field.valid is not None
         assert field.valid[0] <= value <= field.valid[1]
         section, _, name = key.partition(".")

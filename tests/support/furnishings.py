@@ -19,7 +19,7 @@ import yaml
 from PIL import Image
 
 from flight.app import cli
-from flight.link.commands.codec import LONGEST
+from flight.link.commands import LONGEST
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer

@@ -16,11 +16,10 @@ from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
 from flight.app.service import StartRetry, StoppedError, retried_start
+from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
-from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
-from flight.link.process.station import Station, StationSettings
-from flight.link.process.verification import ControlLine, Sent
-from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
+from flight.link.process.station import Line, SerialLine, Station, StationSettings, TcpLine, UdpLine
+from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.schema.consistency import peer_networks
 from flight.schema.document import ConfigError, config_path
 from flight.schema.reader import parse

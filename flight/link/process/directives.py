@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from flight.link.commands.codec import CommandError
-from flight.link.files.entity import FOREIGN, GROUND
+from flight.link.commands import CommandError
 from flight.link.files.store import LONGEST_NAME
-from flight.link.security.associations import KEY_BYTES
-from flight.link.telemetry.form import Field, Packet
+from flight.link.files.transfer import FOREIGN, GROUND
+from flight.link.security import KEY_BYTES
+from flight.link.telemetry.definitions import Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     Layout,

@@ -15,12 +15,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from flight.link.frames.telemetry import HEADER, MasterCount, Seal, TelemetryFramer
+from flight.link.frames import TELEMETRY_HEADER, MasterCount, Seal, TelemetryFramer
+from flight.link.process.commanding import Report, Stage
 from flight.link.process.directives import Play
-from flight.link.process.verification import Report, Stage
-from flight.link.security.associations import OVERHEAD_BYTES
-from flight.link.telemetry.archive import find_runs, find_segments
+from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import COMMAND, EVENT, MODE, PLAN, RUN, STARS, STREAK, TARGET
+from flight.link.telemetry.log import find_runs, find_segments
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, LONGEST_PACKET, walk
 
 _STEM = "flight"
@@ -179,7 +179,7 @@ def _at_once(path: str, flags: int) -> int:
 LIVE, PLAYBACK, FILES = 0, 1, 2
 """Virtual channels of live telemetry, playback and files."""
 
-LEAST_FRAME = HEADER.size + OVERHEAD_BYTES + CRC_BYTES + 64
+LEAST_FRAME = TELEMETRY_HEADER.size + OVERHEAD_BYTES + CRC_BYTES + 64
 
 _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
@@ -244,7 +244,7 @@ class Downlink:
 
         `files` returns the next packet of the file transfers, or None if there is none.
         """
-        room = frame_bytes - HEADER.size - OVERHEAD_BYTES - CRC_BYTES
+        room = frame_bytes - TELEMETRY_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
         master = MasterCount()
         self._live = TelemetryFramer(spacecraft, LIVE, room, master, seal)
         self._replay = TelemetryFramer(spacecraft, PLAYBACK, room, master, seal)

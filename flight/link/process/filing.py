@@ -16,11 +16,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.link.commands.codec import CommandError
-from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
+from flight.link.commands import CommandError
 from flight.link.files.store import FileError, Store, problem_of_name, write_whole
-from flight.link.files.transfer import CRC32, MODULAR
+from flight.link.files.transfer import (
+    CRC32,
+    FOREIGN,
+    LONGEST_FILE,
+    MODULAR,
+    SATELLITE,
+    Entity,
+    Origin,
+    Progress,
+)
 from flight.link.files.units import DOWN, Metadata, PduError, UnitPacker, unit_of
+from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.directives import (
     SEND_FILE,
     CancelFile,
@@ -30,7 +39,6 @@ from flight.link.process.directives import (
     SendFile,
     UseFile,
 )
-from flight.link.process.verification import Report, Request, Stage
 from knightcube.errors import UsageError
 
 KINDS = ("configuration", "elements", "catalogue", "release")

@@ -1,19 +1,133 @@
-"""Table of all telemetry packets: every field with its type, unit, meaning, states and alarms.
+"""Types of a packet definition, the table of all telemetry packets, and the table of parameters.
 
 The packer, the parser, the ground database, the CSV export and the documentation are made from this table.
 A packet that has flown is never changed in place: a field is appended, and the version of the packet is
-raised.
+raised. The parameters are values that an operator can change in flight, all of them at once. Until a table is
+loaded, the configuration gives their values; the bounds of the configuration's schema apply as well.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from flight.link.events import Severity
 from flight.link.modes import Mode
-from flight.link.telemetry.form import Alarms, Field, Level, Limits, Packet, States, counter
-from flight.link.telemetry.parameters import FIELDS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+
+Range = tuple[float, float]
+States = tuple[tuple[int, str], ...]
+Level = Literal["warning", "fault"]
+Alarms = tuple[tuple[int, Level], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Nominal ranges (low, high) of a value; a value outside is a warning or a fault."""
+
+    warning: Range | None = None
+    fault: Range | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field: `kind` is a numpy type code (f8, f4, u1, u2, u4, u8, i8) or S<n> for n bytes of UTF-8.
+
+    `count` > 1 makes an array. All numbers are big-endian on the wire.
+
+    Attributes:
+        states: the values of an enumerated field, each with its name.
+        bits: the bits of a bit field, each with its name; several bits can be set.
+        alarms: the states or set bits that are a warning or a fault.
+        limits: the nominal ranges of a value without states.
+        valid: the allowed range (low, high) of a command's argument.
+        wraps: whether the field continues at 0 after its largest number.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    meaning: str
+    count: int = 1
+    states: States = ()
+    alarms: Alarms = ()
+    limits: Limits | None = None
+    valid: Range | None = None
+    wraps: bool = False
+    bits: States = ()
+
+
+def counter(name: str, meaning: str, kind: str = "u4") -> Field:
+    """Return the field of a counter, which wraps at the end of its range."""
+    return Field(name, kind, "-", meaning, wraps=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet: its application process identifier (APID), rate and fields.
+
+    `hazard` states the harm that a telecommand can cause, empty if there is none.
+    """
+
+    name: str
+    apid: int
+    rate: str
+    meaning: str
+    fields: tuple[Field, ...]
+    version: int = field(default=1)
+    telecommand: bool = False
+    hazard: str = ""
+
+
+def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Field:
+    return Field(key.replace(".", "_", 1), "f8", unit, f"{key}: {meaning}", valid=(low, high))
+
+
+PARAMETER_FIELDS: tuple[Field, ...] = (
+    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "a slew has arrived within this angle"),
+    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "and below this rate"),
+    _parameter("modes.arrived_for", "s", 0.1, 600.0, "for this time"),
+    _parameter("modes.slew_limit", "s", 1.0, 1e5, "a slew that takes longer is late"),
+    _parameter("modes.hold_error", "rad", 1e-3, math.pi, "a hold that is off by more is impossible"),
+    _parameter("modes.hold_patience", "s", 0.1, 3600.0, "once it was for this time"),
+    _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "a faster body is braked"),
+    _parameter("modes.blind_limit", "s", 1.0, 1e5, "without an estimate for longer the mode is safe"),
+    _parameter("modes.known_for", "s", 0.1, 3600.0, "attitude known for this time ends the acquisition"),
+    _parameter("modes.lost_for", "s", 0.1, 3600.0, "attitude lost for this time begins it again"),
+    _parameter("health.cpu_share", "-", 0.01, 64.0, "of one core: the control process takes more"),
+    _parameter("health.memory", "B", 1e6, 1e12, "the flight processes take more memory"),
+    _parameter("health.memory_slope", "B/h", 1e3, 1e12, "it grows faster"),
+    _parameter("health.disk_free", "B", 1.0, 1e13, "the disk has less left"),
+    _parameter("health.temperature", "degree C", -40.0, 150.0, "the board is warm beyond it"),
+    _parameter("health.hottest", "degree C", -40.0, 150.0, "and too hot beyond it"),
+)
+"""Fields of the parameters, in their order in the packets."""
+
+PARAMETER_KEYS: tuple[str, ...] = tuple(parameter.name.replace("_", ".", 1) for parameter in PARAMETER_FIELDS)
+"""Keys of the parameters in a configuration, in the same order."""
+
+
+def crc_of(values: Sequence[float]) -> int:
+    """Return the CRC-32 of a table's values, as big-endian doubles in the order of `KEYS`."""
+    return zlib.crc32(struct.pack(f">{len(PARAMETER_FIELDS)}d", *values))
+
+
+def problem_of(values: Mapping[str, float]) -> str:
+    """Return the problem of a table (missing or unknown key, value out of range), else an empty text."""
+    if lacking := [key for key in PARAMETER_KEYS if key not in values]:
+        return f"{lacking[0]} is missing: a table is loaded as a whole"
+    if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
+        return f"{unknown[0]} is no parameter: {', '.join(PARAMETER_KEYS)}"
+    for key, parameter in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
+        low, high = parameter.valid or (-math.inf, math.inf)
+        if not low <= values[key] <= high:  # NaN compares false
+            return f"{key} = {values[key]:g} must lie within {low:g} to {high:g} {parameter.unit}"
+    return ""
+
 
 TABLES: States = ((0, "configuration"), (1, "loaded"))
 """Where the table of parameters comes from that flies."""
@@ -29,7 +143,7 @@ KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
 """The coils, by body axis."""
 STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
-"""The stages of a command (`flight.link.process.verification.Stage`)."""
+"""The stages of a command (`flight.link.process.commanding.Stage`)."""
 
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
 SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAULT), "fault"))
@@ -497,7 +611,7 @@ PARAMETERS = Packet(
         Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
         Field("table", "u1", "-", "where it comes from", states=TABLES),
         Field("kept", "u1", "-", "it outlives the process", states=NO_YES),
-        *(replace(field, valid=None) for field in FIELDS),
+        *(replace(field, valid=None) for field in PARAMETER_FIELDS),
     ),
 )
 

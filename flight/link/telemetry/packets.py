@@ -29,8 +29,7 @@ from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # 
     SequenceFlags,
 )
 
-from flight.link.telemetry.definitions import PACKETS
-from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.definitions import PACKETS, Field, Packet
 from knightcube.errors import FlightError
 
 PacketArray = npt.NDArray[np.void]

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.link.commands.codec import Point
+from flight.link.commands import Point
 from flight.loop.commanding import command_of
 from flight.schema import reader
 from flight.schema.devices import camera_knowledge

@@ -7,8 +7,7 @@ from ipaddress import IPv4Network
 
 import pytest
 
-from flight.link.commands.channel import open_udp
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands import CommandPacker, Ping, open_udp
 from flight.schema.consistency import peer_networks
 from flight.schema.document import ConfigError
 from flight.schema.reader import parse

@@ -12,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from flight.app.cli import main
-from flight.link.commands.codec import LoadParameters, unpack
+from flight.link.commands import LoadParameters, unpack
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer

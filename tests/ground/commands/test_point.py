@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker, Point, unpack
+from flight.link.commands import CommandPacker, Point, unpack
 from ground.commands import command
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import ChangeMode, CommandPacker
+from flight.link.commands import ChangeMode, CommandPacker
 from flight.link.modes import Mode
 from ground.console import link_feed
 from ground.console.commanding import Commanding

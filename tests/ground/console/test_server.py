@@ -14,12 +14,11 @@ import pytest
 from aiohttp import CookieJar, WSServerHandshakeError
 from aiohttp.test_utils import TestClient, TestServer
 
-from flight.link.commands import codec
-from flight.link.commands.codec import Command
-from flight.link.commands.definitions import COMMANDS
+from flight.link import commands
+from flight.link.commands import COMMANDS, Command
 from flight.link.modes import Mode
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from flight.link.telemetry.parameters import FIELDS, crc_of
 from ground.console.access import Access
 from ground.console.commanding import Commanding
 from ground.console.history import History
@@ -314,8 +313,8 @@ def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any
 
 
 def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(folder: Path) -> None:
-    table = [field.valid[0] for field in FIELDS if field.valid]
-    named = {field.name: value for field, value in zip(FIELDS, table, strict=True)}
+    table = [field.valid[0] for field in PARAMETER_FIELDS if field.valid]
+    named = {field.name: value for field, value in zip(PARAMETER_FIELDS, table, strict=True)}
     forms: dict[str, dict[str, Any]] = {
         "ping": {"number": "7"},
         "safe": {"reason": "bored"},
@@ -330,7 +329,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     sent: list[Command] = []
 
     def send(packet: bytes) -> dict[str, Any]:
-        sent.append(codec.unpack(packet))
+        sent.append(commands.unpack(packet))
         return {"obeyed": 1, "text": "done"}
 
     for name, values in forms.items():

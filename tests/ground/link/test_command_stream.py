@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.link.commands.codec import ChangeMode, CommandPacker, Ping
+from flight.link.commands import ChangeMode, CommandPacker, Ping
 from flight.link.files.units import DOWN, SEGMENT_BYTES, UP, UnitPacker
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH

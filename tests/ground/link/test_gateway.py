@@ -17,7 +17,7 @@ from typing import cast
 
 import pytest
 
-from flight.link.commands.codec import ChangeMode, CommandPacker, Ping
+from flight.link.commands import ChangeMode, CommandPacker, Ping
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import Packer

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from ground.telemetry import read_run
 from ground.watch.tail import LogTail
 from knightcube.errors import UsageError

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS
-from flight.link.telemetry.form import Packet
+from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
 from flight.link.telemetry.packets import Packer
 from ground.commands import watch
 from ground.telemetry import scan

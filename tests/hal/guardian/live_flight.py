@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from ground.telemetry import Run, read_run, scan
 from tests.support.flights import CONFIG
 

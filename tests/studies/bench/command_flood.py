@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from flight.app.run import utc_ns
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands import CommandPacker, Ping
 from ground.commands.command import exchange
 from knightcube.errors import FlightError
 from tests.support.flights import CONFIG

@@ -23,13 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.commands.channel import open_unix
-from flight.link.commands.codec import CommandPacker, Ping
-from flight.link.frames import telecommand, telemetry
+from flight.link.commands import CommandPacker, Ping, open_unix
+from flight.link.frames import TELECOMMAND_HEADER, TELEMETRY_HEADER
+from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.verification import ControlLine, Sent
-from flight.link.security.associations import Vault
+from flight.link.security import Vault
 from ground.link.keys import make_keys
 from ground.link.terminal import Terminal, TerminalSettings
 from tests.flight.link.process.both_ends import SETTINGS, GroundWire, Wire
@@ -100,12 +99,12 @@ def measure(place: Path, kills: int, seed: int) -> Findings:
     for number in range(kills):
         point, torn = int(draw.integers(0, _SENDER_POINTS)), bool(draw.integers(2))
         new = killed(partial(_send, place, number), point, torn)
-        found.note(new, telecommand.HEADER.size)
+        found.note(new, TELECOMMAND_HEADER.size)
         frames = (frames + new)[-_OLD:]
         shuffled = [frames[index] for index in draw.permutation(len(frames)).tolist()]
         point, torn = int(draw.integers(0, _LINK_POINTS)), bool(draw.integers(2))
         first = new if draw.integers(2) else []
-        found.note(killed(partial(_serve, place, [*first, *shuffled]), point, torn), telemetry.HEADER.size)
+        found.note(killed(partial(_serve, place, [*first, *shuffled]), point, torn), TELEMETRY_HEADER.size)
         while got := flight.poll():
             found.obeyed.update(data for data, _ in got)
         found.kills += 2

@@ -20,14 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.commands.channel import DatagramChannel, open_unix
-from flight.link.commands.codec import Ping, unpack
+from flight.link.commands import DatagramChannel, Ping, open_unix, unpack
 from flight.link.modes import Mode
+from flight.link.process.commanding import ControlLine, Sent, Timetable
 from flight.link.process.downlink import LogFollower
-from flight.link.process.scheduling import Timetable
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.verification import ControlLine, Sent
-from flight.link.security.associations import Vault
+from flight.link.security import Vault
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.packets import Packer
 from ground.link.keys import make_keys

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.process.scheduling import Timetable
-from flight.link.security.associations import Vault
+from flight.link.process.commanding import Timetable
+from flight.link.security import Vault
 from ground.link.keys import make_keys
 from tests.studies.bench import schedule_kills
 from tests.studies.bench.link_kills import measure

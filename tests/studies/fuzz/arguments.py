@@ -32,7 +32,7 @@ from flight.app import cli
 from flight.app import flight as flown
 from flight.app.accepted_config import requested_config
 from flight.app.run import RunRequest, RunResult
-from flight.link.telemetry.archive import SUFFIX
+from flight.link.telemetry.log import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from ground.commands import camera as camera_command

@@ -14,11 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.frames import telecommand
-from flight.link.frames.telecommand import TelecommandHeader, close_frame
+from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, TelecommandHeader, close_frame
 from flight.link.process.station import parser_of
-from flight.link.security.associations import COMMAND_SPIS, OVERHEAD_BYTES, Vault
-from flight.link.security.gate import Gate, RefusedError, Sealer
+from flight.link.security import COMMAND_SPIS, OVERHEAD_BYTES, Gate, RefusedError, Sealer, Vault
 from flight.link.telemetry.packets import CRC_BYTES
 from ground.link.keys import make_keys
 from tests.studies.fuzz.harness import Finding
@@ -26,7 +24,7 @@ from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 
 _SPACECRAFT = 0x1A5
 _KEPT = 64
-_HEADERS = telecommand.HEADER.size + 14
+_HEADERS = TELECOMMAND_HEADER.size + 14
 
 
 class LinkFrames:
@@ -38,7 +36,7 @@ class LinkFrames:
         satellite, ground = make_keys(folder / "keys")
         self._sky = Vault(satellite)
         at = Vault(ground)
-        self._sealers = {spi: Sealer(at, spi, telecommand.AUTHENTICATED, 1 << 20) for spi in COMMAND_SPIS}
+        self._sealers = {spi: Sealer(at, spi, TELECOMMAND_MASK, 1 << 20) for spi in COMMAND_SPIS}
         self._gate = self._opened()
         self._sent: dict[tuple[int, int], bytes] = {}
         self._seen: list[bytes] = []
@@ -70,7 +68,7 @@ class LinkFrames:
         return Counter([kind, "admitted", *(["damaged"] if frame not in self._seen else [])])
 
     def _opened(self) -> Gate:
-        return Gate(self._sky, COMMAND_SPIS, parser_of(_SPACECRAFT), telecommand.AUTHENTICATED)
+        return Gate(self._sky, COMMAND_SPIS, parser_of(_SPACECRAFT), TELECOMMAND_MASK)
 
     def frame(self, draw: Draw) -> tuple[str, bytes]:
         """Return the kind and the bytes of the next frame."""
@@ -115,5 +113,5 @@ class LinkFrames:
 
 
 def _header(size: int) -> bytes:
-    length = telecommand.HEADER.size + OVERHEAD_BYTES + size + CRC_BYTES
+    length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + size + CRC_BYTES
     return TelecommandHeader(_SPACECRAFT, 0, 0).pack(length)

@@ -22,9 +22,9 @@ import numpy as np
 from flight.app.accepted_config import FOLDER as FLOWN
 from flight.app.accepted_config import accepted_config, kept_configs, sum_file
 from flight.app.service import TRIALS, FlownRelease
-from flight.link.process.scheduling import Timetable
-from flight.link.security.associations import COPIES, Association, Vault
-from flight.link.security.associations import encode as sealed
+from flight.link.process.commanding import Timetable
+from flight.link.security import COPIES, Association, Vault
+from flight.link.security import encode as sealed
 from flight.loop.state import Learned, StoredState, UncleanShutdown, decode, encode
 from flight.schema.document import ConfigError
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements

@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 
-from flight.link.commands.codec import (
+from flight.link.commands import (
     ChangeMode,
     Clear,
     Command,
@@ -25,7 +25,7 @@ from flight.link.commands.codec import (
     unpack,
 )
 from flight.link.modes import COMMANDABLE, Mode
-from flight.link.telemetry.parameters import FIELDS
+from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.studies.fuzz.harness import Finding
@@ -92,7 +92,7 @@ class Telecommands:
 
 def _command(draw: Draw) -> Command:
     mode = _MODES[integer(draw, 0, len(_MODES) - 1)]
-    table = tuple(float(draw.uniform(*field.valid)) for field in FIELDS if field.valid)
+    table = tuple(float(draw.uniform(*field.valid)) for field in PARAMETER_FIELDS if field.valid)
     commands: tuple[Command, ...] = (
         Ping(integer(draw, 0, 2**16 - 1)),
         ChangeMode(mode, "by hand" if mode is Mode.SAFE and chance(draw, 0.5) else ""),

@@ -88,9 +88,9 @@ def test_a_parser_that_skips_the_checksum_is_found_out(monkeypatch: pytest.Monke
 
 def test_a_gate_that_skips_the_mac_or_the_counter_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as forged:
-        forged.setattr("flight.link.security.gate.unprotect", lambda *parts: parts[-1][14:-16])
+        forged.setattr("flight.link.security.unprotect", lambda *parts: parts[-1][14:-16])
         assert not run("link", target_of("link"), 60, seed=7).sound
-    monkeypatch.setattr("flight.link.security.gate.counter_of", lambda _: 5)
+    monkeypatch.setattr("flight.link.security.counter_of", lambda _: 5)
     assert not run("link", target_of("link"), 60, seed=7).sound
 
 
@@ -100,7 +100,7 @@ def test_a_scanner_that_skips_the_checksum_is_found_out(monkeypatch: pytest.Monk
 
 
 def test_a_reader_of_keys_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight.link.security.associations.zlib.crc32", lambda _: 0)
+    monkeypatch.setattr("flight.link.security.zlib.crc32", lambda _: 0)
     assert not run("keys", target_of("keys"), 60, seed=7).sound
 
 

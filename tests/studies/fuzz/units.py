@@ -12,9 +12,8 @@ import weakref
 from collections import Counter
 from pathlib import Path
 
-from flight.link.files.entity import GROUND, MOST_OPEN, SATELLITE, Entity, Origin
 from flight.link.files.store import FileError, Store
-from flight.link.files.transfer import CRC32
+from flight.link.files.transfer import CRC32, GROUND, MOST_OPEN, SATELLITE, Entity, Origin
 from flight.link.files.units import Metadata, PduError
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer

@@ -16,9 +16,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flight.link.frames.stream import SYNC, telecommand_stream, telemetry_stream
-from flight.link.frames.telecommand import LONGEST_FRAME, TelecommandHeader, close_frame
-from flight.link.frames.telemetry import MasterCount, PacketAssembler, TelemetryFramer, open_frame
+from flight.link.frames import (
+    LONGEST_FRAME,
+    SYNC,
+    MasterCount,
+    PacketAssembler,
+    TelecommandHeader,
+    TelemetryFramer,
+    close_frame,
+    open_telemetry,
+    telecommand_stream,
+    telemetry_stream,
+)
 from flight.loop.worker import message_length, pack_values, unpack_values
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.ina219 import Ina219
@@ -214,7 +223,7 @@ def downlink() -> DoorTarget:
             if ccitt(one) == 0:
                 if one not in made:  # one damaged frame in 65,536; the authentication is fuzzed as `link`
                     return "a right CRC by chance"
-                header, data, _ = open_frame(one, _SPACECRAFT)
+                header, data, _ = open_telemetry(one, _SPACECRAFT)
                 found += assembler.add(header, data)
         if whole and found != packets:
             raise Finding("packets that were sent did not come out")

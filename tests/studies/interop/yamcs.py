@@ -24,10 +24,16 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.archive import find_segments
-from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
+from flight.link.telemetry.definitions import (
+    LINK,
+    PARAMETER_FIELDS,
+    PARAMETER_KEYS,
+    TRANSFER,
+    VERIFICATION,
+    crc_of,
+)
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text, walk
-from flight.link.telemetry.parameters import FIELDS, KEYS, crc_of
 from flight.schema.reader import load
 from ground.telemetry import scan
 from ground.xtce import spread
@@ -45,8 +51,11 @@ _DEADLINE_S = 120.0
 def _same_table(name: str) -> dict[str, Any]:
     """Return the arguments that load the table that a configuration flies anyway."""
     config = load(_CONFIGS / name)
-    values = [float(getattr(getattr(config, section), key)) for section, key in (k.split(".") for k in KEYS)]
-    named = {field.name: value for field, value in zip(FIELDS, values, strict=True)}
+    values = [
+        float(getattr(getattr(config, section), key))
+        for section, key in (k.split(".") for k in PARAMETER_KEYS)
+    ]
+    named = {field.name: value for field, value in zip(PARAMETER_FIELDS, values, strict=True)}
     return {"replaced": crc_of(values), "crc": crc_of(values), **named}
 
 

@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.archive import find_segments
-from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, Layout, compile_layouts, to_text
 from tests.studies.same_bytes.answers import ANSWERS_FILE
 from tests.studies.same_bytes.flights import TABLE_FILE

@@ -19,12 +19,10 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from flight.link.commands.channel import open_unix
-from flight.link.commands.codec import CommandPacker, Ping
-from flight.link.commands.definitions import PING
+from flight.link.commands import PING, CommandPacker, Ping, open_unix
 from flight.link.modes import Mode
-from flight.link.process.verification import Report, Request, Stage
-from flight.link.security.associations import Vault
+from flight.link.process.commanding import Report, Request, Stage
+from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, Packer, walk
 from ground.link.command_stream import new_token
@@ -40,7 +38,7 @@ from ground.link.terminal import (
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import UsageError
 from tests.flight.app.cli.linked_board import ROOT, free_ports, write_linked_config
-from tests.flight.link.security.vaults import frame_with
+from tests.flight.link.vaults import frame_with
 from tests.support.flights import CONFIG
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.files.entity import GROUND, SATELLITE, Entity, Origin, Progress
 from flight.link.files.store import Store
-from flight.link.files.transfer import CRC32
+from flight.link.files.transfer import CRC32, GROUND, SATELLITE, Entity, Origin, Progress
 from flight.link.files.units import Metadata
 
 STEP_NS = 20_000_000

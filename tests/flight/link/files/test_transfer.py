@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.files.entity import GROUND, MOST_OPEN, SATELLITE
 from flight.link.files.store import FileError, Store, problem_of_name
-from flight.link.files.transfer import CRC32, MODULAR, Ranges
+from flight.link.files.transfer import CRC32, GROUND, MODULAR, MOST_OPEN, SATELLITE, Ranges
 from flight.link.files.units import Eof, FileData, Finished, Metadata, Transaction, pack, unpack
 from tests.flight.link.files.lossy import MOST, Pair
 

@@ -55,8 +55,8 @@ from flight.link.files.units import (
 from flight.link.files.units import (
     TransactionStatus as OurTransactionStatus,
 )
-from flight.link.frames.telecommand import HEADER, LONGEST_FRAME
-from flight.link.security.associations import OVERHEAD_BYTES
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER
+from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
 
 TRANSACTION = Transaction(1, 0x01020304, 2)
@@ -156,7 +156,7 @@ def test_units_of_class_1_with_a_crc_of_large_files_and_other_versions_are_refus
 
 
 def test_the_longest_units_fit_into_a_telecommand_frame() -> None:
-    around = HEADER.size + OVERHEAD_BYTES + CRC_BYTES + HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES
+    around = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES + HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES
     for content in (FileData(0, bytes(SEGMENT_BYTES)), Nak(0, 1, ((0, 1),) * MOST_REQUESTS)):
         assert len(pack(TRANSACTION, content)) + around <= LONGEST_FRAME
 

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from flight.link.commands.channel import open_unix
+from flight.link.commands import open_unix
 from flight.link.modes import Mode
+from flight.link.process.commanding import ControlLine, Report, Sent
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
-from flight.link.process.verification import ControlLine, Report, Sent
-from flight.link.security.associations import Vault
-from flight.link.telemetry.archive import SegmentStore
+from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, LINK, MODE, VERIFICATION
+from flight.link.telemetry.log import SegmentStore
 from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
 from ground.link.keys import make_keys
 from ground.link.terminal import Terminal, TerminalSettings, report_of

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.link.files.entity import Progress
 from flight.link.files.store import Store
+from flight.link.files.transfer import Progress
+from flight.link.process.commanding import Report
 from flight.link.process.directives import Directive
 from flight.link.process.station import TURN_NS
-from flight.link.process.verification import Report
 from ground.link.files import FileSession, failed
 from tests.flight.link.process.both_ends import BothEnds
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands import CommandPacker, Ping
 from flight.link.files.units import UP, UnitPacker
 from flight.link.process import directives, filing
 from flight.link.process.directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile

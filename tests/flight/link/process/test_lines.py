@@ -9,9 +9,8 @@ from ipaddress import IPv4Network
 
 import pytest
 
-from flight.link.frames.stream import SYNC
-from flight.link.frames.telecommand import TelecommandHeader, close_frame
-from flight.link.process.lines import AT_MOST, TcpLine, UdpLine
+from flight.link.frames import SYNC, TelecommandHeader, close_frame
+from flight.link.process.station import AT_MOST, TcpLine, UdpLine
 from knightcube.errors import UsageError
 
 FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import ChangeMode, CommandError, Ping, Point, Slew, command_of_words, unpack
+from flight.link.commands import ChangeMode, CommandError, Ping, Point, Slew, command_of_words, unpack
 from flight.link.modes import Mode
-from flight.link.process import directives, scheduling
+from flight.link.process import commanding, directives
+from flight.link.process.commanding import MOST_ENTRIES, Timetable, TimetableError
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
-from flight.link.process.scheduling import MOST_ENTRIES, Timetable, TimetableError
-from flight.link.security.associations import overwrite
+from flight.link.security import overwrite
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
 
@@ -144,7 +144,7 @@ def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
             raise KeyboardInterrupt
         return overwrite(path, data)
 
-    monkeypatch.setattr(scheduling, "overwrite", until_killed)
+    monkeypatch.setattr(commanding, "overwrite", until_killed)
     removed = False
     try:
         table.remove(1)
@@ -166,7 +166,7 @@ def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
     link.restart()
     link.turn()
     assert link.reports()[-1].text == "both copies of the schedule are lost: it is empty"
-    monkeypatch.setattr(scheduling, "overwrite", lambda *_: False)
+    monkeypatch.setattr(commanding, "overwrite", lambda *_: False)
     with pytest.raises(TimetableError, match="could not be stored"):
         Timetable(link.sky.folder).add(5, 1, 9, "ping 1")
 

@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.commands.codec import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
+from flight.link.commands import ChangeMode, Command, CommandError, CommandPacker, Ping, Slew, unpack
 from flight.link.modes import Mode
 from flight.link.process import directives, station
 from flight.link.process.directives import NewKey, Play, Stop
 from flight.link.process.downlink import LIVE, PLAYBACK
-from flight.link.security.gate import Admitted
+from flight.link.security import Admitted
 from flight.link.telemetry.definitions import CYCLE_TIMING, EVENT
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, crc16
 from tests.flight.link.process.both_ends import BothEnds
-from tests.flight.link.security.vaults import frame_with
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
+from tests.flight.link.vaults import frame_with
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import errno
 import os
 from pathlib import Path
 
-from flight.link.telemetry.archive import SegmentFile, find_segments, open_segment
+from flight.link.telemetry.log import SegmentFile, find_segments, open_segment
 
 
 def content(folder: Path, stem: str = "flight") -> bytes:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from flight.link.telemetry.archive import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
+from flight.link.telemetry.log import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
 from knightcube.errors import UsageError
 
 

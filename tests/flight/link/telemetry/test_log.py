@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.archive import find_segments
-from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.log import FlightLog, find_segments
 from ground.telemetry import scan
 from hal.buses.clock import SystemClock
 from knightcube.errors import UsageError

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.archive import SegmentFile, open_segment
-from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.log import FlightLog, SegmentFile, open_segment
 from ground.telemetry import scan
 from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
@@ -104,7 +103,7 @@ def test_a_segment_whose_name_cannot_be_synced_is_not_left_in_the_way(
 
     path = tmp_path / "flight-0001.ccsds"
     with monkeypatch.context() as broken:
-        broken.setattr("flight.link.telemetry.archive.os.fsync", fail)
+        broken.setattr("flight.link.telemetry.log.os.fsync", fail)
         with pytest.raises(OSError, match=os.strerror(errno.EIO)):
             open_segment(path)
     assert not path.exists()

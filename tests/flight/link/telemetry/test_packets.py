@@ -17,8 +17,7 @@ from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # 
     parse_space_packets,
 )
 
-from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, PACKETS, TARGET
-from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, PACKETS, TARGET, Field, Packet
 from flight.link.telemetry.packets import (
     LAYOUTS,
     SEQUENCE_MODULUS,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.archive import find_segments
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import LAYOUTS, crc16
 from ground.report import format_report, summarise
 from ground.telemetry import ScanResult, read_run, scan

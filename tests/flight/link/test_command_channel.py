@@ -17,15 +17,19 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
-from flight.link.commands.codec import (
+from flight.link.commands import (
+    AT_MOST,
     IDENTIFIERS,
     LONGEST,
     ChangeMode,
+    Channel,
     Command,
     CommandPacker,
+    DatagramChannel,
     Ping,
     Slew,
+    open_udp,
+    open_unix,
     unpack,
 )
 from flight.link.modes import Mode

@@ -1,20 +1,55 @@
-"""Packets come whole out of telemetry frames, whatever their sizes and whichever frames are lost."""
+"""Frames carry their packets, and other bytes are refused or skipped."""
 
 from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.link.frames.stream import SYNC, telemetry_stream
-from flight.link.frames.telemetry import (
+from flight.link.frames import (
+    SYNC,
+    FrameError,
     MasterCount,
     PacketAssembler,
+    TelecommandHeader,
     TelemetryFramer,
+    close_frame,
     idle_packet,
-    open_frame,
+    open_telecommand,
+    open_telemetry,
+    telemetry_stream,
 )
+
+SPACECRAFT = 0x1A5
+
+
+def test_each_bit_of_the_header_stands_where_the_standard_puts_it() -> None:
+    header = TelecommandHeader(spacecraft=SPACECRAFT, channel=0b10_1101, sequence=0x7E).pack(0x123 + 1)
+    version, bypass, control, reserved = "00", "1", "0", "00"
+    bits = (
+        version + bypass + control + reserved + f"{SPACECRAFT:010b}" + "101101" + f"{0x123:010b}" + "01111110"
+    )
+    assert header == int(bits, 2).to_bytes(5, "big")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda frame: frame + b"x",
+        lambda frame: frame[:-1],
+        lambda frame: frame[:3],
+        lambda frame: bytes([frame[0] ^ 0x10]) + frame[1:],  # a control frame
+        lambda frame: frame[:1] + bytes([frame[1] ^ 1]) + frame[2:],  # another spacecraft
+    ],
+)
+def test_only_whole_frames_of_this_spacecraft_are_opened(change: object) -> None:
+    frame = close_frame(TelecommandHeader(SPACECRAFT, 0, 0).pack(11) + b"data")
+    assert open_telecommand(frame, SPACECRAFT) == frame[:-2]
+    with pytest.raises(FrameError):
+        open_telecommand(change(frame), SPACECRAFT)  # type: ignore[operator]  # a lambda of the table above
+
 
 SPACECRAFT, ROOM = 0x1A5, 97
 FRAME = 6 + ROOM + 2
@@ -33,7 +68,7 @@ def packet(number: int, size: int) -> bytes:
 def assembled(frames: list[bytes], assembler: PacketAssembler) -> list[bytes]:
     found = []
     for frame in frames:
-        header, data, channel = open_frame(frame, SPACECRAFT)
+        header, data, channel = open_telemetry(frame, SPACECRAFT)
         assert channel == 3
         found += assembler.add(header, data)
     return found

@@ -10,11 +10,21 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flight.link.frames.telecommand import close_frame
-from flight.link.security.associations import COPIES, HIGHEST_COUNTER, Association, Vault, decode, encode
-from flight.link.security.gate import WINDOW, Gate, Refusal, RefusedError
+from flight.link.frames import close_frame
+from flight.link.security import (
+    COPIES,
+    HIGHEST_COUNTER,
+    WINDOW,
+    Association,
+    Gate,
+    Refusal,
+    RefusedError,
+    Vault,
+    decode,
+    encode,
+)
 from knightcube.errors import FlightError, UsageError
-from tests.flight.link.security.vaults import Ground, frame_with, gate, vault
+from tests.flight.link.vaults import Ground, frame_with, gate, vault
 
 KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}
 

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.link.commands.codec import (
+from flight.link.commands import (
+    COMMANDS,
+    LAYOUTS,
     ChangeMode,
     Clear,
     Command,
@@ -23,11 +25,10 @@ from flight.link.commands.codec import (
     Slew,
     unpack,
 )
-from flight.link.commands.definitions import COMMANDS, LAYOUTS
 from flight.link.modes import Mode
+from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16
-from flight.link.telemetry.parameters import FIELDS
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
@@ -55,7 +56,7 @@ ANY: st.SearchStrategy[Command] = st.one_of(
     st.builds(
         LoadParameters,
         st.integers(0, 2**32 - 1),
-        st.tuples(*(st.floats(*field.valid) for field in FIELDS if field.valid)),
+        st.tuples(*(st.floats(*field.valid) for field in PARAMETER_FIELDS if field.valid)),
     ),
     st.builds(Clear, st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=31)),
 )

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.link.frames import telecommand
-from flight.link.security.associations import COMMAND_SPIS, OVERHEAD_BYTES, Association, Vault, protect
-from flight.link.security.gate import Gate, Sealer
+from flight.link.frames import (
+    TELECOMMAND_HEADER,
+    TELECOMMAND_MASK,
+    TelecommandHeader,
+    close_frame,
+    open_telecommand,
+)
+from flight.link.security import COMMAND_SPIS, OVERHEAD_BYTES, Association, Gate, Sealer, Vault, protect
 from flight.link.telemetry.packets import CRC_BYTES
 
 SPACECRAFT = 0x1A5
@@ -23,34 +28,34 @@ def vault(folder: Path, keys: dict[int, bytes]) -> Vault:
 
 def parse(frame: bytes) -> tuple[bytes, bytes]:
     """Split a telecommand frame as the satellite does."""
-    body = telecommand.open_frame(frame, SPACECRAFT)
-    size = telecommand.HEADER.size
+    body = open_telecommand(frame, SPACECRAFT)
+    size = TELECOMMAND_HEADER.size
     return body[:size], body[size:]
 
 
 def gate(at: Vault) -> Gate:
     """Return the satellite's gate of commands."""
-    return Gate(at, COMMAND_SPIS, parse, telecommand.AUTHENTICATED)
+    return Gate(at, COMMAND_SPIS, parse, TELECOMMAND_MASK)
 
 
 def frame_with(at: Vault, counter: int, data: bytes, spi: int = 1) -> bytes:
     """Return an authentic telecommand frame with any counter of 96 bits, which no sealer would reserve."""
     entry = at.read(spi)
     assert entry is not None
-    header = telecommand.TelecommandHeader(SPACECRAFT, 0, 0)
-    length = telecommand.HEADER.size + OVERHEAD_BYTES + len(data) + CRC_BYTES
-    mask = telecommand.AUTHENTICATED
-    return telecommand.close_frame(protect(entry.cipher, spi, counter, header.pack(length), mask, data))
+    header = TelecommandHeader(SPACECRAFT, 0, 0)
+    length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(data) + CRC_BYTES
+    mask = TELECOMMAND_MASK
+    return close_frame(protect(entry.cipher, spi, counter, header.pack(length), mask, data))
 
 
 class Ground:
     """Makes protected telecommand frames."""
 
     def __init__(self, at: Vault, spi: int = 1) -> None:
-        self._sealer = Sealer(at, spi, telecommand.AUTHENTICATED)
+        self._sealer = Sealer(at, spi, TELECOMMAND_MASK)
 
     def frame(self, data: bytes) -> bytes:
         """Return the next frame."""
-        header = telecommand.TelecommandHeader(SPACECRAFT, 0, 0)
-        length = telecommand.HEADER.size + 30 + len(data) + 2
-        return telecommand.close_frame(self._sealer.seal(header.pack(length), data)[0])
+        header = TelecommandHeader(SPACECRAFT, 0, 0)
+        length = TELECOMMAND_HEADER.size + 30 + len(data) + 2
+        return close_frame(self._sealer.seal(header.pack(length), data)[0])

@@ -1,0 +1,621 @@
+"""Telecommands: the table of their packets, their values and words, and the channels that receive them.
+
+Telecommands are CCSDS space packets of type 1. `time_ns` of the secondary header is a number that the sender
+uses once, such as its UTC, so that a packet which a network duplicates is executed once. States and ranges of
+arguments are checked from the table, on the ground and on board; the words of `flight command` are made
+from it.
+
+The queue of a socket is short: an unknown sender that is faster than the loop would fill it, and a peer's
+command would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop datagrams that
+do not begin as a command does or that come from no peer. The filter sees a UDP datagram from its UDP header
+on, and a UNIX datagram from its first byte on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import socket
+import stat
+import struct
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
+from typing import Any, Protocol
+
+from flight.link.modes import COMMANDABLE, Mode
+from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet, crc_of
+from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
+from flight.link.telemetry.packets import (
+    HEADER_BYTES,
+    Layout,
+    Packer,
+    TelemetryError,
+    compile_layouts,
+    crc16,
+    to_text,
+)
+from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
+from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
+
+_MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)
+_NUMBERS = (
+    "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad; object: right ascension, "
+    "declination, rad, where it is looked for, NaN: where the camera looks"
+)
+_GOALS = tuple((int(goal), goal.label) for goal in Goal)
+
+
+def _command(name: str, apid: int, meaning: str, *fields: Field, hazard: str = "") -> Packet:
+    return Packet(name, apid, "at will", meaning, fields, telecommand=True, hazard=hazard)
+
+
+PING = _command(
+    "ping", 0x201, "Answer, and do nothing else", Field("number", "u4", "-", "comes back in the answer")
+)
+SAFE = _command(
+    "safe",
+    0x202,
+    "Abort: coils to zero, mode safe",
+    Field("reason", "S64", "-", "for the log"),
+    hazard="ends pointing, slews and braking until the next command",
+)
+MODE = _command(
+    "mode",
+    0x203,
+    "Change the mode",
+    Field("mode", "u1", "-", "what the satellite shall do", states=_MODES),
+    hazard="moves the body, or stops moving it",
+)
+SLEW = _command(
+    "slew",
+    0x204,
+    "Go to an attitude, then hold it",
+    Field("q2", "f8", "-", "commanded final q2", valid=(-Q2_LIMIT, Q2_LIMIT)),
+    hazard="moves the body",
+)
+CLEAR = _command(
+    "clear",
+    0x205,
+    "Clear a latched event",
+    Field("event", "S32", "-", "its name, as in the log"),
+    hazard="what the event barred is used again, as a broken coil",
+)
+POINT = _command(
+    "point",
+    0x206,
+    "Point a satellite to a goal",
+    Field("goal", "u1", "-", "where to point", states=_GOALS),
+    Field("numbers", "f8", "-", _NUMBERS, 4),
+    Field("roll", "f8", "rad", "about the pointing axis, NaN: free"),
+    hazard="moves the body",
+)
+
+LOAD_PARAMETERS = _command(
+    "load-parameters",
+    0x210,
+    "Fly another table of parameters, all of them at once",
+    Field(
+        "replaced",
+        "u4",
+        "-",
+        "CRC-32 of the table that it replaces: another one has come between, if not equal",
+    ),
+    Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
+    *PARAMETERS,
+    hazard="moves the limits at which the satellite brakes, gives up or warns",
+)
+DUMP_PARAMETERS = _command("dump-parameters", 0x211, "Report the table of parameters that flies")
+
+COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT, LOAD_PARAMETERS, DUMP_PARAMETERS)
+
+LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
+"""Their bytes, by name."""
+
+
+class CommandError(FlightError):
+    """Raised for bytes or values that are not a valid command; the text states the reason."""
+
+
+class MalformedError(CommandError):
+    """Raised for bytes that are not a command packet.
+
+    Such bytes are never answered, so that two flights cannot answer each other without end.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Ping:
+    """Answer."""
+
+    number: int = 0
+    packet = PING
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name."""
+        return {"number": self.number}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"ping {self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeMode:
+    """Go into a mode; `reason` is for the log."""
+
+    mode: Mode
+    reason: str = ""
+
+    @property
+    def packet(self) -> Packet:
+        """The packet of the command: SAFE has its own packet."""
+        return SAFE if self.mode is Mode.SAFE else MODE
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name."""
+        return {"reason": self.reason} if self.mode is Mode.SAFE else {"mode": int(self.mode)}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"mode {self.mode.label}" + (f": {shown(self.reason)}" if self.reason else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Slew:
+    """Go to an attitude."""
+
+    q2: float
+    packet = SLEW
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name."""
+        return {"q2": self.q2}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"slew to q2 {self.q2:+.4f}" if math.isfinite(self.q2) else "slew"
+
+
+@dataclass(frozen=True, slots=True)
+class Clear:
+    """Clear a latched event, so that it can be raised again."""
+
+    event: str
+    packet = CLEAR
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name."""
+        return {"event": self.event}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"clear {shown(self.event)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Point to a goal."""
+
+    target: PointingTarget
+    packet = POINT
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name; spare numbers and a free roll are NaN."""
+        target = self.target
+        return {
+            "goal": int(target.goal),
+            "numbers": [*target.numbers, *[math.nan] * (4 - len(target.numbers))],
+            "roll": math.nan if target.roll is None else target.roll,
+        }
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"point {self.target.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class LoadParameters:
+    """Replace the table of parameters whose CRC is `replaced` by `values`, in the order of the table."""
+
+    replaced: int
+    values: tuple[float, ...]
+    packet = LOAD_PARAMETERS
+
+    @property
+    def by_key(self) -> dict[str, float]:
+        """The values by their keys in a configuration."""
+        return dict(zip(PARAMETER_KEYS, self.values, strict=True))
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields, by name."""
+        named = {field.name: value for field, value in zip(PARAMETER_FIELDS, self.values, strict=True)}
+        return {"replaced": self.replaced, "crc": crc_of(self.values), **named}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return f"load-parameters {crc_of(self.values):08x} in place of {self.replaced:08x}"
+
+
+@dataclass(frozen=True, slots=True)
+class DumpParameters:
+    """Report the table of parameters."""
+
+    packet = DUMP_PARAMETERS
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The packet's fields: none."""
+        return {}
+
+    @property
+    def text(self) -> str:
+        """The command as printable text."""
+        return "dump-parameters"
+
+
+Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParameters
+
+
+def shown(text: str) -> str:
+    """Return a text in which characters that do not print are replaced by escapes."""
+    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(escaped)
+
+
+def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
+    """Return the target of a packet's fields; a roll of NaN means a free roll. Raises CommandError."""
+    goal = Goal(number)
+    try:
+        counts = NUMBERS.get(goal, (0,))
+        given = numbers[: counts[-1]]
+        if 0 in counts and all(map(math.isnan, given)):
+            given = []
+        return PointingTarget(goal, tuple(given), None if math.isnan(roll) else roll)
+    except UsageError as error:
+        raise CommandError(str(error)) from error
+
+
+def _table(fields: Mapping[str, Any]) -> LoadParameters:
+    """Return the table in a packet's fields. Raises CommandError if its CRC is wrong."""
+    values = tuple(fields[field.name] for field in PARAMETER_FIELDS)
+    if fields["crc"] != crc_of(values):
+        raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
+    return LoadParameters(fields["replaced"], values)
+
+
+MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
+    PING.name: lambda fields: Ping(fields["number"]),
+    SAFE.name: lambda fields: ChangeMode(Mode.SAFE, fields["reason"]),
+    MODE.name: lambda fields: ChangeMode(Mode(fields["mode"])),
+    SLEW.name: lambda fields: Slew(fields["q2"]),
+    CLEAR.name: lambda fields: Clear(fields["event"]),
+    POINT.name: lambda fields: Point(_target(fields["goal"], fields["numbers"], fields["roll"])),
+    LOAD_PARAMETERS.name: _table,
+    DUMP_PARAMETERS.name: lambda _: DumpParameters(),
+}
+"""Functions that make a command from the fields of a packet, by packet name."""
+
+
+LONGEST = max(layout.length for layout in LAYOUTS.values())
+"""Length (bytes) of the longest command; longer packets are refused."""
+
+_BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
+IDENTIFIERS = tuple(_BY_IDENTIFIER)
+"""First 16 bits of all command packets."""
+
+
+def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
+    """Return the command of a packet's fields. Raises CommandError for values outside the table."""
+    check(packet, fields)
+    return MAKERS[packet.name](fields)
+
+
+def check(packet: Packet, fields: Mapping[str, Any]) -> None:
+    """Refuse fields outside the states and ranges of the table. Raises CommandError."""
+    for field in packet.fields:
+        value = fields[field.name]
+        if field.states and value not in dict(field.states):
+            allowed = ", ".join(f"{number} {label}" for number, label in field.states)
+            raise CommandError(f"{field.name} = {value} is not to be commanded so: one of {allowed}")
+        if field.valid is not None and not field.valid[0] <= value <= field.valid[1]:  # NaN compares false
+            low, high = field.valid
+            raise CommandError(f"{field.name} = {value} must lie within {low:g} to {high:g}")
+    if packet is CLEAR and not fields["event"]:
+        raise CommandError("clear needs the name of an event")
+
+
+class CommandPacker:
+    """Makes the packets of commands with their sequence counts."""
+
+    def __init__(self) -> None:
+        self._packer = Packer(LAYOUTS)
+
+    def pack(self, command: Command, utc_ns: int) -> bytes:
+        """Return the packet of a command. Raises CommandError for values outside the table."""
+        check(command.packet, command.fields)
+        try:
+            return self._packer.pack(command.packet, utc_ns, command.fields)
+        except TelemetryError as error:
+            raise CommandError(str(error)) from error
+
+
+def unpack(data: bytes) -> Command:
+    """Return the command in a packet.
+
+    Raises MalformedError for bytes that are not a command packet and CommandError for invalid values.
+    """
+    if len(data) < HEADER_BYTES:
+        raise MalformedError(f"{len(data)} bytes are no packet")
+    layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
+    if layout is None:
+        raise MalformedError(f"no command begins with 0x{int.from_bytes(data[:2], 'big'):04x}")
+    stated = int.from_bytes(data[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
+    if not len(data) == stated == layout.length:
+        raise MalformedError(f"{len(data)} bytes, {stated} stated, {layout.packet.name} has {layout.length}")
+    if crc16(data) != 0:
+        raise MalformedError("its CRC is wrong")
+    if data[HEADER_BYTES] != layout.packet.version:
+        raise CommandError(f"version {data[HEADER_BYTES]} of {layout.packet.name} is not known")
+    (row,) = layout.array(data)
+    fields = {
+        field.name: to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
+        for field in layout.packet.fields
+    }
+    return command_of(layout.packet, fields)
+
+
+def command_of_words(text: str) -> Command:
+    """Return the command of a line such as `slew 0.2`, `mode hold`, `safe end of pass` or `point sun`.
+
+    A line is the name of the command, then each field in order, in the units of the table; labels stand for
+    states. Missing numbers at the end are NaN, and a text field takes the rest of the line. Raises
+    CommandError, also for a number outside the range of its field.
+    """
+    name, *words = text.split() or [""]
+    if name not in LAYOUTS:
+        raise CommandError(f"{name!r} is no command: {', '.join(LAYOUTS)}")
+    packet = LAYOUTS[name].packet
+    fields: dict[str, Any] = {}
+    for field in packet.fields:
+        if field.kind.startswith("S"):
+            fields[field.name], words = " ".join(words), []
+            continue
+        taken, words = words[: field.count], words[field.count :]
+        numbers = [_number(field, word) for word in [*taken, *[""] * (field.count - len(taken))]]
+        fields[field.name] = numbers if field.count > 1 else numbers[0]
+    if words:
+        raise CommandError(f"{text}: nothing is to stand behind {packet.fields[-1].name}")
+    command = command_of(packet, fields)
+    CommandPacker().pack(command, 0)
+    return command
+
+
+def _number(field: Field, word: str) -> float | int:
+    for number, label in field.states:
+        if word == label:
+            return number
+    real = field.kind.startswith("f")
+    if not word and real:
+        return math.nan
+    try:
+        return float(word) if real else int(word)
+    except ValueError:
+        labels = ", ".join(label for _, label in field.states)
+        raise CommandError(
+            f"{field.name} = {word!r}: {f'one of {labels}' if labels else field.meaning}"
+        ) from None
+
+
+_SO_ATTACH_FILTER = 26
+_SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF: the source address of the IPv4 header
+_UDP_HEADER_BYTES = 8
+_LOAD_WORD, _LOAD_HALF, _AND, _EQUAL, _RETURN = 0x20, 0x28, 0x54, 0x15, 0x06
+_DROP, _WHOLE = (_RETURN, 0, 0, 0), (_RETURN, 0, 0, 0xFFFF)
+
+_Instruction = tuple[int, int, int, int]
+"""Operation, instructions to skip if the condition is true and if it is false, and operand."""
+
+
+def _filter_datagrams(
+    bound: socket.socket, identifiers: Sequence[int], peers: Sequence[IPv4Network] | None = None
+) -> None:
+    """Let a socket receive only datagrams that begin with one of `identifiers`, from `peers` if given.
+
+    If the kernel refuses the filter, the socket receives all datagrams, and its reader must check them.
+    """
+    start = _UDP_HEADER_BYTES if bound.family == socket.AF_INET else 0
+    left = len(identifiers)
+    program: list[_Instruction] = [(_LOAD_HALF, 0, 0, start)]
+    program += [(_EQUAL, left - number, 0, identifier) for number, identifier in enumerate(identifiers)]
+    program.append(_DROP)
+    for peer in peers or ():
+        network = (_EQUAL, 0, 1, int(peer.network_address))
+        program += [(_LOAD_WORD, 0, 0, _SOURCE), (_AND, 0, 0, int(peer.netmask)), network, _WHOLE]
+    program.append(_WHOLE if peers is None else _DROP)
+    code = array("B", b"".join(struct.pack("@HBBI", *instruction) for instruction in program))
+    # struct sock_fprog: the number of instructions and a pointer to the first
+    with suppress(OSError):
+        packed = struct.pack("@HP", len(program), code.buffer_info()[0])
+        bound.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
+
+
+AT_MOST = 16
+"""Maximum number of datagrams read per call, so that a flood does not delay the loop."""
+
+_LOOK_EVERY = 10
+"""Polls between two checks that the socket's file exists: one second in flight."""
+
+
+class Channel(Protocol):
+    """Source of datagrams, each with the address for its answer."""
+
+    name: str
+
+    def poll(self) -> list[tuple[bytes, Any]]:
+        """Return the received datagrams, oldest first. Never waits, never raises."""
+
+    def news(self) -> str:
+        """Return what happened to the channel since the last call, empty when nothing did."""
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        """Answer a sender that has an address and listens. Never waits, never raises."""
+
+    def close(self) -> None:
+        """Close. Safe to call twice."""
+
+
+class DatagramChannel:
+    """Bound datagram socket. A UNIX socket whose file was removed is bound again."""
+
+    def __init__(
+        self,
+        name: str,
+        bound: socket.socket,
+        path: Path | None = None,
+        peers: Sequence[IPv4Network] | None = None,
+    ) -> None:
+        """Use a bound socket; remove `path` at the end, and ignore senders outside `peers` if given."""
+        self.name = name
+        self._socket = bound
+        self._path = path
+        self._peers = peers
+        self._polls = 0
+        self._news = ""
+        self._closed = False
+        bound.setblocking(False)
+        self._file = _identity(path)
+
+    def poll(self) -> list[tuple[bytes, Any]]:
+        """Return the received datagrams, oldest first, cut to one byte more than the longest command."""
+        self._polls += 1
+        if self._path is not None and not self._closed and self._polls % _LOOK_EVERY == 0:
+            self._look(self._path)
+        found = []
+        for _ in range(AT_MOST):
+            try:
+                data, sender = self._socket.recvfrom(LONGEST + 1)
+            except OSError:  # no datagram waits, or ICMP reports that an earlier answer found no listener
+                break
+            if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
+                found.append((data, sender))
+        return found
+
+    def news(self) -> str:
+        """Return what happened to the channel since the last call, empty when nothing did."""
+        news, self._news = self._news, ""
+        return news
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        """Answer a sender that has an address."""
+        if sender:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, sender)
+
+    def close(self) -> None:
+        """Close the socket and remove its file, unless another socket has replaced the file."""
+        self._socket.close()
+        self._closed = True
+        if self._path is not None and self._file is not None and _identity(self._path) == self._file:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+
+    def _look(self, path: Path) -> None:
+        """Bind the socket again if its file was removed or replaced; retry at the next check."""
+        if self._file is not None and _identity(path) == self._file:
+            return
+        try:
+            bound = _bound_unix(path)
+        except OSError as error:
+            if self._file is not None:
+                self._news = f"{path} is gone and cannot be bound again: {error.strerror or error}"
+            self._file = None
+            return
+        bound.setblocking(False)
+        old, self._socket, self._file = self._socket, bound, _identity(path)
+        old.close()
+        self._news = f"{path} was gone: bound again"
+
+
+def open_unix(path: Path) -> DatagramChannel:
+    """Bind a UNIX datagram socket that owner and group may write to. Raises UsageError.
+
+    A stale socket file, to which no process listens, is replaced; any other file is left unchanged.
+    """
+    try:
+        bound = _bound_unix(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"commands.socket: {path} cannot be listened to: {reason}") from error
+    return DatagramChannel("socket", bound, path)
+
+
+def _bound_unix(path: Path) -> socket.socket:
+    """Return a bound socket. Raises OSError."""
+    bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            if not stat.S_ISSOCK(path.lstat().st_mode):
+                raise OSError("something else stands there")
+            if _is_served(path):
+                raise OSError("another flight listens there")
+            path.unlink()
+        before = os.umask(0o117)
+        try:
+            bound.bind(str(path))
+        finally:
+            os.umask(before)
+    except OSError:
+        bound.close()
+        raise
+    _filter_datagrams(bound, IDENTIFIERS)
+    return bound
+
+
+def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
+    """Bind a UDP socket to HOST:PORT; ignore senders outside `peers` if given. Raises UsageError."""
+    host, _, port = address.rpartition(":")
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, int(port)))
+    except (OSError, OverflowError) as error:
+        bound.close()
+        raise UsageError(f"commands.udp: {address} cannot be listened to: {error}") from error
+    _filter_datagrams(bound, IDENTIFIERS, peers)
+    return DatagramChannel("udp", bound, peers=peers)
+
+
+def _identity(path: Path | None) -> tuple[int, int] | None:
+    """Return the device and inode of a file, None if it does not exist."""
+    try:
+        found = os.lstat(path) if path is not None else None
+    except OSError:
+        return None
+    return None if found is None else (found.st_dev, found.st_ino)
+
+
+def _is_served(path: Path) -> bool:
+    """Return whether a process listens to a socket file."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+        return True

@@ -1,1 +1,0 @@
-"""Commands: the channels they arrive by, their packets and their values."""

@@ -1,1 +1,0 @@
-"""Transfer frames: telecommand (CCSDS 232.0-B) and telemetry (132.0-B), and the streams that carry them."""
