@@ -21,8 +21,8 @@ from knightcube.reference.corner_streaks.rate import estimate_rate
 from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, StreakSettings
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.objects.detect import SpaceObject, detect
-from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
+from knightcube.vision.objects.detect import SpaceObject, detect_objects
+from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
@@ -154,10 +154,8 @@ def _objects(
 ) -> tuple[SpaceObject, ...]:
     if found.rate is None:
         return ()
-    settings = EndpointSettings(gain=likelihood.gain, saturation=likelihood.saturation)
-    rotation, exposure = found.rate * found.exposure, found.exposure
-    report = detect(pixels, pinhole, rotation, exposure, settings, ObjectSettings())
-    return report.objects if report is not None else ()
+    settings = ObjectSettings(gain=likelihood.gain, saturation=likelihood.saturation)
+    return detect_objects(pixels, pinhole, found.rate, found.exposure, settings).objects
 
 
 def _facts(found: FrameMotion, objects: tuple[SpaceObject, ...], method: str) -> dict[str, Any]:

@@ -1,29 +1,23 @@
-"""Three indicators that a streak is no star: centre, displacement, OLAE residual (Sease 4.11-4.15 corrected).
+"""Resident space objects among the star streaks of one image (Sease chapter 4).
 
-Every star turns about one axis by one angle. A streak that misses the common centre of rotation, that turned
-by another angle about it, or that leaves a residual in OLAE belongs to something else. When the axis is
-nearly normal to the boresight the centre runs to infinity; the slope takes its place and the length that of
-the angle.
+    found = detect_objects(image, camera, rate, exposure)
 
-The pinhole's projection bends slopes and lengths across a wide field by far more than their errors, so each
-indicator is compared with a star in the same place, and the difference is expressed in
-expected errors of an endpoint. All three are then one scale, fair to bright and faint streaks, and without an
-RSO their
-spread is a constant of the detector: `python -m tests.studies.bench.rso_spread` measures it, for the lower
-bounds
-    that
-the strict 2.5 sigma rule lacks (text at Table 4.4).
+Every star rotates about one axis by one angle. Three indicators show that a streak belongs to something else:
+its chord misses the common centre of rotation, it subtends another angle there, or it leaves a residual in
+OLAE (Sease 4.11-4.15, corrected). If the axis is nearly normal to the boresight, the centre recedes to
+infinity, and slope and length of the chord replace centre and angle. The projection of a pinhole changes
+slopes and lengths across a wide field by far more than their errors. Each indicator is therefore compared
+with a star at the same position, in units of the expected error of an endpoint. The strict rule of 2.5 sigma
+lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an object (`python -m
+tests.studies.bench.rso_spread`).
 
-Resident space objects among the streaks of one frame (Sease chapter 4).
-
-`rso_indicators` finds the streaks that do not move as the stars do. Such a streak is not yet an object: two
-stars whose streaks overlap, or a piece of a faint star's streak, deviate as well (Table 4.4: "overlapping
-streak"). `Judge` therefore tests whether stars explain the pixels (`star_light`). Regions with more than two
-corners, which the thesis discards, may be stars or an object that crosses a star. Bright points in a frame
-whose stars are streaks are tracked objects (Figure 4.5). Regions that are saturated or otherwise deviate, or
-in which objects and stars are merged, are searched once their stars are removed (`merged`). The search needs
-only the rotation of the camera. The maximum-likelihood estimate of that rotation succeeds in more frames than
-the corners' estimate and is more accurate.
+A deviating streak is not yet an object: two stars whose streaks overlap, or a segment of a faint star's
+streak, deviate as well (Table 4.4: "overlapping streak"). `Judge` therefore tests whether stars explain the
+pixels (`star_light`). Regions with more than two corners, which the thesis discards, may be stars or an
+object that crosses a star. Bright points in an image whose stars are streaks are tracked objects (Figure
+4.5). Regions that are saturated or otherwise deviate, or in which objects and stars are merged, are searched
+after their stars are removed. The search needs only the rotation of the camera. The maximum-likelihood
+estimate of that rotation succeeds in more images than the corners' estimate and is more accurate.
 """
 
 from __future__ import annotations
@@ -38,19 +32,18 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import CameraModel, Pinhole, check_image
 from knightcube.vision.frame import MAD_TO_SIGMA, line_of, positions
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
 from knightcube.vision.objects.star_light import (
     Explanation,
     StarLight,
+    at_mid_exposure,
     brightest_left,
-    carried_to_middle,
     cut_patch,
     fit_stars,
 )
 from knightcube.vision.objects.streak_ends import (
-    Regions,
     Segmented,
     Streaks,
     centre_of_rotation,
@@ -63,6 +56,7 @@ from knightcube.vision.objects.streak_ends import (
 )
 
 INDICATORS = ("centre", "displacement", "residual")
+"""Names of the three indicators."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +64,11 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: (n, 2, 2) px, in the order of time in which a star would have gone.
-        deviations: (n, 3) standard deviations from a star in the same place.
-        fired: (n, 3) which exceed their thresholds.
-        centre: (2,) px, of rotation, by least squares; worthless when `degenerate`.
-        degenerate: whether slope and length stand in for centre and angle.
+        endpoints: ends of the streaks (n, 2, 2), px, in the order of time in which a star would have moved.
+        deviations: deviations from a star at the same position (n, 3), in standard deviations.
+        fired: which deviations exceed their thresholds (n, 3).
+        centre: centre of rotation (2,), px, by least squares; meaningless if `degenerate`.
+        degenerate: whether slope and length replace centre and angle.
     """
 
     endpoints: FloatArray
@@ -85,34 +79,33 @@ class Indicators:
 
 
 def centre_residuals(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return by how far (n,) px the bisector of each chord misses the centre (2,): 4.11-4.13 corrected."""
+    """Return the distances (n,), px, of a centre (2,) from the bisectors of chords, by 4.11-4.13."""
     chord = endpoints[:, 1] - endpoints[:, 0]
-    length = np.linalg.norm(chord, axis=-1)
     missed = np.sum(chord * (centre - endpoints.mean(axis=1)), axis=-1)
-    return np.asarray(missed / np.maximum(length, np.finfo(float).tiny))
+    return np.asarray(missed / np.maximum(np.linalg.norm(chord, axis=-1), np.finfo(float).tiny))
 
 
 def slopes(endpoints: FloatArray) -> FloatArray:
-    """Return the direction (n,) of each chord in the image, rad: the slope m without its infinity."""
+    """Return the directions (n,), rad, of chords (n, 2, 2) in the image."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.asarray(np.arctan2(chord[:, 1], chord[:, 0]))
 
 
 def angular_displacements(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the angle (n,) rad that each streak (n, 2, 2) subtends at the centre (2,): 4.14."""
+    """Return the angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,), by 4.14."""
     first, second = endpoints[:, 0] - centre, endpoints[:, 1] - centre
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # Not by the arc cosine, which is blind to small angles.
+    # The arc cosine would be inaccurate for small angles.
     return np.asarray(np.arctan2(np.abs(cross), np.sum(first * second, axis=-1)))
 
 
 def lengths(endpoints: FloatArray) -> FloatArray:
-    """Return the distance (n,) px between the ends: 4.15."""
+    """Return the lengths (n,), px, of chords (n, 2, 2), by 4.15."""
     return np.asarray(np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1))
 
 
 def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the lengths (n,) of the OLAE residuals of directions (n, 2, 3), first to second (4.7)."""
+    """Return the norms (n,) of the OLAE residuals of directions (n, 2, 3), first and second, by 4.7."""
     angle = float(np.linalg.norm(rotation))
     scale = np.tan(0.5 * angle) / angle if angle > 0.0 else 0.5
     sums, differences = vectors[:, 0] + vectors[:, 1], vectors[:, 1] - vectors[:, 0]
@@ -120,10 +113,10 @@ def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the first and last directions (n, 2, 3) of the stars whose chords have the middles of `vectors`.
+    """Return the first and last directions (n, 2, 3) of stars whose chords have the midpoints of `vectors`.
 
-    A chord's middle lies inside the circle: the part of it normal to the axis is too short by the cosine of
-    half the angle turned.
+    The midpoint of a chord lies inside of the circle: its component normal to the axis is too short by the
+    cosine of half the rotation angle.
     """
     angle = float(np.linalg.norm(rotation))
     middle = vectors.mean(axis=1)
@@ -148,15 +141,15 @@ def evaluate(
     """Return the indicators of streaks under the rotation that the stars share.
 
     Args:
-        endpoints: (n, 2, 2) px, without bias, in any order.
-        sigma: (n,) px, expected errors of an endpoint.
-        rotation: (3,) rad, camera frame, over the exposure.
+        endpoints: ends of the streaks (n, 2, 2), px, without bias, in any order.
+        sigma: expected errors of an endpoint (n,), px.
+        rotation: rotation of the camera over the exposure (3,), rad, camera axes.
         pinhole: the camera.
-        bounds: least deviations at which each indicator fires, from their measured spread without an RSO.
-        strict: robust standard deviations within the frame that must be exceeded too, the thesis's rule.
-        farthest_centre: focal lengths from the image's middle, beyond which the centre is degenerate; taken
-            of the axis, for the least squares' own centre, the thesis's trigger, falls short the more the
-            farther it should be: errors and projection turn parallel chords enough to let them meet anywhere.
+        bounds: least deviations at which each indicator fires.
+        strict: robust standard deviations within the image that must be exceeded too, as in the thesis.
+        farthest_centre: distance of the centre from the boresight, in focal lengths, beyond which it is
+            degenerate. The axis of the rotation decides, because the centre by least squares is too near: its
+            errors and the projection make parallel chords intersect.
     """
     vectors = pinhole.unit_vectors(endpoints)
     stars = star_ends(vectors, rotation)
@@ -170,43 +163,27 @@ def evaluate(
     centre = centre_of_rotation(endpoints[quiet]) if np.count_nonzero(quiet) >= 2 else np.full(2, np.nan)
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > farthest_centre * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
-    if degenerate:
-        centred, displaced = _slope_and_length(endpoints, expected)
-    else:
-        centred, displaced = _centre_and_angle(endpoints, expected, centre)
-    deviations = np.stack([centred / error, displaced / error, residual], axis=-1)
-    return Indicators(endpoints, deviations, _fired(deviations, bounds, strict), centre, degenerate)
-
-
-def _centre_and_angle(
-    endpoints: FloatArray, expected: FloatArray, centre: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return both indicators less a star's, in px across and along the streak at one end."""
-    radius = np.linalg.norm(endpoints.mean(axis=1) - centre, axis=-1)
-    missed = centre_residuals(endpoints, centre) - centre_residuals(expected, centre)
-    turned = angular_displacements(endpoints, centre) - angular_displacements(expected, centre)
-    return missed * lengths(endpoints) / np.maximum(radius, 1.0), turned * radius
-
-
-def _slope_and_length(endpoints: FloatArray, expected: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the stand-ins for a centre at infinity less a star's, in px across and along the streak."""
     length = lengths(endpoints)
-    return np.sin(slopes(endpoints) - slopes(expected)) * length, length - lengths(expected)
+    # Both differences from a star, in px across and along the streak at one end.
+    if degenerate:
+        across = np.sin(slopes(endpoints) - slopes(expected)) * length
+        along = length - lengths(expected)
+    else:
+        radius = np.linalg.norm(endpoints.mean(axis=1) - centre, axis=-1)
+        missed = centre_residuals(endpoints, centre) - centre_residuals(expected, centre)
+        turned = angular_displacements(endpoints, centre) - angular_displacements(expected, centre)
+        across, along = missed * length / np.maximum(radius, 1.0), turned * radius
+    deviations = np.stack([across / error, along / error, residual], axis=-1)
+    fired = np.zeros((0, 3), dtype=np.bool_)
+    if len(deviations):
+        # The median absolute deviation, because an object widens the standard deviation that is to find it:
+        # of ten streaks none could exceed 2.85 of it.
+        spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
+        fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
+    return Indicators(endpoints, deviations, fired, centre, degenerate)
 
 
-def _fired(deviations: FloatArray, bounds: tuple[float, float, float], strict: float) -> BoolArray:
-    """Return which deviations (n, 3) exceed both the bound and `strict` times the frame's own spread.
-
-    The spread is the median absolute deviation: an RSO would widen the standard deviation that is to find it,
-    of ten streaks so far that none could exceed 2.85 of it.
-    """
-    if not len(deviations):
-        return np.zeros((0, 3), dtype=np.bool_)
-    spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
-    return np.asarray(np.abs(deviations) > np.maximum(bounds, strict * spread))
-
-
-# Bright parts shorter than this are points.
+# Length (px) below which a bright part of a region is a point.
 _LEAST_LINE_PX = 4.0
 
 
@@ -217,10 +194,10 @@ def short_regions(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return ends (n, 2, 2), errors (n,) px and labels (n,) of bright regions too short for corners.
+    """Return the bright regions that are too short for corners, where stars would not be short.
 
-    Only where stars would not be short. The ends are those of the uniform line with the region's moments; a
-    point's two ends coincide.
+    The result is their ends (n, 2, 2), px, errors (n,), px, and labels (n,). The ends are those of the
+    uniform line with the moments of the region's bright part; both ends of a point are equal.
     """
     regions = segmented.regions
     noise = segmented.background.typical_noise
@@ -232,7 +209,19 @@ def short_regions(
     )
     brightest = np.flatnonzero(chosen)[np.argsort(-regions.flux[chosen], kind="stable")]
     short = regions.select(brightest[: objects.most_points])
-    ends = np.array([_line_of(segmented, short, index) for index in range(len(short))]).reshape(-1, 2, 2)
+    lines = []
+    for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
+        row, column = positions(short.labels[top:bottom, left:right] == label)
+        weight = segmented.signal[row + top, column + left].astype(float)
+        # Above half of the brightest pixel: the streak of a faint star under a point must not lengthen it.
+        bright = weight >= 0.5 * weight.max()
+        points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
+        weight = weight[bright] / weight[bright].sum()
+        centre = weight @ points
+        offset = points - centre
+        # Below the point spread the moments measure noise instead of length.
+        lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX))
+    ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
     # Near the axis stars are points too.
@@ -240,26 +229,8 @@ def short_regions(
     return ends[streaked], sigma[streaked], short.label[streaked]
 
 
-def _line_of(segmented: Segmented, regions: Regions, index: int) -> FloatArray:
-    """Return the ends (2, 2) px of the uniform line with the moments of a region's bright part.
-
-    Bright is above half of the brightest pixel, so that a faint star's streak under a point does not lengthen
-    it.
-    """
-    top, bottom, left, right = regions.boxes[index]
-    row, column = positions(regions.labels[top:bottom, left:right] == regions.label[index])
-    weight = segmented.signal[row + top, column + left].astype(float)
-    bright = weight >= 0.5 * weight.max()
-    points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
-    weight = weight[bright] / weight[bright].sum()
-    centre = weight @ points
-    offset = points - centre
-    # Shorter than the point spread the moments measure noise, not length.
-    return line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX)
-
-
 class Verdict(Enum):
-    """The verdict on a streak: a star by its indicators, stars by its pixels, an object, or neither."""
+    """The verdict on a streak: a star by its indicators, stars by its pixels, an object, or undecided."""
 
     STAR = "star"
     STARS = "stars"
@@ -272,13 +243,13 @@ class SpaceObject:
     """A streak or point that does not move as the stars do.
 
     Attributes:
-        endpoints: (2, 2) px, in the order of time for which the motion among the stars is the slower.
-        fired: names of the indicators that singled it out; none when it was found by its pixels alone.
-        flux: counts.
-        improvement: of chi-square over stars.
-        relative_rate: rad/s, its motion among the stars.
-        direction: (2,) unit vector in the image (x, y), of that motion at mid-exposure.
-        other_relative_rate: rad/s, for the other order of the endpoints, which one frame cannot exclude.
+        endpoints: ends (2, 2), px, in the order of time for which the motion among the stars is slower.
+        fired: names of the indicators that fired; empty if the object was found by its pixels alone.
+        flux: light, counts.
+        improvement: gain in chi-square over stars alone.
+        relative_rate: angular rate of its motion among the stars, rad/s.
+        direction: direction of that motion in the image at mid-exposure, unit vector (2,), x and y.
+        other_relative_rate: rate for the other order of the endpoints, which one image cannot exclude, rad/s.
     """
 
     endpoints: FloatArray
@@ -292,14 +263,14 @@ class SpaceObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """The streaks examined and the objects found.
+    """The examined streaks and the objects among them.
 
     Attributes:
-        indicators: of all streaks with two ends, then of the short regions.
-        verdicts: one for each of them.
-        crowded: verdicts of the regions with more than two corners.
-        objects: brightest first.
-        rotation: (3,) rad, camera frame, as used.
+        indicators: indicators of all streaks with two ends, then of the short regions.
+        verdicts: verdict on each of them.
+        crowded: verdicts on the regions with more than two corners.
+        objects: the objects, the brightest first.
+        rotation: the rotation that was used (3,), rad, camera axes.
     """
 
     indicators: Indicators
@@ -309,17 +280,17 @@ class ObjectReport:
     rotation: FloatArray
 
 
-# Corners nearer to one another are one corner found twice.
+# Distance (px) below which two corners are one corner that was found twice.
 _LEAST_CROSSING_PX = 10.0
-# A star's ends, fitted to its pixels, are nearer than this to where the rotation puts them, px.
+# Largest distance (px) of the fitted ends of a star from those that the rotation predicts.
 _FITTED_PX = 1.0
-# A region this far from the frame's border ends inside the frame.
+# Distance (px) from the border beyond which a region ends inside of the image.
 _BORDER_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """Distinguishes objects from stars by their pixels; the camera turns by `rotation` (3,) rad."""
+    """Distinguishes objects from stars by their pixels; the camera rotates by `rotation` (3,), rad."""
 
     segmented: Segmented
     rotation: FloatArray
@@ -329,7 +300,7 @@ class Judge:
     objects: ObjectSettings
 
     def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
-        """Return the verdict on a streak or point for which the indicators of these names fired."""
+        """Return the verdict on a streak or point for which the named indicators fired."""
         if not fired:
             return Verdict.STAR, None
         try:
@@ -342,7 +313,7 @@ class Judge:
         return self._stars_or_unclear(light), None
 
     def crowd(self, corners: FloatArray) -> tuple[Verdict, SpaceObject | None]:
-        """Return the verdict on a region with more than two corners (k, 2): stars, or an object."""
+        """Return the verdict on a region with more than two corners (k, 2), px."""
         if len(corners) > self.objects.most_corners:
             return Verdict.UNCLEAR, None
         pairs = np.array([corners[list(pair)] for pair in itertools.combinations(range(len(corners)), 2)])
@@ -350,7 +321,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # Adding a line cannot explain more light than is left above the noise.
+            # A line cannot explain more light than the stars leave above the noise.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -364,7 +335,10 @@ class Judge:
         return self._stars_or_unclear(light), None
 
     def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
-        """Return the objects in the regions whose labels are not `settled`; the `strange` come first."""
+        """Return the objects in regions whose labels are not `settled`; `strange` labels are tried first.
+
+        The light of the stars in a region is removed, and the brightest remainder is tested.
+        """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
         chosen = (
@@ -374,29 +348,27 @@ class Judge:
         )
         indices = np.flatnonzero(chosen)
         order = np.lexsort((-regions.flux[indices], ~np.isin(regions.label[indices], strange)))
-        tried = [self._merged(int(index)) for index in indices[order[: self.objects.most_merged]]]
-        return [found for found in tried if found is not None]
+        objects = []
+        for index in indices[order[: self.objects.most_merged]].tolist():
+            patch = cut_patch(
+                self.segmented,
+                regions,
+                index,
+                self.objects.psf_sigma,
+                self.settings.gain,
+                self.settings.saturation or np.inf,
+            )
+            found = self._remaining_object(brightest_left(patch, patch.signal), ())
+            if found is None:
+                stars, left = fit_stars(patch, self.rotation, self.pinhole)
+                found = self._remaining_object(brightest_left(patch, left), stars)
+                enough = self.objects.least_share * float(regions.flux[index])
+                found = found if found is not None and found.flux >= enough else None
+            objects += [found] if found is not None else []
+        return objects
 
-    def _merged(self, index: int) -> SpaceObject | None:
-        """Return the object among the stars of region number `index`, None when there is none."""
-        patch = cut_patch(
-            self.segmented,
-            self.segmented.regions,
-            index,
-            self.objects.psf_sigma,
-            self.settings.gain,
-            self.settings.saturation or np.inf,
-        )
-        alone = self._left_as_object(brightest_left(patch, patch.signal), ())
-        if alone is not None:
-            return alone
-        stars, left = fit_stars(patch, self.rotation, self.pinhole)
-        beside = self._left_as_object(brightest_left(patch, left), stars)
-        enough = self.objects.least_share * float(self.segmented.regions.flux[index])
-        return beside if beside is not None and beside.flux >= enough else None
-
-    def _left_as_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
-        """Return the object between `ends` (2, 2) px, beside stars on known paths, or None."""
+    def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
+        """Return the object between `ends` (2, 2), px, beside stars on known paths; None if there is none."""
         if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
             return None
         try:
@@ -421,10 +393,10 @@ class Judge:
         )
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float) -> bool:
-        """Return whether the object explains enough, most of the light stars left along it, and fits."""
+        """Return whether an object explains enough, most of the light that stars leave, and fits."""
         enough = light.chi_square - found.chi_square >= improvement
         most = found.misfit <= 0.5 * found.misfit_of_stars
-        # A saturated point's place is known to a tenth of a pixel, its wings not to their noise.
+        # The position of a saturated point is known to a tenth of a pixel, its wings not to their noise.
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
         return enough and most and fits
 
@@ -432,7 +404,7 @@ class Judge:
         return Verdict.STARS if light.chi_square <= self.objects.worst_fit * light.pixels else Verdict.UNCLEAR
 
     def _moves_like_a_star(self, ends: FloatArray, within: float = 2.0) -> bool:
-        """Return whether the ends (2, 2) lie `within` this many px of a star's."""
+        """Return whether ends (2, 2), px, lie `within` that many px of the ends of a star."""
         star = self.pinhole.project(star_ends(self.pinhole.unit_vectors(ends[None]), self.rotation))[0]
         missed = min(np.abs(star - ends).max(), np.abs(star[::-1] - ends).max())
         return bool(missed < within)
@@ -440,6 +412,7 @@ class Judge:
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
     ) -> SpaceObject:
+        """Return the object between `ends`, in the order of time with the slower motion among the stars."""
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:
@@ -448,18 +421,18 @@ class Judge:
         return SpaceObject(ends, fired, found.flux, improvement, rate, direction, other)
 
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
-        """Return rate in rad/s and direction (2,) in the image of a motion from the first end to the second.
+        """Return rate, rad/s, and direction (2,) in the image of a motion from the first end to the second.
 
-        Both ends are carried to mid-exposure as a star would be: the difference left is the object's own
-        motion.
+        Both ends are propagated to mid-exposure as stars would be. Their remaining difference is the motion
+        of the object.
         """
-        carried = carried_to_middle(self.pinhole.unit_vectors(ends), self.rotation)
-        angle = np.arctan2(np.linalg.norm(np.cross(carried[0], carried[1])), carried[0] @ carried[1])
-        step = np.diff(self.pinhole.project(carried), axis=0)[0]
+        middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
+        angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])
+        step = np.diff(self.pinhole.project(middle), axis=0)[0]
         return float(angle) / self.exposure, np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
 
 
-# A streak with an indicator beyond this many standard deviations is judged by its pixels, though none fired.
+# Deviation (standard deviations) above which a streak is searched for a merged object.
 _STRANGE = 5.0
 
 
@@ -471,29 +444,15 @@ def detect(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> ObjectReport | None:
-    """Return the objects of a frame (rows, columns), None when it has too few streaks.
+    """Return the report on an image (rows, columns); None if it has too few streaks.
 
-    The camera turns by `rotation` (3,) rad in `exposure` s. Where the sign of the rotation is unknown, all
+    The camera rotates by `rotation` (3,), rad, in `exposure` s. If the sign of the rotation is unknown, all
     directions of motion are known up to one common reversal.
     """
     segmented = segment_frame(pixels, replace(settings, most_streaks=objects.most_streaks))
     streaks = measure_streaks(segmented, settings)
     if len(streaks) < settings.least_streaks:
         return None
-    return examine(segmented, streaks, rotation, pinhole, exposure, settings, objects)
-
-
-def examine(
-    segmented: Segmented,
-    streaks: Streaks,
-    rotation: FloatArray,
-    pinhole: Pinhole,
-    exposure: float,
-    settings: EndpointSettings,
-    objects: ObjectSettings,
-) -> ObjectReport:
-    """Return the objects among segmented regions; the camera turns by `rotation` (3,) rad in `exposure` s."""
-    judge = Judge(segmented, rotation, pinhole, exposure, settings, objects)
     ends = extend(streaks.endpoints, chord_outward(streaks.endpoints), settings.endpoint_bias)
     short, short_sigma, short_label = short_regions(segmented, rotation, pinhole, settings, objects)
     indicators = evaluate(
@@ -505,11 +464,12 @@ def examine(
         objects.strict,
     )
     labels = np.concatenate([segmented.candidates.label[streaks.candidate], short_label])
+    judge = Judge(segmented, rotation, pinhole, exposure, settings, objects)
     return _judged(judge, indicators, labels, streaks)
 
 
 def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Streaks) -> ObjectReport:
-    """Return the verdict on each streak of `indicators`, of regions `labels`, and on the crowded regions."""
+    """Return the verdicts on the streaks of `indicators`, in regions `labels` (n,), and on crowds."""
     found: list[SpaceObject] = []
     settled: list[int] = []
     strange: list[int] = []
@@ -530,3 +490,63 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
     found += judge.merged(np.array(settled, dtype=np.int64), np.array(strange, dtype=np.int64))
     found.sort(key=lambda candidate: -candidate.flux)
     return ObjectReport(indicators, tuple(verdicts), tuple(crowded), tuple(found), judge.rotation)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DetectedObjects:
+    """The objects in one image, the brightest first. The result is true if there is an object.
+
+    Attributes:
+        objects: the n objects.
+        directions: directions at mid-exposure (n, 3), unit vectors in camera axes.
+        covariance: covariance of their errors (n, 3, 3), rad^2, zero along the direction.
+        reason: why the image could not be searched; empty if it was searched, with or without a result.
+    """
+
+    objects: tuple[SpaceObject, ...]
+    directions: FloatArray
+    covariance: FloatArray
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        """Return whether there is an object."""
+        return len(self.objects) > 0
+
+
+def detect_objects(
+    image: Image,
+    camera: CameraModel,
+    rate: FloatArray,
+    exposure: float,
+    settings: ObjectSettings | None = None,
+) -> DetectedObjects:
+    """Return the objects that do not move as the stars do, in an image whose stars are streaks.
+
+    Args:
+        image: pixel values (rows, columns) of an unsigned integer type, with streaks of 20 px or more.
+        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size. The
+            distortion of a lens is neglected.
+        rate: angular velocity of the camera with respect to inertial space (3,), camera axes, rad/s, for
+            instance from the streaks of the image. If its sign is unknown, all motions are known up to one
+            reversal.
+        exposure: exposure time, s.
+        settings: thresholds, gain and saturation; None: the defaults.
+
+    Raises:
+        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+
+    Source: Sease 2013, chapter 4, with the errata; the tests of the pixels are this project's.
+    """
+    settings = ObjectSettings() if settings is None else settings
+    check_image(image, camera)
+    ends = EndpointSettings(gain=settings.gain, saturation=settings.saturation)
+    rotation = np.asarray(rate, dtype=float) * exposure
+    report = detect(image, camera.ideal, rotation, exposure, ends, settings)
+    objects = () if report is None else report.objects
+    middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
+    directions = camera.unit_vectors(middles)
+    # Off the boresight a pixel subtends a smaller angle; the larger one of the boresight is used.
+    sigma = settings.streak_sigma / camera.focal_length
+    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
+    reason = f"fewer than {ends.least_streaks} streaks stand out of the noise" if report is None else ""
+    return DetectedObjects(objects, directions, sigma**2 * across, reason)

@@ -1,14 +1,14 @@
-"""Directions of possible objects in a frame whose attitude the stars determine.
+"""Directions of possible objects in an image whose attitude the stars determine.
 
-Where the stars are streaks, `detect` finds objects by indicators and pixels. Where the stars are points, an
-object is a point or a short streak too. Every area of light that stands well above the noise and is not at
-the position of a catalogue star may be an object, and so may light beside a star that the star does not
-explain. One frame cannot show which of them moves; tracks over several frames do.
+If the stars are streaks, `detect` finds objects by indicators and pixels. If the stars are points, an object
+is a point or a short streak too. Every area of light that stands well above the noise and is not at the
+position of a catalogue star may be an object, and so may light beside a star that the star does not explain.
+One image cannot show which of them moves; tracks over several images do.
 
 All pixels of an object are fitted together with the known stars nearby. An object is a short trail of
 constant brightness with the camera's point spread. Gauss-Newton fits position, extent and brightness of the
 object, the sky, and the brightness of each star, weighted by the noise of the fitted light. Saturated pixels
-are excluded: they would shift a centre of light by 0.03 px. The covariance is that of the fit, enlarged where
+are excluded: they would shift a centre of light by 0.03 px. The covariance is that of the fit, increased if
 the residuals exceed the noise.
 """
 
@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from knightcube.astro import catalogue
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.vision.objects.detect import detect
 from knightcube.vision.objects.settings import EndpointSettings, MeasuredObjects, ObjectMeasurementSettings
@@ -31,36 +31,38 @@ from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
-"""Half size of an object's patch, in point spreads."""
+"""Half size of an object's patch, in sigmas of the point spread."""
 _STEP_PX = 0.7
-_ROUNDS, _SETTLED = 12, 1e-4
+"""Distance (px) of the points that make up a trail."""
+_ROUNDS, _CONVERGED = 12, 1e-4
 """Largest number of steps, and the step (px) that ends the iteration."""
 _EXTENT = 2.0
-"""Largest change of the half extent from its first guess (px)."""
+"""Prior standard deviation (px) of the half extent relative to its first guess."""
 STAR_SIGMA = 0.3
 """Relative error of a star's brightness by the catalogue, whose colour band differs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trails:
-    """n straight trails: `middle` and `half` extent (n, 2) px, and `flux` (n,) counts."""
+    """Straight trails of n stars: `middle` and `half` extent (n, 2), px, and `flux` (n,), counts."""
 
     middle: FloatArray
     half: FloatArray
     flux: FloatArray
 
-    def near(self, point: FloatArray, reach: float) -> Trails:
-        """Return those whose middle is within `reach` px of a point (2,) in each axis, beside their half."""
-        away = np.abs(self.middle - point) - np.abs(self.half)
-        chosen = np.all(away < reach, axis=1)
-        return Trails(self.middle[chosen], self.half[chosen], self.flux[chosen])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPatch:
-    """Pixels about a point: `light` (rows, columns) counts over the sky, the first of them at `corner` (2,).
+    """The pixels around a point.
 
-    `noise` counts without light, `gain` electrons a count, `usable` which pixels did not clip, `psf` px.
+    Attributes:
+        light: counts above the sky (rows, columns).
+        corner: position of the first pixel (2,), px.
+        noise: noise of a pixel without light, counts.
+        gain: electrons per count.
+        usable: which pixels are not saturated (rows, columns).
+        psf: sigma of the point spread, px.
+        ceiling: counts above the sky at which pixels saturate.
     """
 
     light: FloatArray
@@ -72,16 +74,19 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return one count of a trail as the pixels get it."""
+        """Return the image of a trail of one count (rows, columns)."""
         rows, columns = self.light.shape
-        return spread_over(_path(middle - self.corner, half)[0], columns, rows, self.psf)
+        return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedObject:
-    """An object: `middle` (2,) px and its `covariance` (2, 2), `flux` counts and its `flux_sigma`.
+    """A fitted object.
 
-    `misfit` is chi-square over its degrees of freedom.
+    Attributes:
+        middle, covariance: position (2,), px, and its covariance (2, 2), px^2.
+        flux, flux_sigma: light and its standard deviation, counts.
+        misfit: chi-square per degree of freedom.
     """
 
     middle: FloatArray
@@ -91,73 +96,63 @@ class FittedObject:
     misfit: float
 
 
-def reach_of(half: FloatArray, psf: float) -> float:
-    """Return px from an object's middle that its patch needs on each side."""
+def _trail(middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points (m, 2), px, along a trail, and their distances (m,) from its middle, from -1 to 1."""
+    count = max(4, int(np.ceil(2.0 * float(np.linalg.norm(half)) / _STEP_PX)))
+    share = (np.arange(count) + 0.5) * 2.0 / count - 1.0
+    return middle + share[:, None] * half, share
+
+
+def _patch_reach(half: FloatArray, psf: float) -> float:
+    """Return the distance (px) from the middle of an object that its patch must cover on each side."""
     return float(np.abs(half).max()) + _REACH * psf
 
 
-def fit_object(
+def _fit_object(
     patch: ObjectPatch, middle: FloatArray, half: FloatArray, flux: float, stars: Trails
 ) -> FittedObject | None:
-    """Return the object near `middle` (2,) px of a half extent (2,) px; None where the pixels have none."""
+    """Return the object near `middle` (2,), px, of a half extent (2,), px; None if there is none."""
     images = [patch.image(star, extent) for star, extent in zip(stars.middle, stars.half, strict=True)]
     given = np.maximum(stars.flux, 1e-9)
-    believed = _believed(half, given)
+    # Prior values and standard deviations of the extent and of the light of the stars.
+    prior = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
+    prior += [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(given)]
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
+    rows, columns = patch.light.shape
     for _ in range(_ROUNDS):
-        light, change = _model(patch, unknowns, images)
+        # The modelled light, and its derivatives by the unknowns (k, pixels).
+        path, share = _trail(unknowns[:2] - patch.corner, unknowns[2:4])
+        both = np.stack([np.ones(len(share)), share])
+        shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
+        light = unknowns[4] * shape + unknowns[5]
+        for of_star, image in zip(unknowns[6:], images, strict=True):
+            light = light + of_star * image
+        change = [*(unknowns[4] * slope for slope in slopes), shape, np.ones(shape.shape), *images]
+        by_unknown = np.array([part.ravel() for part in change])
         usable = patch.usable & (light < patch.ceiling)
         spare = int(np.count_nonzero(usable)) - len(unknowns)
         if spare < 2:
             return None
         weight = (usable / (patch.noise**2 + np.maximum(light, 0.0) / patch.gain)).ravel()
         off = (patch.light - light).ravel()
-        normal, right = (change * weight) @ change.T, (change * weight) @ off
-        for place, value, sigma in believed:
+        normal, right = (by_unknown * weight) @ by_unknown.T, (by_unknown * weight) @ off
+        for place, value, sigma in prior:
             normal[place, place] += sigma**-2
             right[place] += (value - unknowns[place]) / sigma**2
         step = np.linalg.solve(normal, right)
         step[:4] = np.clip(step[:4], -0.5, 0.5)
         unknowns = unknowns + step
         misfit = float(np.sum(weight * off**2)) / spare
-        if np.abs(step[:2]).max() < _SETTLED:
+        if np.abs(step[:2]).max() < _CONVERGED:
             break
-    # As of the stars (`inflation`), three deviations of chi-square are left to chance.
+    # As for the stars (`inflation`), an excess of less than three deviations of chi-square is chance.
     excess = misfit if misfit > 1.0 + 3.0 * (2.0 / spare) ** 0.5 else 1.0
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * excess
     away = np.abs(unknowns[:2] - middle).max()
-    if not np.isfinite(unknowns).all() or unknowns[4] <= 0.0 or away > reach_of(half, patch.psf):
+    if not np.isfinite(unknowns).all() or unknowns[4] <= 0.0 or away > _patch_reach(half, patch.psf):
         return None
     deviation = float(np.sqrt(covariance[4, 4]))
     return FittedObject(unknowns[:2], covariance[:2, :2], float(unknowns[4]), deviation, misfit)
-
-
-def _model(
-    patch: ObjectPatch, unknowns: FloatArray, images: list[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the light (rows, columns) of unknowns (k,), and how it changes with each (k, pixels)."""
-    rows, columns = patch.light.shape
-    path, share = _path(unknowns[:2] - patch.corner, unknowns[2:4])
-    both = np.stack([np.ones(len(share)), share])
-    shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
-    light = unknowns[4] * shape + unknowns[5]
-    for flux, image in zip(unknowns[6:], images, strict=True):
-        light = light + flux * image
-    change = [*(unknowns[4] * slope for slope in slopes), shape, np.ones(shape.shape), *images]
-    return light, np.array([part.ravel() for part in change])
-
-
-def _believed(half: FloatArray, stars: FloatArray) -> list[tuple[int, float, float]]:
-    """Return unknown, value and deviation of what is believed before: the extent, the stars' light."""
-    known = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
-    return known + [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(stars)]
-
-
-def _path(middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points (m, 2) px along a trail, and the part (m,) from -1 to 1 of its half that each is off."""
-    count = max(4, int(np.ceil(2.0 * float(np.linalg.norm(half)) / _STEP_PX)))
-    share = (np.arange(count) + 0.5) * 2.0 / count - 1.0
-    return middle + share[:, None] * half, share
 
 
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
@@ -173,16 +168,16 @@ _MISFIT = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stars:
-    """The n catalogue stars of a frame: trails' `middle` and `half` (n, 2) px, and `magnitude` (n,)."""
+class CatalogueTrails:
+    """The trails of n catalogue stars: `middle` and `half` extent (n, 2), px, and `magnitude` (n,)."""
 
     middle: FloatArray
     half: FloatArray
     magnitude: FloatArray
 
 
-def stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: FloatArray) -> Stars:
-    """Return the stars of the frame and its margin; the camera turns by `rotation` (3,) rad, camera axes."""
+def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: FloatArray) -> CatalogueTrails:
+    """Return the stars in and around an image; the camera rotates by `rotation` (3,), rad, camera axes."""
     known = catalogue.load()
     directions = known.directions_at(epoch)
     centre = np.array([[(shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0]])
@@ -196,33 +191,43 @@ def stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: FloatA
         begin, end = (replace(sky, quaternion=turn).pixels(directions) for turn in turns)
         half = 0.5 * (end - begin)
     seen = np.isfinite(middle).all(axis=1) & np.isfinite(half).all(axis=1)
-    return Stars(middle[seen], half[seen], known.magnitude[near][seen])
+    return CatalogueTrails(middle[seen], half[seen], known.magnitude[near][seen])
 
 
 class FramePatches:
-    """The pixels about any place of a frame, with the stars there; places and light in px and counts."""
+    """The pixels around any place of an image, with the catalogue stars there.
 
-    def __init__(self, seen: Survey, stars: Stars, zero: float, psf: float) -> None:
-        """`zero`: magnitude of one count."""
+    Args:
+        seen: survey of the image.
+        stars: the catalogue stars.
+        zero: magnitude of one count.
+        psf: sigma of the point spread, px.
+    """
+
+    def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # The survey's noise has the faint stars in it, which are as smooth as their image.
+        # The noise of the survey includes the faint stars, which are as smooth as their images.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
         self._trails = Trails(stars.middle, stars.half, 10.0 ** (0.4 * (zero - stars.magnitude)))
 
     def measured(self, point: FloatArray, half: FloatArray, flux: float) -> FittedObject | None:
-        """Return the object near `point` (2,) px of a half extent (2,) px."""
-        patch = self._patch(point, reach_of(half, self._psf))
-        return None if patch is None else fit_object(patch, point, half, flux, self._near(point, patch))
+        """Return the object near `point` (2,), px, of a half extent (2,), px; None if there is none."""
+        patch = self._patch(point, _patch_reach(half, self._psf))
+        return None if patch is None else _fit_object(patch, point, half, flux, self._near(point, patch))
 
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
-        """Return an object whose light runs together with that of known stars, None without one.
+        """Return an object whose light is merged with that of known stars; None if there is none.
 
-        `point` (2,) is the middle of their light, `length` px its length. The object is where most is left
-        when the stars are taken away.
+        The object is searched where the most light remains after the stars are subtracted.
+
+        Args:
+            point: middle of the merged light (2,), px.
+            length: its length, px.
+            significance: least light of the object, in standard deviations.
         """
-        patch = self._patch(point, 0.5 * length + reach_of(np.zeros(2), self._psf))
+        patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
         if patch is None:
             return None
         stars = self._near(point, patch)
@@ -230,7 +235,7 @@ class FramePatches:
         for middle, half, flux in zip(stars.middle, stars.half, stars.flux, strict=True):
             image = patch.image(middle, half)
             share = patch.usable * image / (patch.noise**2 + flux * image / patch.gain)
-            # No more than the star may have: the object's light must not go to it.
+            # The light of a star is limited, because it must not include the light of the object.
             light = float(np.sum(share * left)) / max(float(np.sum(share * image)), 1e-300)
             left -= np.clip(light, 0.0, _BRIGHTEST * flux) * image
         top = np.where(patch.usable, left, -np.inf)[1:-1, 1:-1]
@@ -242,18 +247,19 @@ class FramePatches:
         if found is None or found.flux < significance * found.flux_sigma or found.misfit > _MISFIT:
             return None
         away = np.linalg.norm(stars.middle - found.middle, axis=1)
-        beside = stars.flux[away < reach_of(np.zeros(2), self._psf)]
-        told = len(away) and away.min() > _APART and found.flux > _LEAST_SHARE * beside.max(initial=0.0)
-        return found if told else None
+        beside = stars.flux[away < _patch_reach(np.zeros(2), self._psf)]
+        distinct = len(away) and away.min() > _APART and found.flux > _LEAST_SHARE * beside.max(initial=0.0)
+        return found if distinct else None
 
     def _near(self, point: FloatArray, patch: ObjectPatch) -> Trails:
-        """Return the stars that light a patch and stand above its noise."""
-        near = self._trails.near(point, 0.5 * max(patch.light.shape) + 3.0 * self._psf)
-        bright = near.flux > 3.0 * patch.noise
-        return Trails(near.middle[bright], near.half[bright], near.flux[bright])
+        """Return the stars that illuminate a patch and stand above its noise."""
+        trails, reach = self._trails, 0.5 * max(patch.light.shape) + 3.0 * self._psf
+        near = np.all(np.abs(trails.middle - point) - np.abs(trails.half) < reach, axis=1)
+        near &= trails.flux > 3.0 * patch.noise
+        return Trails(trails.middle[near], trails.half[near], trails.flux[near])
 
     def _patch(self, point: FloatArray, reach: float) -> ObjectPatch | None:
-        """Return the pixels within `reach` px of a point (2,) in each axis, None off the frame."""
+        """Return the pixels within `reach` px of a point (2,) along each axis; None beyond the border."""
         rows, columns = self._light.shape
         x, y = np.rint(point).astype(int)
         size = int(np.ceil(reach))
@@ -274,18 +280,6 @@ _SAME = 1.0
 """Distance (px) within which two fits belong to the same light."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FoundObjects:
-    """What may be objects: places (n, 2) px, their covariance (n, 2, 2) px^2, magnitudes (n,)."""
-
-    points: FloatArray
-    covariance: FloatArray
-    magnitudes: FloatArray
-
-
-_NOTHING = FoundObjects(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))
-
-
 def measure_objects(
     pixels: Image,
     solution: FrameSolution,
@@ -295,154 +289,127 @@ def measure_objects(
     detection: DetectionSettings,
     settings: ObjectMeasurementSettings,
 ) -> MeasuredObjects | None:
-    """Return the sightings of a frame (rows, columns), None without an attitude.
+    """Return the possible objects in an image; None if its attitude is unknown.
 
-    `epoch` is the Julian year of the stars' places, `velocity` (3,) m/s that which the frame was solved with.
+    Args:
+        pixels: the image (rows, columns).
+        solution: solution of the star tracker.
+        exposure: exposure time, s.
+        epoch: Julian year of the positions of the stars.
+        velocity: velocity (3,), m/s, with which the image was solved.
+        detection: settings of the survey of the image.
+        settings: settings of the measurement.
     """
     sky = solution.sky_map(velocity)
     if sky is None or solution.fix is None:
         return None
     motion = solution.motion
     rotation = np.zeros(3) if motion is None or motion.rate is None else motion.rate * exposure
-    seen, stars = survey(pixels, detection), stars_in(sky, epoch, pixels.shape, rotation)
+    seen, stars = survey(pixels, detection), _stars_in(sky, epoch, pixels.shape, rotation)
     if solution.kind is FrameKind.STREAKS and motion is not None:
-        found = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
+        fits = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
     else:
-        found = _among_points(seen, stars, settings)
-    brightest = np.argsort(np.nan_to_num(found.magnitudes, nan=np.inf), kind="stable")[: settings.most]
-    points = found.points[brightest]
+        fits = _among_points(seen, stars, settings)
+    # The fits of two areas may converge to the same light; the first of them counts.
+    middles = np.array([fit.middle for fit, _ in fits]).reshape(-1, 2)
+    away = np.linalg.norm(middles[:, None] - middles, axis=2)
+    again = np.any(np.tril(away < _SAME, -1), axis=1)
+    fits = [fit for fit, repeated in zip(fits, again, strict=True) if not repeated]
+    magnitudes = np.array([zero - _faintness(np.array(fit.flux)) for fit, zero in fits])
+    brightest = np.argsort(np.nan_to_num(magnitudes, nan=np.inf), kind="stable")[: settings.most]
+    points = middles[~again][brightest]
+    covariance = np.zeros((len(points), 3, 3))
+    for number, (point, of_fits) in enumerate(zip(points, brightest, strict=True)):
+        about = sky.directions(point + 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
+        slope = np.stack([about[0] - about[1], about[2] - about[3]], axis=1)
+        square = fits[of_fits][0].covariance + settings.floor**2 * np.eye(2)
+        covariance[number] = slope @ square @ slope.T
     to_sky = attitude_matrix(solution.fix.quaternion).T
     return MeasuredObjects(
         points,
         sky.directions(points) if len(points) else np.zeros((0, 3)),
-        _on_sky(sky, points, found.covariance[brightest]),
-        found.magnitudes[brightest],
+        covariance,
+        magnitudes[brightest],
         to_sky @ solution.fix.covariance @ to_sky.T,
-    )
-
-
-def _on_sky(sky: SkyMap, points: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) of the directions of points (n, 2) of `covariance` (n, 2, 2) px^2."""
-    spread = np.zeros((len(points), 3, 3))
-    for number, (point, square) in enumerate(zip(points, covariance, strict=True)):
-        about = sky.directions(point + 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]))
-        slope = np.stack([about[0] - about[1], about[2] - about[3]], axis=1)
-        spread[number] = slope @ square @ slope.T
-    return spread
-
-
-def _found(fits: list[tuple[FittedObject, float]], settings: ObjectMeasurementSettings) -> FoundObjects:
-    """Return fitted objects, each with the magnitude of a count.
-
-    Fits of two areas may lead to one place, where one object's light is the brighter: it is one sighting.
-    """
-    if not fits:
-        return _NOTHING
-    middles = np.array([fit.middle for fit, _ in fits])
-    away = np.linalg.norm(middles[:, None] - middles, axis=2)
-    again = np.any(np.tril(away < _SAME, -1), axis=1)
-    fits = [fit for fit, repeated in zip(fits, again, strict=True) if not repeated]
-    floor = settings.floor**2 * np.eye(2)
-    return FoundObjects(
-        np.array([fit.middle for fit, _ in fits]),
-        np.array([fit.covariance + floor for fit, _ in fits]),
-        np.array([zero - _faintness(np.array(fit.flux)) for fit, zero in fits]),
     )
 
 
 def _among_streaks(
     seen: Survey,
-    stars: Stars,
+    stars: CatalogueTrails,
     solution: FrameSolution,
     motion: MotionResult,
     rotation: FloatArray,
     exposure: float,
     settings: ObjectMeasurementSettings,
-) -> FoundObjects:
-    """Return the objects among streaks."""
-    detection = seen.settings
+) -> list[tuple[FittedObject, float]]:
+    """Return the objects among streaks, each with the magnitude of one count."""
+    detection, search = seen.settings, settings.search
     if motion.rate is None:
-        return _NOTHING
+        return []
     streaks = EndpointSettings(gain=detection.gain or 1.0, saturation=detection.saturation)
-    report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, settings.search)
+    report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
-        return _NOTHING
-    zero = _zero_point(solution, motion)
-    scene = FramePatches(seen, stars, zero, detection.psf_sigma or settings.search.psf_sigma)
+        return []
+    # The magnitude of one count, from the identified streaks; NaN without any.
+    zero = float("nan")
+    known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
+    if known is not None and np.any(known):
+        from knightcube.vision.startracker.index.build import default_index  # noqa: PLC0415 - memory-mapped
+
+        magnitude = default_index().stars.magnitude[solution.star[known]]
+        zero = float(np.median(magnitude + _faintness(motion.flux[known])))
+    patches = FramePatches(seen, stars, zero, detection.psf_sigma or search.psf_sigma)
     fits = []
     for found in report.objects:
-        half = 0.5 * (found.endpoints[1] - found.endpoints[0])
-        fit = scene.measured(found.endpoints.mean(axis=0), half, found.flux) if np.isfinite(zero) else None
-        rough = FittedObject(
-            found.endpoints.mean(axis=0), settings.streak_sigma**2 * np.eye(2), found.flux, 0.0, 1.0
-        )
+        middle, half = found.endpoints.mean(axis=0), 0.5 * (found.endpoints[1] - found.endpoints[0])
+        fit = patches.measured(middle, half, found.flux) if np.isfinite(zero) else None
+        rough = FittedObject(middle, search.streak_sigma**2 * np.eye(2), found.flux, 0.0, 1.0)
         fits.append((fit or rough, zero))
-    return _found(fits, settings)
+    return fits
 
 
-def _zero_point(solution: FrameSolution, motion: MotionResult) -> float:
-    """Return the magnitude of a star of one count by the frame's identified streaks; NaN without any."""
-    if len(motion.flux) != len(solution.star):
-        return float("nan")
-    known = (solution.star >= 0) & (motion.flux > 0.0)
-    if not np.any(known):
-        return float("nan")
-    from knightcube.vision.startracker.index.build import default_index  # noqa: PLC0415 - memory-mapped
-
-    magnitude = default_index().stars.magnitude[solution.star[known]]
-    return float(np.median(magnitude + _faintness(motion.flux[known])))
-
-
-def _among_points(seen: Survey, stars: Stars, settings: ObjectMeasurementSettings) -> FoundObjects:
-    """Return the areas of light that are no star, and what shines beside a star."""
+def _among_points(
+    seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
+) -> list[tuple[FittedObject, float]]:
+    """Return light at no star, and excess light beside a star, each with the magnitude of one count."""
     areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
     ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
     strong = np.flatnonzero(ratio >= settings.significance)
     if not len(strong) or not len(stars.magnitude):
-        return _NOTHING
+        return []
     away = np.linalg.norm(areas.centre[strong, None] - stars.middle[None], axis=2)
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The brightest star is saturated, the faintest are pairs: the median of the others.
+    # The median, because the brightest stars are saturated and the faintest are pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
-        return _NOTHING
+        return []
     faintness = _faintness(areas.flux[strong])
     zero = float(np.median(stars.magnitude[nearest[own]] + faintness[own]))
-    inside = _inside(areas, strong)
-    scene = FramePatches(seen, stars, zero, seen.settings.psf_sigma or settings.search.psf_sigma)
+    rows, columns = areas.shape
+    x, y = areas.centre[strong].T
+    margin = 3.0 + 0.5 * areas.length[strong]
+    inside = (x > margin) & (x < columns - 1 - margin) & (y > margin) & (y < rows - 1 - margin)
+    patches = FramePatches(seen, stars, zero, seen.settings.psf_sigma or settings.search.psf_sigma)
     fits = []
     for number in np.flatnonzero(~is_star & (zero - faintness <= settings.faintest) & inside):
         area = int(strong[number])
-        half = 0.5 * max(float(areas.length[area]), 0.6) * _along(float(areas.direction[area]))
-        fit = scene.measured(areas.centre[area], half, float(areas.flux[area]))
+        direction = float(areas.direction[area])
+        half = 0.5 * max(float(areas.length[area]), 0.6) * np.array([np.cos(direction), np.sin(direction)])
+        fit = patches.measured(areas.centre[area], half, float(areas.flux[area]))
         fits.append(fit if fit is not None else _centre(areas, area, float(ratio[area]), settings))
     odd = (distance > _OFF_PLACE) | (zero - faintness < stars.magnitude[nearest] - _TOO_BRIGHT)
     for area in strong[is_star & odd & inside].tolist():
-        fit = scene.beside(areas.centre[area], float(areas.length[area]), settings.significance)
+        fit = patches.beside(areas.centre[area], float(areas.length[area]), settings.significance)
         if fit is not None and zero - _faintness(np.array(fit.flux)) <= settings.faintest:
             fits.append(fit)
-    return _found([(fit, zero) for fit in fits], settings)
-
-
-def _along(direction: float) -> FloatArray:
-    """Return the unit vector (2,) of a direction, rad from the rows."""
-    return np.array([np.cos(direction), np.sin(direction)])
-
-
-def _inside(areas: Areas, chosen: IntArray) -> BoolArray:
-    """Return which areas end within the frame."""
-    rows, columns = areas.shape
-    x, y = areas.centre[chosen].T
-    margin = 3.0 + 0.5 * areas.length[chosen]
-    return np.asarray(
-        (x > margin) & (x < columns - 1 - margin) & (y > margin) & (y < rows - 1 - margin), dtype=bool
-    )
+    return [(fit, zero) for fit in fits]
 
 
 def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an area that no fit explains, by its centre of light."""
+    """Return an area that no fit explains, at its centre of light."""
     sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
     error = np.hypot(settings.centre_sigma, sigma)
     return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)

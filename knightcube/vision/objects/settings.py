@@ -60,28 +60,33 @@ class EndpointSettings:
 
 @dataclass(frozen=True, slots=True)
 class ObjectSettings:
-    """Thresholds and limits of the search for objects.
+    """Thresholds and limits of the search for objects among streaks.
 
     Attributes:
-        bounds: standard deviations of centre, displacement and residual below which none fires, whatever the
-            spread within the frame: `python -m tests.studies.bench.rso_spread`.
-        strict: the thesis's 2.5 sigma, of the spread within the frame.
-        psf_sigma: px, of the camera.
-        most_streaks: how many regions are examined; the rate needs fewer.
-        most_points: how many short regions are examined.
-        most_merged: how many regions are searched for an object among the light of their stars.
-        least_share: part of a region's light that an object beside stars must have: an error of the rotation
-            of 2 % leaves that much at the end of a bright star's streak.
-        most_corners: regions with more are left unclear.
-        point_significance: least counts of a short region over the noise of its area.
+        bounds: standard deviations of centre, displacement and residual below which an indicator never fires
+            (`python -m tests.studies.bench.rso_spread`).
+        strict: standard deviations within the image that must be exceeded too, 2.5 in the thesis.
+        psf_sigma: point spread of the camera, px.
+        gain: electrons per count.
+        saturation: counts at which a pixel saturates; None: the maximum of the integer type.
+        most_streaks: maximum number of examined regions; a rate needs fewer.
+        most_points: maximum number of examined short regions.
+        most_merged: maximum number of regions that are searched after their stars are removed.
+        least_share: least light of an object beside stars, as a fraction of the light of its region: an error
+            of the rotation of 2 % leaves that much at the end of a bright star's streak.
+        most_corners: number of corners above which a region is not decided.
+        point_significance: least light of a short region, in standard deviations.
         improvement: least gain in chi-square of an object over stars.
-        crossing_improvement: the same for an object that crosses stars, the best of many lines tried.
+        crossing_improvement: the same for an object that crosses stars, the best of many tested lines.
         worst_fit: largest chi-square per pixel of an accepted object.
+        streak_sigma: standard deviation per axis of the midpoint between the ends of an object, px.
     """
 
     bounds: tuple[float, float, float] = (8.0, 10.0, 10.0)
     strict: float = 2.5
     psf_sigma: float = 1.0
+    gain: float = 1.0
+    saturation: float | None = None
     most_streaks: int = 80
     most_points: int = 20
     most_merged: int = 12
@@ -91,21 +96,22 @@ class ObjectSettings:
     improvement: float = 300.0
     crossing_improvement: float = 600.0
     worst_fit: float = 2.5
+    streak_sigma: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectMeasurementSettings:
-    """How objects are sighted.
+    """Settings of the measurement of possible objects in an image with a known attitude.
 
     Attributes:
-        search: of the search among streaks.
-        faintest: V; the catalogue has nearly all stars so bright, and half a magnitude of what is fainter.
-        significance: least counts of an area over the noise of its pixels.
-        clearance: px from the nearest catalogue star, beside half the area's own length.
-        floor: px, standard deviation along an axis that no brightness betters (campaign `object-passes`).
-        centre_sigma: px, the same of a centre of light, where the pixels could not be fitted.
-        streak_sigma: px, of the middle of an object's streak by its ends, likewise.
-        most: sightings of a frame, the brightest.
+        search: settings of the search among streaks.
+        faintest: V of the faintest object. The catalogue has nearly all stars of this magnitude, and half a
+            magnitude of fainter ones.
+        significance: least light of an area, in standard deviations.
+        clearance: least distance from the nearest catalogue star, px, in addition to half the area's length.
+        floor: least standard deviation per axis, px, for any brightness (campaign `object-passes`).
+        centre_sigma: least standard deviation of a centre of light, px, if the pixels could not be fitted.
+        most: maximum number of objects, the brightest.
     """
 
     search: ObjectSettings = field(default_factory=ObjectSettings)
@@ -114,20 +120,19 @@ class ObjectMeasurementSettings:
     clearance: float = 4.0
     floor: float = 0.002
     centre_sigma: float = 0.05
-    streak_sigma: float = 0.1
     most: int = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredObjects:
-    """What may be objects in a frame, the brightest first.
+    """Possible objects in an image, the brightest first.
 
     Attributes:
-        points: (n, 2) px at mid-exposure.
-        directions: (n, 3) unit vectors, ICRS, free of the stars' aberration.
-        covariance: (n, 3, 3) rad^2, ICRS axes, of the places in the image.
-        magnitudes: (n,) V by the frame's stars; NaN when unknown.
-        attitude: (3, 3) rad^2, ICRS axes, of the attitude: common to all.
+        points: positions at mid-exposure (n, 2), px.
+        directions: unit vectors (n, 3), ICRS, without the aberration of the stars.
+        covariance: covariance of the positions as directions (n, 3, 3), rad^2, ICRS axes.
+        magnitudes: V magnitudes relative to the stars of the image (n,); NaN if unknown.
+        attitude: covariance of the attitude (3, 3), rad^2, ICRS axes, which all objects share.
     """
 
     points: FloatArray

@@ -1,18 +1,17 @@
-"""Whether stars explain the light of a region, or it takes an object's streak.
+"""Tests whether stars explain the light of a region, and searches a region after its stars are removed.
 
-Both are sums of streaks of constant brightness with the camera's point spread: stars along the paths that the
-rotation gives them, an object from one end straight to the other, straight either in the image or among the
-stars, which a turn about the boresight bends. Brightnesses by non-negative least squares; the sum of squares
-decides. Streaks of two stars that overlap, lie side by side or follow each other, and the pieces of a faint
-star's streak are the light of stars; what no star path covers, or what ends where a star would go on, is not.
+Explanation. Both hypotheses are sums of streaks of constant brightness with the camera's point spread: stars
+along the paths that the rotation gives them, and an object from one end straight to the other, either in the
+image or among the stars, whose frame a rotation about the boresight bends. Brightnesses come from
+non-negative least squares; the sum of squares decides. Overlapping, adjacent and successive streaks of two
+stars, and segments of a faint star's streak, are the light of stars. Light that no star path covers, or that
+ends where a star would continue, is not.
 
-A region without the stars that run through it.
-
-A star's streak is evenly bright from its one end to its other: it cannot be brighter than its faintest piece.
-So the erosion of the region by the path of a star bounds what a star may have lit, from above; objects that
-cross the streaks, and points on them, all but vanish in it. Stars are removed one by one, brightest first,
-their places and brightnesses fitted together, pixels that are too bright for them left out. The brightest
-thing left is then fitted as a point or a line.
+Removal. The streak of a star has one brightness from end to end, which cannot exceed that of its faintest
+segment. The erosion of the region by the path of a star is therefore an upper bound of the light of a star;
+objects that cross the streaks, and points on them, nearly vanish in it. Stars are removed one by one, the
+brightest first. Their positions and brightnesses are fitted together, without the pixels that are too bright
+for them. The brightest remainder is then fitted as a point or a line.
 """
 
 from __future__ import annotations
@@ -33,16 +32,15 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
-# Star paths along a region are tried at every eighth of a path; a longer chain of stars is a rarity.
-_PATHS_PER_LENGTH = 8
-_LONGEST_CHAIN = 5.0
-# A streak is a row of Gaussians this far apart: its ripple is 0.2 % at a point spread of 0.6 px.
+# Number of star paths per path length that are tried along a region, and the longest chain of stars.
+_PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
+# Distance (px) of the Gaussians that make up a streak: the ripple is 0.2 % at a point spread of 0.6 px.
 _STEP_PX = 1.0
-# Light farther than this from all paths is ignored: in sigmas of the point spread.
+# Distance from all paths, in sigmas of the point spread, beyond which light is ignored.
 _REACH = 3.0
-# A point's light ends here, in sigmas: 6e-7 of it lies beyond.
+# Distance, in sigmas, at which the light of a point is truncated: 6e-7 of it lies beyond.
 _FARTHEST = 5.0
-# The shape of a bright streak is known to this part of its brightness: ends, point spread, evenness.
+# Relative error of the shape of a bright streak: ends, point spread, evenness.
 SHAPE_ERROR = 0.1
 
 
@@ -51,9 +49,9 @@ class Explanation:
     """How well an object among the stars explains the pixels.
 
     Attributes:
-        chi_square: of the best sum of star streaks and the object's.
-        misfit, misfit_of_stars: chi-square per pixel along the object's streak, with it and without.
-        flux: counts of the object's streak.
+        chi_square: chi-square of the best sum of star streaks and the object's streak.
+        misfit, misfit_of_stars: chi-square per pixel along the object's streak, with and without the object.
+        flux: light of the object, counts.
     """
 
     chi_square: float
@@ -63,11 +61,27 @@ class Explanation:
 
 
 class StarLight:
-    """The pixels about one region, and the stars that may have lit them.
+    """The pixels around one region, and the stars that may illuminate them.
+
+    The pixels are those along all star paths and all lines between the corners. A star may begin or end at
+    each corner, and pass the midpoint of the corners anywhere on its path.
+
+    Args:
+        segmented: the frame.
+        corners: corners of the region (k, 2), px, k of 2 or more.
+        rotation: rotation of the camera over the exposure (3,), rad.
+        pinhole: the camera.
+        psf_sigma: point spread, px.
+        gain: electrons per count.
+        saturation: counts at which a pixel saturates; pixels within 5 % of it have no weight.
+        known: paths (m, 2), px, of stars that illuminate the pixels too.
 
     Attributes:
-        chi_square: of the best sum of star streaks.
-        pixels: how many there are.
+        chi_square: chi-square of the best sum of star streaks.
+        pixels: number of pixels.
+
+    Raises:
+        FlightError: if the brightnesses cannot be solved for.
     """
 
     def __init__(
@@ -81,12 +95,6 @@ class StarLight:
         saturation: float,
         known: Sequence[FloatArray] = (),
     ) -> None:
-        """Take the pixels along all star paths and all lines between the `corners` (k, 2) px, k at least 2.
-
-        Stars may start or stop at each corner and pass the corners' middle anywhere on their path. Pixels
-        within 5 % of `saturation` counts weigh nothing; `gain` is in e-/count. Stars on `known` paths (m, 2)
-        px may have lit them as well. Raises FlightError when the brightnesses cannot be solved for.
-        """
         stars = _star_paths(corners, rotation, pinhole)
         lines = [
             straight_path(corners[list(pair)]) for pair in itertools.combinations(range(len(corners)), 2)
@@ -95,44 +103,41 @@ class StarLight:
         self._psf_sigma, self._rotation, self._pinhole = psf_sigma, rotation, pinhole
         self._near = _pixels_near([*stars, *lines], _REACH * psf_sigma, rows, columns)
         signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
-        self._weight = pixel_weights(signal, segmented.background, gain, saturation)
+        self._weight = _pixel_weights(signal, segmented.background, gain, saturation)
         self._target = signal * self._weight
         self._stars = np.stack([self._weighted_image(path) for path in (*stars, *known)], axis=1)
         self.pixels = len(self._near)
         self._brightness, self.chi_square = _brightnesses(self._stars, self._target)
 
     def explain(self, ends: FloatArray) -> Explanation:
-        """Return how well an object between `ends` (2, 2) does among the stars, by its better path."""
-        paths = straight_path(ends), path_among_stars(ends, self._rotation, self._pinhole)
-        return min((self._explain_path(path) for path in paths), key=lambda found: found.chi_square)
-
-    def _explain_path(self, path: FloatArray) -> Explanation:
-        line = self._weighted_image(path)
-        images = np.column_stack([self._stars, line])
-        found, chi_square = _brightnesses(images, self._target)
-        along = line > 0.05 * line.max()
-        if not along.any():
-            return Explanation(chi_square, np.inf, np.inf, 0.0)
-        missed = (self._target - images @ found)[along]
-        by_stars = (self._target - self._stars @ self._brightness)[along]
-        return Explanation(
-            chi_square,
-            float(missed @ missed) / len(missed),
-            float(by_stars @ by_stars) / len(missed),
-            float(found[-1]),
-        )
+        """Return how well an object between `ends` (2, 2), px, explains the pixels, on its better path."""
+        found = []
+        for path in (straight_path(ends), _path_among_stars(ends, self._rotation, self._pinhole)):
+            line = self._weighted_image(path)
+            images = np.column_stack([self._stars, line])
+            brightness, chi_square = _brightnesses(images, self._target)
+            along = line > 0.05 * line.max()
+            if not along.any():
+                found.append(Explanation(chi_square, np.inf, np.inf, 0.0))
+                continue
+            missed = (self._target - images @ brightness)[along]
+            by_stars = (self._target - self._stars @ self._brightness)[along]
+            misfit, of_stars = (float(each @ each) / len(each) for each in (missed, by_stars))
+            found.append(Explanation(chi_square, misfit, of_stars, float(brightness[-1])))
+        return min(found, key=lambda one: one.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
-        """Return the light (p,) over its error that one count along `path` (m, 2) gives to the pixels."""
+        """Return the light (p,) of one count along `path` (m, 2), px, in the pixels, over its error."""
         (left, top), (right, bottom) = self._near.min(axis=0), self._near.max(axis=0)
         light = spread_over(path - (left, top), right - left + 1, bottom - top + 1, self._psf_sigma)
         return np.asarray(light[self._near[:, 1] - top, self._near[:, 0] - left] * self._weight)
 
 
-def pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
-    """Return 1/error of pixels with `signal` counts above `background`; 0 within 5 % of `saturation` counts.
+def _pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
+    """Return the reciprocal errors of pixels with `signal` counts above `background`; 0 if saturated.
 
-    The error holds the noise, the photons (`gain` in e-/count) and the badly known shape of bright streaks.
+    The error covers the noise, the photons (`gain` in electrons per count) and the uncertain shape of bright
+    streaks. Pixels within 5 % of `saturation` counts are saturated.
     """
     light = np.maximum(signal, 0.0)
     clipped = signal + background.typical_level >= 0.95 * saturation
@@ -143,7 +148,7 @@ def pixel_weights(signal: FloatArray, background: Background, gain: float, satur
 def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
     """Return the non-negative brightness (k,) of each column of `images` (p, k), and the chi-square.
 
-    Raises FlightError when the solver gives up.
+    Raises FlightError if the solver does not converge.
     """
     try:
         brightness, residual = nnls(images, target, maxiter=30 * images.shape[1])
@@ -153,28 +158,30 @@ def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, f
 
 
 def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
-    """Return the pixels (m, 2) of a star that is at `direction` (3,) after the part `start` of its path."""
-    whole = pinhole.project(_turned(direction, rotation, np.linspace(-start, 1.0 - start, 17)))
-    length = float(np.sum(np.linalg.norm(np.diff(whole, axis=0), axis=-1)))
-    steps = _steps(length)
+    """Return points (m, 2), px, along the path of a star that is at `direction` (3,) after a part of it.
+
+    `start` is that part of the path, from 0 to 1.
+    """
+    whole = pinhole.project(_rotated(direction, rotation, np.linspace(-start, 1.0 - start, 17)))
+    steps = _steps(float(np.sum(np.linalg.norm(np.diff(whole, axis=0), axis=-1))))
     parts = (np.arange(steps) + 0.5) / steps - start
-    return pinhole.project(_turned(direction, rotation, parts))
+    return pinhole.project(_rotated(direction, rotation, parts))
 
 
 def straight_path(ends: FloatArray) -> FloatArray:
-    """Return pixels (m, 2) evenly along the line in the image between two ends (2, 2)."""
+    """Return evenly spaced points (m, 2), px, on the line in the image between two ends (2, 2)."""
     steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
     parts = (np.arange(steps)[:, None] + 0.5) / steps
     return np.asarray(ends[0] + parts * (ends[1] - ends[0]))
 
 
-def path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return pixels (m, 2) between two ends (2, 2) of what moves straight and evenly among the stars.
+def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return points (m, 2), px, of a straight and even motion among the stars between two ends (2, 2).
 
-    In the order of time that needs the slower motion.
+    The order of time is the one with the slower motion.
     """
     vectors = pinhole.unit_vectors(ends)
-    both = [carried_to_middle(pair, rotation) for pair in (vectors, vectors[::-1])]
+    both = [at_mid_exposure(pair, rotation) for pair in (vectors, vectors[::-1])]
     first, last = min(both, key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))
     steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
     parts = (np.arange(steps) + 0.5) / steps
@@ -183,14 +190,14 @@ def path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -
     return pinhole.project(np.einsum("mij,mj->mi", turns, at))
 
 
-def carried_to_middle(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return where stars seen at `vectors` (2, 3) at the start and at the end are at mid-exposure (2, 3)."""
+def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Return the directions (2, 3) at mid-exposure of stars at `vectors` (2, 3) at start and end."""
     turns = attitude_matrix(from_rotation_vector(np.array([[0.5], [-0.5]]) * rotation))
     return np.asarray(np.einsum("mij,mj->mi", turns, vectors))
 
 
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> list[FloatArray]:
-    """Return the star paths worth trying: from and to each corner, and all along the region."""
+    """Return the star paths to try: from and to each corner, and along the whole region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
     one = star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
@@ -205,8 +212,8 @@ def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> 
     return [path for path in paths if np.all(np.isfinite(path))]
 
 
-def _turned(direction: FloatArray, rotation: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return where a fixed star goes (m, 3) after parts (m,) of the camera's rotation."""
+def _rotated(direction: FloatArray, rotation: FloatArray, parts: FloatArray) -> FloatArray:
+    """Return the directions (m, 3) of a fixed star after parts (m,) of the camera's rotation."""
     return np.asarray(attitude_matrix(from_rotation_vector(parts[:, None] * rotation)) @ direction)
 
 
@@ -215,14 +222,14 @@ def _steps(length: float) -> int:
 
 
 def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int) -> IntArray:
-    """Return the pixels (p, 2), (x, y), within about `reach` px of any of the paths."""
+    """Return the pixels (p, 2), x and y, within about `reach` px of any of the paths."""
     points = np.rint(np.concatenate(paths))
     r = int(np.ceil(reach))
     inside = np.all((points >= -r) & (points < (columns + r, rows + r)), axis=-1)
     x, y = np.meshgrid(np.arange(-r, r + 1), np.arange(-r, r + 1))
     disc = np.stack([x[x**2 + y**2 <= reach**2], y[x**2 + y**2 <= reach**2]], axis=-1)
     points = points[inside].astype(np.int64)
-    # On a map of the frame's part, with room beyond the frame: no sorting.
+    # A map of the part of the frame, with a margin, is faster than sorting.
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
     marked = np.zeros((height, width), dtype=np.bool_)
@@ -235,7 +242,10 @@ def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int)
 
 
 def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
-    """Return one count spread evenly over `path` (m, 2) px and by a Gaussian, as (rows, columns) get it."""
+    """Return the image (rows, columns) of one count, spread evenly over `path` (m, 2), px, and by a Gaussian.
+
+    `sigma` is the standard deviation of the Gaussian, px.
+    """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     return np.asarray(y.T @ x / len(path))
 
@@ -243,42 +253,30 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return what `spread_over` does, and its change with x and with y, 1/px, of what moves the path.
+    """Return the image of `spread_over`, followed by its derivatives, 1/px, by each displacement in x and y.
 
-    Each row of `shares` (k, m) is one thing that moves, and by how much of it each point does; two slopes of
-    each follow the light.
+    Each row of `shares` (k, m) is a displacement: the fraction by which it moves each point of the path.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
-    dx, dy = _slopes_within(columns, path[:, 0], sigma), _slopes_within(rows, path[:, 1], sigma)
+    dx, dy = _within_pixels(columns, path[:, 0], sigma, True), _within_pixels(rows, path[:, 1], sigma, True)
     images = [y.T @ x]
     for share in shares:
         images += [y.T @ (share[:, None] * dx), dy.T @ (share[:, None] * x)]
     return [image / len(path) for image in images]
 
 
-def _within_pixels(count: int, centres: FloatArray, sigma: float) -> FloatArray:
-    """Return the parts (m, count) of normal densities about `centres` (m,) that fall on each pixel."""
-    first, edges = _edges(centres, sigma)
-    return _placed(np.diff(ndtr(edges), axis=1), first, count)
+def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = False) -> FloatArray:
+    """Return the parts (m, count) of normal densities around `centres` (m,) in each pixel along one axis.
 
-
-def _slopes_within(count: int, centres: FloatArray, sigma: float) -> FloatArray:
-    """Return how `_within_pixels` changes with the centres, 1/px."""
-    first, edges = _edges(centres, sigma)
-    density = np.exp(-0.5 * edges**2) / (np.sqrt(2.0 * np.pi) * sigma)
-    return _placed(-np.diff(density, axis=1), first, count)
-
-
-def _edges(centres: FloatArray, sigma: float) -> tuple[IntArray, FloatArray]:
-    """Return the first pixel (m,) near each centre, and the edges (m, k) of the pixels there, in sigmas."""
+    With `slope`, return the derivatives of the parts by the centres, 1/px.
+    """
     reach = int(np.ceil(_FARTHEST * sigma))
     first = np.rint(centres).astype(np.int64) - reach
-    edges = first[:, None] + np.arange(2 * reach + 2) - 0.5
-    return first, (edges - centres[:, None]) / sigma
-
-
-def _placed(values: FloatArray, first: IntArray, count: int) -> FloatArray:
-    """Return `values` (m, k) of the pixels from `first` (m,) on as (m, count), those on the frame."""
+    edges = (first[:, None] + np.arange(2 * reach + 2) - 0.5 - centres[:, None]) / sigma
+    if slope:
+        values = -np.diff(np.exp(-0.5 * edges**2) / (np.sqrt(2.0 * np.pi) * sigma), axis=1)
+    else:
+        values = np.diff(ndtr(edges), axis=1)
     number, width = values.shape
     start = np.clip(first, -width, count) + width
     placed = np.zeros((number, count + 2 * width))
@@ -286,35 +284,34 @@ def _placed(values: FloatArray, first: IntArray, count: int) -> FloatArray:
     return placed[:, width : width + count]
 
 
-# Room about a region, px: more than the point spread reaches.
+# Margin (px) around a region, wider than the point spread.
 _ROOM = 8
 _MOST_STARS = 12
-# Of the noise of the smoothed image.
-_STAR_SIGMAS = 4.0
-_LEFT_SIGMAS = 6.0
-# A pixel so much brighter than the stars is not theirs, sigmas.
+# Thresholds of a star and of the remainder, in standard deviations of the smoothed image.
+_STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
+# Excess over the stars, in standard deviations, from which a pixel is not used in their fit.
 _NOT_THEIRS = 4.0
-# px; the farthest that a fit moves in one step, and the step at which it has settled.
-_FARTHEST_STEP = 1.0
-_SETTLED_PX = 0.02
+# Largest step (px) of a fit, the step at which it has converged, and the largest number of steps.
+_LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
+# Least length (px) of a line; a shorter remainder is a point.
 _LEAST_LINE_PX = 4.0
+# Widest gap (px) in a line.
 _WIDEST_GAP_PX = 12
-_FITS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """A region and room around it.
+    """A region with a margin.
 
     Attributes:
-        signal: (rows, columns) counts above the background, other regions' light included.
-        weight: (rows, columns) 1/counts, of an error that grows with the light; 0 where the pixel clips.
-        noise: counts, of a pixel without light.
-        corner: (2,) px, (x, y) of its first pixel.
-        mask: (rows, columns) which pixels are the region's.
-        beyond: counts of the pixels above and below, left and right of it: infinite beyond the frame, where
-            any star may go on.
-        psf_sigma: px.
+        signal: counts above the background (rows, columns), including the light of other regions.
+        weight: reciprocal errors (rows, columns), 1/counts; 0 for saturated pixels.
+        noise: noise of a pixel without light, counts.
+        corner: position of the first pixel (2,), x and y, px.
+        mask: which pixels belong to the region (rows, columns).
+        beyond: assumed counts above and below, left and right of the patch: infinite outside of the frame,
+            where any star may continue.
+        psf_sigma: point spread, px.
     """
 
     signal: FloatArray
@@ -325,18 +322,13 @@ class Patch:
     beyond: tuple[tuple[float, float], tuple[float, float]]
     psf_sigma: float
 
-    def image(self, path: FloatArray) -> FloatArray:
-        """Return the light (rows, columns) of one count spread evenly over `path` (m, 2) px."""
-        rows, columns = self.signal.shape
-        return spread_over(path - self.corner, columns, rows, self.psf_sigma)
-
     def image_and_slopes(self, path: FloatArray, shares: FloatArray) -> list[FloatArray]:
-        """Return `image` of a path, and its changes with what moves it: see `spread_with_slopes`."""
+        """Return the image of one count along `path` (m, 2), px, and its slopes, by `spread_with_slopes`."""
         rows, columns = self.signal.shape
         return spread_with_slopes(path - self.corner, shares, columns, rows, self.psf_sigma)
 
     def smoothed(self, light: FloatArray) -> FloatArray:
-        """Return `light` seen through the point spread again: the matched filter of a point."""
+        """Return `light` convolved with the point spread: the matched filter of a point."""
         return np.asarray(ndimage.gaussian_filter(light, self.psf_sigma, mode="constant"))
 
     @property
@@ -348,13 +340,13 @@ class Patch:
 def cut_patch(
     segmented: Segmented, regions: Regions, index: int, psf_sigma: float, gain: float, saturation: float
 ) -> Patch:
-    """Return region number `index` with room around it; pixels within 5 % of `saturation` weigh nothing."""
+    """Return region number `index` with a margin. Pixels within 5 % of `saturation` have no weight."""
     rows, columns = segmented.signal.shape
     top, bottom, left, right = (int(edge) for edge in regions.boxes[index])
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
     bottom, right = min(bottom + _ROOM, rows), min(right + _ROOM, columns)
     signal = segmented.signal[top:bottom, left:right].astype(np.float64)
-    weight = pixel_weights(signal, segmented.background, gain, saturation)
+    weight = _pixel_weights(signal, segmented.background, gain, saturation)
     mask = regions.labels[top:bottom, left:right] == regions.label[index]
     corner = np.array([left, top], dtype=float)
     above, below, before, after = (
@@ -365,10 +357,15 @@ def cut_patch(
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2) px of the stars in a patch, and the rest of it (rows, columns)."""
+    """Return the paths (m, 2), px, of the stars in a patch, and the patch without them (rows, columns)."""
     middles: list[FloatArray] = []
     left = patch.signal
-    offsets = _offsets(patch, rotation, pinhole)
+    rows, columns = patch.signal.shape
+    centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
+    path = _path_of(centre, rotation, pinhole)
+    # Points of a star's path relative to its middle, both ends included.
+    every = max(1, round(2.0 * patch.psf_sigma))
+    offsets = path[np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))] - centre
     while len(middles) < _MOST_STARS:
         eroded = _eroded(patch, left, offsets)
         row, column = np.unravel_index(int(np.argmax(eroded)), eroded.shape)
@@ -376,13 +373,64 @@ def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[lis
             break
         middles.append(patch.corner + np.array([column, row], dtype=float))
         middles, left = _fit_together(patch, middles, rotation, pinhole)
-    return [_path(middle, rotation, pinhole) for middle in middles], left
+    return [_path_of(middle, rotation, pinhole) for middle in middles], left
+
+
+def _path_of(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
+    return star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
+
+
+def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
+    """Return the largest possible brightness of a star centred on each pixel, as in the smoothed image."""
+    seen = patch.smoothed(left)
+    rows, columns = seen.shape
+    reach = int(np.ceil(np.abs(offsets).max())) + 1
+    wide = np.pad(seen, reach, constant_values=patch.beyond)
+    least = np.full(seen.shape, np.inf)
+    for number, (x, y) in enumerate(np.rint(offsets).astype(int)):
+        part = wide[reach + y : reach + y + rows, reach + x : reach + x + columns]
+        # At its very end a streak has half of its brightness.
+        np.minimum(least, 2.0 * part if number in (0, len(offsets) - 1) else part, out=least)
+    return least
+
+
+def _fit_together(
+    patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
+) -> tuple[list[FloatArray], FloatArray]:
+    """Return the middles (2,), px, of stars fitted together, and the patch without them (rows, columns)."""
+
+    def images(middle: FloatArray) -> list[FloatArray]:
+        path = _path_of(middle, rotation, pinhole)
+        return patch.image_and_slopes(path, np.ones((1, len(path))))
+
+    theirs = np.ones(patch.signal.shape, dtype=np.bool_)
+    for _ in range(3):
+        columns = [image for middle in middles for image in images(middle)]
+        weight = np.where(theirs, patch.weight, 0.0).ravel()
+        weighted = np.stack([column.ravel() * weight for column in columns], axis=1)
+        solution = _solve(weighted, patch.signal.ravel() * weight).reshape(-1, 3)
+        flux = np.maximum(solution[:, 0], 1e-9)
+        middles = [
+            middle + np.clip(step / part, -_LARGEST_STEP, _LARGEST_STEP)
+            for middle, step, part in zip(middles, solution[:, 1:], flux, strict=True)
+        ]
+        stars = np.tensordot(flux, np.stack(columns[::3]), axes=1)
+        theirs = (patch.signal - stars) * patch.weight < _NOT_THEIRS
+    lights = [images(middle)[0] for middle in middles]
+    weight = np.where(theirs, patch.weight, 0.0).ravel()
+    weighted = np.stack([light.ravel() * weight for light in lights], axis=1)
+    flux = np.maximum(_solve(weighted, patch.signal.ravel() * weight), 0.0)
+    return middles, patch.signal - np.tensordot(flux, np.stack(lights), axes=1)
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2) px of the brightest thing that the stars left in the region, None if nothing.
+    """Return the ends (2, 2), px, of the brightest remainder in the region; None if there is none.
 
-    A point's ends are one. Residuals of a bright star's badly known shape do not count.
+    Both ends of a point are equal. Residuals due to the uncertain shape of a bright star do not count.
+
+    Args:
+        patch: the region.
+        left: the patch without its stars (rows, columns).
     """
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))
@@ -394,24 +442,29 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     if flux.max(initial=0.0) <= 0.0:
         return None
     y, x = np.divmod(pixel[owner == int(np.argmax(flux))], seen.shape[1])
-    guess = _moment_line(np.stack([x, y], axis=-1).astype(float), seen[y, x])
+    # The first guess is the uniform line with the moments of the bright pixels.
+    points, weight = np.stack([x, y], axis=-1).astype(float), seen[y, x]
+    points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
+    spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
+    guess = line_of(points.mean(axis=0), spread, _LEAST_LINE_PX)
     ends = _fit_line(patch, left, guess + patch.corner)
-    longer = _grown(patch, seen, ends)
+    longer = _continued(patch, seen, ends)
     return ends if longer is None else _fit_line(patch, left, longer)
 
 
-def _moment_line(points: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the ends (2, 2) px of the uniform line with the moments of the bright ones of pixels (n, 2)."""
-    points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
-    spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
-    return line_of(points.mean(axis=0), spread, _LEAST_LINE_PX)
+def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
+    """Return the ends (2, 2), px, of a line that continues beyond gaps; None if it does not.
 
-
-def _grown(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2) px to which a line goes on beyond gaps, None where it does not.
-
-    A star that crosses it, removed with what is below it, leaves a gap.
+    A star that crosses the line leaves a gap, because it is removed together with the light below it.
     """
+
+    def last_before_gap(lit: BoolArray) -> int:
+        places = np.flatnonzero(lit)
+        if not len(places):
+            return 0
+        gaps = np.flatnonzero(np.diff(places) > _WIDEST_GAP_PX)
+        return int(places[gaps[0]] if len(gaps) else places[-1])
+
     length = float(np.linalg.norm(ends[1] - ends[0]))
     if length < 2.0 * _LEAST_LINE_PX:
         return None
@@ -422,24 +475,15 @@ def _grown(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | Non
     profile = ndimage.map_coordinates(seen, points.T[::-1], order=1, mode="constant")
     middle = int(np.argmin(np.abs(at - 0.5 * length)))
     lit = profile > 0.5 * np.median(profile[(at >= 0) & (at <= length)])
-    first = middle - _run(lit[middle::-1])
-    last = middle + _run(lit[middle:])
-    if at[first] > -_FARTHEST_STEP and at[last] < length + _FARTHEST_STEP:
+    first = middle - last_before_gap(lit[middle::-1])
+    last = middle + last_before_gap(lit[middle:])
+    if at[first] > -_LARGEST_STEP and at[last] < length + _LARGEST_STEP:
         return None
     return np.asarray(ends[0] + np.array([[min(at[first], 0)], [max(at[last], length)]]) * along)
 
 
-def _run(lit: BoolArray) -> int:
-    """Return the index of the last one before a gap that is too wide."""
-    places = np.flatnonzero(lit)
-    if not len(places):
-        return 0
-    gaps = np.flatnonzero(np.diff(places) > _WIDEST_GAP_PX)
-    return int(places[gaps[0]] if len(gaps) else places[-1])
-
-
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the ends (2, 2) px fitted to the rest, from a guess; Gauss-Newton."""
+    """Return the ends (2, 2), px, fitted to a remainder (rows, columns) from a guess, by Gauss-Newton."""
     is_point = bool(np.all(ends[0] == ends[1]))
     for _ in range(_FITS):
         path = straight_path(ends)
@@ -452,75 +496,15 @@ def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
         solution = _solve(np.stack([c[near] * weight for c in columns], axis=1), left[near] * weight)
         if solution[0] <= 0.0:
             break
-        steps = np.clip(solution[1:] / solution[0], -_FARTHEST_STEP, _FARTHEST_STEP).reshape(-1, 2)
+        steps = np.clip(solution[1:] / solution[0], -_LARGEST_STEP, _LARGEST_STEP).reshape(-1, 2)
         ends = ends + steps
-        if np.abs(steps).max() < _SETTLED_PX:
+        if np.abs(steps).max() < _CONVERGED:
             break
     return ends
 
 
-def _offsets(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the path (m, 2) px of a star about its middle, were that the patch's; the ends come along."""
-    rows, columns = patch.signal.shape
-    middle = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
-    path = _path(middle, rotation, pinhole)
-    every = max(1, round(2.0 * patch.psf_sigma))
-    # Steps are a pixel: half of one more reaches the star's true ends.
-    chosen = np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))
-    return np.asarray(path[chosen] - middle)
-
-
-def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the greatest brightness, as of the smoothed image, of a star whose middle each pixel is."""
-    seen = patch.smoothed(left)
-    rows, columns = seen.shape
-    reach = int(np.ceil(np.abs(offsets).max())) + 1
-    wide = np.pad(seen, reach, constant_values=patch.beyond)
-    least = np.full(seen.shape, np.inf)
-    for number, (x, y) in enumerate(np.rint(offsets).astype(int)):
-        part = wide[reach + y : reach + y + rows, reach + x : reach + x + columns]
-        # At its very end a streak is half as bright.
-        np.minimum(least, 2.0 * part if number in (0, len(offsets) - 1) else part, out=least)
-    return least
-
-
-def _fit_together(
-    patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
-) -> tuple[list[FloatArray], FloatArray]:
-    """Return the stars' middles (2,) px fitted together, and the rest; the last is new."""
-    stars = np.zeros_like(patch.signal)
-    theirs = np.ones(patch.signal.shape, dtype=np.bool_)
-    for _ in range(3):
-        columns, lights = [], []
-        for middle in middles:
-            path = _path(middle, rotation, pinhole)
-            light, *slopes = patch.image_and_slopes(path, np.ones((1, len(path))))
-            lights.append(light)
-            columns += [light, *slopes]
-        weight = np.where(theirs, patch.weight, 0.0).ravel()
-        images = np.stack([column.ravel() * weight for column in columns], axis=1)
-        solution = _solve(images, patch.signal.ravel() * weight).reshape(-1, 3)
-        flux = np.maximum(solution[:, 0], 1e-9)
-        moved = [
-            middle + np.clip(step / part, -_FARTHEST_STEP, _FARTHEST_STEP)
-            for middle, step, part in zip(middles, solution[:, 1:], flux, strict=True)
-        ]
-        middles = moved
-        stars = np.tensordot(flux, np.stack(lights), axes=1)
-        theirs = (patch.signal - stars) * patch.weight < _NOT_THEIRS
-    lights = [patch.image(_path(middle, rotation, pinhole)) for middle in middles]
-    weight = np.where(theirs, patch.weight, 0.0).ravel()
-    images = np.stack([light.ravel() * weight for light in lights], axis=1)
-    flux = np.maximum(_solve(images, patch.signal.ravel() * weight), 0.0)
-    return middles, patch.signal - np.tensordot(flux, np.stack(lights), axes=1)
-
-
-def _path(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    return star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
-
-
 def _solve(images: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the least-squares coefficients (k,) of `images` (p, k); held a little where they are unknown."""
+    """Return the least-squares coefficients (k,) of `images` (p, k), slightly regularised."""
     normal = images.T @ images
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     normal = normal / np.outer(scale, scale) + 1e-6 * np.eye(len(scale))

@@ -121,6 +121,17 @@ def test_a_sun_that_blooms_over_whole_columns_is_refused_not_guessed() -> None:
     assert "larger" in solution.reason
 
 
+def test_without_settings_the_camera_is_a_linear_one() -> None:
+    model, settings = CAMERAS["linear"]
+    frame, truth = _frame_at(250.0, 250.0, model)
+    found = find_sun(frame, model.lens)
+    assert found
+    assert settings == LINEAR
+    assert found.sun is not None
+    assert np.degrees(np.linalg.norm(found.sun.basis @ truth)) < 0.05
+    assert not find_sun(np.zeros_like(frame), model.lens)
+
+
 def test_few_pixels_are_read() -> None:
     """A third of the rows, and those about the Sun once more."""
     frame, _ = _frame_at(250.0, 250.0, MODEL)

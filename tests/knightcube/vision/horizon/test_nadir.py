@@ -82,6 +82,15 @@ def test_edges_lie_on_the_true_limb_to_a_fraction_of_a_pixel(day: tuple[EarthSce
     assert np.count_nonzero(apart < 0.7) > 25
 
 
+def test_a_solution_is_true_if_it_has_a_nadir(day: tuple[EarthScene, Image]) -> None:
+    found = find_nadir(day[1], MODEL.lens, settings=SETTINGS)
+    assert bool(found) is (found.nadir is not None) is True
+    assert found.reason == ""
+    dark = find_nadir(np.zeros_like(day[1]), MODEL.lens)
+    assert not dark
+    assert dark.reason == "0 edges lie on no horizon better than chance edges would"
+
+
 def test_only_the_scanned_lines_are_read(day: tuple[EarthScene, Image]) -> None:
     _, lines = find_edges(day[1], EdgeSettings(lines=8))
     assert lines.pixels == 16 * 512

@@ -24,6 +24,7 @@ from knightcube.vision.objects.detect import (
     angular_displacements,
     centre_residuals,
     detect,
+    detect_objects,
     evaluate,
     lengths,
     olae_residuals,
@@ -346,6 +347,28 @@ def test_a_piece_of_a_faint_star_is_no_object() -> None:
 def test_a_frame_without_streaks_has_no_report() -> None:
     noise = np.rint(np.random.default_rng(9).normal(150.0, 12.0, (512, 512))).astype(np.uint16)
     assert detect(noise, _FRAME_CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, ObjectSettings()) is None
+    found = detect_objects(noise, _FRAME_CAMERA.pinhole, _ROTATION, 1.0)
+    assert not found
+    assert found.reason == "fewer than 4 streaks stand out of the noise"
+    assert found.directions.shape == (0, 3)
+    assert found.covariance.shape == (0, 3, 3)
+
+
+def test_the_public_search_gives_the_direction_of_each_object_with_its_covariance() -> None:
+    exposure, pinhole = 0.5, _FRAME_CAMERA.pinhole
+    path = object_path(_FRAME_CAMERA, _PLACE, motion_across(_PLACE, 25.0 / _FOCAL, 0.3), _ROTATION)
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, exposure, 5, [(path, 4.0)], _FAINTEST)
+    settings = ObjectSettings(gain=_SETTINGS.gain, saturation=_SETTINGS.saturation)
+    found = detect_objects(pixels, pinhole, _turn(pixels, _ROTATION, exposure) / exposure, exposure, settings)
+    assert found
+    assert found.reason == ""
+    assert len(found.objects) == len(found.directions) == 1
+    off = np.cross(found.directions[0], pinhole.unit_vectors(path[[0, -1]].mean(axis=0)[None])[0])
+    assert np.linalg.norm(off) < 5.0 * settings.streak_sigma / pinhole.focal_length
+    spread = np.sort(np.linalg.eigvalsh(found.covariance[0]))
+    assert spread == pytest.approx([0.0, *[(0.1 / pinhole.focal_length) ** 2] * 2], abs=1e-20)
+    with pytest.raises(ValueError, match="but the camera has"):
+        detect_objects(pixels[1:], pinhole, _ROTATION, exposure)
 
 
 def test_an_object_weaker_than_asked_is_not_called_one() -> None:
