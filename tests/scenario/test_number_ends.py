@@ -16,8 +16,8 @@ from flight.loop.facts import FACTS
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run
-from tests.scenario.test_objects import flight_with_objects, two_objects
-from tests.scenario.test_orbit import orbit_config, world
+from tests.scenario.object_flights import flight_with_objects, two_objects
+from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import Rigged, demo_config, event_names, fly
 
 NEAR = (1 << 32) - 30

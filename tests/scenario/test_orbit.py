@@ -11,40 +11,21 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
-from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
 from ground.telemetry import Run
-from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from sim_hal.faults.schedule import check
-from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.settings import FaultEntry
 from tests.scenario.mode_flights import currents, entered, modes_of
-from tests.support.flights import CONFIG, event_names, fly
+from tests.scenario.orbit_flights import ORBIT, orbit_config, speed, world
+from tests.support.flights import event_names, fly
 
-ORBIT = CONFIG.parent / "orbit.yaml"
-TEXT = ORBIT.read_text(encoding="utf-8")
 SPEED, SLOW = 0.1745, 0.1
 """At the release, and where braking ends, rad/s."""
 SILENT, MUTE = 20.0, 1.0
 """When the inertial unit falls silent, and for how long, s."""
-
-
-def orbit_config(duration: float, **modes: object) -> OrbitConfig:
-    """Return the configuration without its wide cameras, which `test_wide_cameras` flies."""
-    config = configuration.replace(as_orbit(configuration.load(ORBIT)), wide_cameras=())
-    section = configuration.replace(config.modes, **modes)
-    return configuration.replace(config, duration=duration, modes=section)
-
-
-def world(speed: float, *faults: FaultEntry) -> Simulation:
-    section = configuration.simulation_section(TEXT, str(ORBIT), Simulation)
-    assert section is not None
-    assert section.free_body is not None
-    release = configuration.replace(section.free_body.release, speed=speed)
-    return configuration.replace(
-        section, free_body=configuration.replace(section.free_body, release=release), faults=faults
-    )
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +37,6 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
     config = configuration.replace(config, detumble=section, commands=Commands(timeline=timeline))
     silence = FaultEntry(fault="imu: silent", at=SILENT, span=MUTE)
     return fly(config, tmp_path_factory.mktemp("orbit"), section=world(SPEED, silence))
-
-
-def speed(run: Run) -> FloatArray:
-    return np.asarray(np.linalg.norm(run["truth"]["rate"], axis=1))
 
 
 def test_it_detumbles_rests_and_is_braked_again_when_it_turns_too_fast(flown: Run) -> None:

@@ -13,7 +13,7 @@ from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between
 from tests.scenario.mode_flights import modes_of
-from tests.scenario.test_orbit_navigation import navigating, skyward
+from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 DURATION, SUNWARD = 60.0, 45.0

@@ -11,7 +11,7 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
-from tests.scenario.test_orbit_navigation import GYRO_BIAS, navigating, skyward
+from tests.scenario.orbit_flights import GYRO_BIAS, navigating, skyward
 from tests.support.flights import Rigged, event_names, fly
 
 KILLED, AGAIN = 40.0, 16.0

@@ -10,7 +10,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry import Run
 from tests.scenario.mode_flights import currents, entered, modes_of
-from tests.scenario.test_orbit import orbit_config, speed, world
+from tests.scenario.orbit_flights import orbit_config, speed, world
 from tests.support.flights import event_names, fly
 
 SPEED, SLOW = 0.05, 0.042

@@ -16,7 +16,7 @@ from knightcube.astro.quaternion import angle_between, from_rotation_vector, mul
 from knightcube.gnc.control.three_axes import pointing_law
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.mode_flights import modes_of
-from tests.scenario.test_orbit_navigation import navigating, skyward
+from tests.scenario.orbit_flights import navigating, skyward
 from tests.support.flights import event_names, fly
 
 BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([10.0, 20.0, -10.0])

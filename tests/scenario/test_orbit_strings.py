@@ -9,7 +9,7 @@ from flight.schema import reader as configuration
 from ground.report.orbit import COARSE, attitude_errors
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
-from tests.scenario.test_orbit import orbit_config, world
+from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import fly
 
 DEAD = 6.0

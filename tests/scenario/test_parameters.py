@@ -11,8 +11,8 @@ from flight.link.commands import CommandPacker, DumpParameters, LoadParameters
 from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, crc_of
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import decode
+from tests.scenario.answers import said
 from tests.scenario.mode_flights import commanded
-from tests.scenario.test_commands import said
 from tests.support.flights import event_names
 
 SPINS = "tumbling"

@@ -9,7 +9,7 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from ground.report.orbit import COARSE, attitude_errors
 from ground.telemetry import Run
-from tests.scenario.test_orbit import orbit_config, world
+from tests.scenario.orbit_flights import orbit_config, world
 from tests.support.flights import CONFIG, event_names, fly
 
 DURATION, SETTLED = 30.0, 15.0

@@ -19,7 +19,6 @@ from flight.loop.facts import (
     IMU_POOR,
     POWER_POOR,
     EventLog,
-    Facts,
     StreamLimits,
     Streams,
     StreamState,
@@ -29,16 +28,8 @@ from flight.loop.facts import (
 )
 from flight.loop.modes import SAFING_REACTIONS, Trigger, modes_moved_by
 from knightcube.errors import FlightError
+from tests.flight.loop.fdir.records import EventRecord
 from tests.support.flights import demo_config
-
-
-class EventRecord:
-    """A sink that records events."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-        self.log = EventLog(lambda kind, *_: self.names.append(kind.name), throttle_ns=0)
-        self.facts = Facts(self.log)
 
 
 def state(record: EventRecord, fact: facts.Fact, *statements: bool | None) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 from flight.app.cli import main
-from tests.ground.commands.test_commands import ROOT
+from tests.support.places import ROOT
 
 
 def command(*arguments: str | Path) -> CompletedProcess[str]:

@@ -18,9 +18,7 @@ from flight.app.cli.run import progress_on
 from flight.loop.flight_loop import FlightProgress
 from ground.telemetry import read_run
 from tests.ground.report.synthetic import Recipe, make_run
-
-ROOT = Path(__file__).resolve().parents[3]
-DEMO = ROOT / "config" / "step_demo.yaml"
+from tests.support.places import DEMO, ROOT
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:

@@ -13,8 +13,8 @@ from PIL import Image
 
 from flight.app.service import EndingSignals
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import ROOT
 from tests.ground.report.synthetic import Recipe, make_run
+from tests.support.places import ROOT
 
 
 @pytest.fixture(scope="module")

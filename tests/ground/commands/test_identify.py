@@ -11,7 +11,7 @@ import pytest
 from flight.schema.reader import parse
 from flight.schema.testbed import as_testbed
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import DEMO
+from tests.support.places import DEMO
 
 
 @pytest.fixture(scope="module")

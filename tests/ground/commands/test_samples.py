@@ -13,7 +13,7 @@ pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from knightcube.astro.quaternion import angle_between
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import DEMO
+from tests.support.places import DEMO
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import DEMO
+from tests.support.places import DEMO
 
 PLAN = "plan --from 0.1 --to 0"
 

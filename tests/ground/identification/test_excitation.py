@@ -13,11 +13,11 @@ from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, manoeuvres
 from knightcube.gnc.guidance.one_axis.path import PathSample
 from tests.ground.identification.conftest import Identified
-from tests.ground.identification.worlds import PERIOD, World, believed, drawn, fly_bare, usual_excitation
+from tests.ground.identification.excitations import USUAL
+from tests.ground.identification.worlds import PERIOD, believed, drawn, fly_bare, usual_excitation
 
 REST = PathSample(0.0, 0.0, 0.0)
 PLANT = plant_of(believed())
-USUAL = World(inertia=1.05e-3, dipole=0.648, field=4.5e-4, stiffness=1.0e-5, damping=2.0e-6)
 
 
 def controller(**changes: float) -> ExcitationController:

@@ -16,7 +16,7 @@ from ground.identification.record import IdentificationError, Record, Timeline
 from ground.identification.scale import noise_of
 from knightcube.astro.arrays import FloatArray
 from tests.ground.identification.conftest import Identified
-from tests.ground.identification.test_excitation import USUAL
+from tests.ground.identification.excitations import USUAL
 from tests.ground.identification.worlds import believed, fly_bare, motion_error
 
 NOISE = noise_of(believed())

@@ -23,9 +23,9 @@ from ground.watch.plain import PlainLines, state_line
 from ground.watch.tail import LogTail
 from ground.watch.view import View
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import ROOT
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.support.furnishings import Listener, answer
+from tests.support.places import ROOT
 
 
 def pack(packer: Packer, packet: Packet, time_s: float, **values: object) -> bytes:

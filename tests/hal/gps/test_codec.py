@@ -7,23 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyubx2 import UBXMessage, UBXReader
 
-from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, Pvt, StreamParser, checksum, frame, unpack_pvt
-
-PVT = Pvt(
-    date=(2026, 3, 20, 12, 34, 56),
-    nano=-123_456,
-    valid=0b111,
-    fix=3,
-    flags=1,
-    satellites=9,
-    longitude=-1_234_567_890,
-    latitude=456_789_012,
-    height=500_123_456,
-    horizontal=2_500,
-    vertical=4_000,
-    velocity=(-7_123_456, 2_345_678, -123),
-    speed_accuracy=55,
-)
+from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, StreamParser, checksum, frame, unpack_pvt
+from tests.hal.gps.fixes import PVT
 
 
 def test_another_authors_client_reads_our_frame_as_it_is_meant() -> None:

@@ -22,7 +22,7 @@ from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body import FreeBody
 from sim_hal.worlds.world import UNIX_EPOCH
 from tests.hal.gps.bench_line import EXACT, bench
-from tests.hal.gps.test_codec import PVT
+from tests.hal.gps.fixes import PVT
 
 
 def test_a_fix_is_where_the_satellite_was_at_the_epoch() -> None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from flight.schema import reader as configuration
 from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
 from sim_hal.clock import NEVER, SimClock
 from sim_hal.emulators.coil_circuit import CoilCondition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.faults.bench import Bench, FaultKind, Where
+from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import parse, put
 from sim_hal.lockstep import LockStep
+from tests.sim_hal.faults.benches import bench_of
 from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
-from tests.support.flights import demo_config, demo_world
 
 OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
 SECOND_NS = 1_000_000_000
@@ -26,22 +24,10 @@ SECOND_NS = 1_000_000_000
 IN_ORBIT = {"gps", "strings", "wide"}
 
 
-@pytest.fixture
-def lock() -> LockStep:
-    config = configuration.replace(demo_config(10.0))
-    return lockstep.build(config, demo_world(), None, SimClock())
-
-
 @pytest.fixture(scope="module")
 def orbit() -> LockStep:
     """Return the devices of an orbit; every fault leaves them as they were."""
     return lockstep.build(orbit_config(), orbit_world(), None, SimClock())
-
-
-def bench_of(lock: LockStep) -> Bench:
-    generator = np.random.default_rng(1)
-    line = lock.line
-    return Bench(lock.hardware, line, lock.clock.now_ns, generator, line.host, gps_line=lock.gps_line)
 
 
 def is_sound(lock: LockStep) -> bool:

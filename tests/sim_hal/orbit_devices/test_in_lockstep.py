@@ -27,7 +27,7 @@ from sim_hal.lockstep import LockStep, utc_ns
 from sim_hal.orbit_assembly import wide_model
 from sim_hal.orbit_sky import aberrated, view
 from sim_hal.worlds.free_body import FreeBody
-from tests.sim_hal.faults.test_catalogue import bench_of
+from tests.sim_hal.faults.benches import bench_of
 from tests.sim_hal.orbit_devices.fitted import UTC, at_first, orbit_config, orbit_world
 from tests.support.flights import TEXT, demo_world
 

@@ -28,7 +28,7 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.settings import Simulation
-from tests.scenario.test_orbit_navigation import skyward
+from tests.scenario.orbit_flights import skyward
 from tests.support.flights import fly
 
 CONFIG = Path(__file__).resolve().parents[3] / "config" / "orbit_3u.yaml"

@@ -18,7 +18,7 @@ from flight.app.cli.check import flight_problems
 from flight.app.run import RunResult
 from flight.loop.flight_loop import FlightEnding
 from tests.ground.commands.in_process import command
-from tests.ground.commands.test_commands import DEMO, ROOT
+from tests.support.places import DEMO, ROOT
 
 TESTBED = ROOT / "config" / "testbed.yaml"
 WELL = FlightEnding(10.0, 400, "testbed-demo", coils_at_zero=True, coil_error="")

@@ -22,8 +22,8 @@ from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequ
 from knightcube.gnc.control.three_axes.pointing_law import LEAVING
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from tests.flight.bodies.orbit.test_guidance_astray import AWAY, NADIR, STILL, table
-from tests.knightcube.gnc.control.three_axes.test_pointing_law import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, STILL, table
+from tests.knightcube.gnc.control.three_axes.pointing_cases import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
 
 assert table  # a fixture
 RESIDUAL = np.array([1e-3, 0.0, 0.0])

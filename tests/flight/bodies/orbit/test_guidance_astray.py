@@ -5,33 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from flight.bodies.orbit.guidance import PointingPaths
 from hal.interfaces.wires import SECOND_NS
-from knightcube.gnc.control.three_axes.pointing_law import FAR, SLOW
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
-from knightcube.gnc.guidance.three_axes.attitude_law import references
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from tests.knightcube.gnc.control.three_axes.test_pointing_law import (
-    INERTIA,
-    LAW,
-    LIMIT,
-    ORBIT,
-    STEP,
-    WEIGHTS,
-)
-
-NADIR = PointingTarget(Goal.NADIR, roll=0.0)
-NEAR, AWAY = np.array([0.5 * FAR, 0.0, 0.0]), np.array([0.0, 1.2 * FAR, 0.0])
-STILL, QUICK = np.array([0.5 * SLOW, 0.0, 0.0]), np.array([0.0, 0.0, 3.0 * SLOW])
-
-
-@pytest.fixture(scope="module")
-def table() -> PointingTable:
-    times = STEP * np.arange(1.0, 20.0)
-    wanted = references(LAW, ORBIT, times)
-    return table_along(wanted, ORBIT.field_at(times), ORBIT.position_at(times), INERTIA, WEIGHTS)
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, NEAR, QUICK, STILL
+from tests.knightcube.gnc.control.three_axes.pointing_cases import LIMIT
 
 
 def test_the_path_is_flown_until_the_body_is_far_off_and_again_with_a_new_plan(table: PointingTable) -> None:

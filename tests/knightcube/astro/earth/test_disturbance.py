@@ -10,8 +10,8 @@ from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.gnc.control.three_axes.pointing_job import slew
 from knightcube.gnc.guidance.three_axes.slew_task import along
 from sim_hal.worlds.free_body import CRAFTS, air_torque, box
-from tests.knightcube.gnc.control.three_axes.test_pointing_job import AXES, BEGIN, NADIR, WISH
-from tests.knightcube.gnc.control.three_axes.test_pointing_law import ORBIT
+from tests.knightcube.gnc.control.three_axes.pointing_cases import ORBIT
+from tests.knightcube.gnc.control.three_axes.pointing_requests import AXES, BEGIN, NADIR, WISH
 
 ARM = np.array([0.012, -0.009, 0.013])
 """m."""

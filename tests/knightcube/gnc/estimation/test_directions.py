@@ -15,8 +15,8 @@ from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from knightcube.gnc.estimation.estimate import ATTITUDE, FIELD_BIAS, SIZE, FilterState
 from knightcube.gnc.estimation.measurements import DirectionMeasurement, FieldMeasurement, Measurement
 from knightcube.gnc.estimation.mekf import correct, innovation, normalised_square
+from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
-from tests.knightcube.gnc.estimation.test_mekf import STATE, moved
 from tests.support.consistency_worlds import CYCLE_NS
 
 SIGMA = 1e-3

@@ -27,12 +27,10 @@ from knightcube.gnc.estimation.rotation import (
     logarithm,
     skew,
 )
+from tests.knightcube.gnc.estimation.filter_states import STATE, moved
 from tests.knightcube.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
 STILL = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(SIZE))
-STATE = FilterState(
-    exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()
-)
 TORQUING = FREE.torquing(np.array([0.1, -0.08, 0.05]))
 HUNG = FilterState(
     exponential(0.0, 0.4, 0.0), (0.0, -0.3, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.02, 0.0), Parameters(0.01, 2e-3)
@@ -43,21 +41,6 @@ ABOUT_THREAD = [1, 4, 7, 10, 12, 13, 14]
 def walks_of(bias: float, disturbance: float) -> FloatArray:
     """Return the densities (19,) of the random walks."""
     return np.repeat([0.0, bias, disturbance, 0.0], [6, 3, 3, SIZE - 12])
-
-
-def moved(state: FilterState, error: FloatArray) -> FilterState:
-    """Return the state with an error put in."""
-    e = error.tolist()
-    return FilterState(
-        compose(exponential(*e[0:3]), state.quaternion),
-        (state.rate[0] + e[3], state.rate[1] + e[4], state.rate[2] + e[5]),
-        (state.bias[0] + e[6], state.bias[1] + e[7], state.bias[2] + e[8]),
-        (state.disturbance[0] + e[9], state.disturbance[1] + e[10], state.disturbance[2] + e[11]),
-        Parameters(*(p + d for p, d in zip(state.parameters, e[12:15], strict=True))),
-        state.kept,
-        state.latency + e[15],
-        (state.field_bias[0] + e[16], state.field_bias[1] + e[17], state.field_bias[2] + e[18]),
-    )
 
 
 def difference(a: FilterState, b: FilterState) -> FloatArray:

@@ -20,7 +20,7 @@ from knightcube.gnc.estimation.measurements import (
 )
 from tests.knightcube.gnc.estimation import single_axis
 from tests.knightcube.gnc.estimation.flights import SUSPENDED
-from tests.knightcube.gnc.estimation.test_single_axis import PERIOD, PLANT, SETTINGS, simulate
+from tests.knightcube.gnc.estimation.single_axis_flights import PERIOD, PLANT, SETTINGS, simulate
 from tests.support.consistency_worlds import KNOWN_PLANT
 
 ODD: FloatArray = np.array([3e-3, 0.0, -1e-2])

@@ -10,42 +10,21 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import pressures
-from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_job import FINE, SlewRequest, SlewStart, slew, slew_table
+from knightcube.gnc.control.three_axes.pointing_job import FINE, SlewRequest, slew, slew_table
 from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
 from knightcube.gnc.control.three_axes.pointing_table import PointingPreview, PointingTable
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, references
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from tests.knightcube.gnc.control.three_axes.test_pointing_law import (
-    INERTIA,
-    LAW,
+from tests.knightcube.gnc.control.three_axes.pointing_cases import (
     LIMIT,
     ORBIT,
     RESIDUAL,
     SIZE,
     STEP,
     WEIGHTS,
-    X,
-    Y,
-    Z,
     pushed,
 )
-
-NADIR = PointingTarget(Goal.NADIR, roll=0.0)
-AXES = BodyAxes(Z, X)
-WISH = SlewRequest(700.0, np.full(3, 5.0), RESIDUAL, -Y)
-TIMES = np.arange(STEP, 5_000.0, STEP)
-WANTED = references(LAW, ORBIT, TIMES)
-BEGIN = SlewStart(
-    multiply(from_rotation_vector(np.radians([0.0, 60.0, 0.0])), WANTED.quaternion[0]),
-    np.zeros(3),
-    TIMES,
-    100,
-    INERTIA,
-    LIMIT,
-    SIZE,
-)
+from tests.knightcube.gnc.control.three_axes.pointing_requests import AXES, BEGIN, NADIR, TIMES, WANTED, WISH
 
 
 def planned(sizes: FloatArray) -> PointingTable:

@@ -12,7 +12,6 @@ import pytest
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import AIR, CONSTANT, SIZES, pressures, shapes
-from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.control.three_axes.pointing_law import (
@@ -27,23 +26,20 @@ from knightcube.gnc.control.three_axes.pointing_law import (
 from knightcube.gnc.control.three_axes.pointing_table import (
     PointingPreview,
     PointingTable,
-    PointingWeights,
     pointing_table,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeLaw, approach, nadir, references, velocity
-from tests.support.circular_orbits import circular
-
-ORBIT = circular(11_500.0)
-INERTIA = np.diag([0.0066, 0.0333, 0.0333])
-LIMIT = 0.2
-STEP = 10.0
-SIZE = np.array([0.0, 0.0, 1e-9, 0.0, -5e-10, 5e-10, 0.0, 0.0, 0.0])
-RESIDUAL = np.array([5e-4, -3e-4, 2e-4])
-X, Y, Z = np.eye(3)
-
-
-LAW = AttitudeLaw(Z, nadir, X, velocity).attitudes
-WEIGHTS = PointingWeights(turn=0.02, rate=1.0, dipole=0.001)
+from knightcube.gnc.guidance.three_axes.attitude_law import approach, references
+from tests.knightcube.gnc.control.three_axes.pointing_cases import (
+    INERTIA,
+    LAW,
+    LIMIT,
+    ORBIT,
+    RESIDUAL,
+    SIZE,
+    STEP,
+    WEIGHTS,
+    pushed,
+)
 
 
 def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_000.0) -> PointingTable:
@@ -81,19 +77,6 @@ def fly(
             at = np.array([time + 0.5 * STEP * part])
             q, w = pushed(q, w, attitude_matrix(q), at, command.dipole + RESIDUAL, 0.5 * STEP)
     return np.degrees(turns)
-
-
-def pushed(
-    q: FloatArray, w: FloatArray, turned: FloatArray, at: FloatArray, dipole: FloatArray, seconds: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return attitude and rate some seconds later."""
-    position = turned @ ORBIT.position_at(at)[0]
-    radius = float(np.linalg.norm(position))
-    torque = 3.0 * GRAVITATIONAL_PARAMETER / radius**5 * np.cross(position, INERTIA @ position)
-    torque += np.cross(dipole, turned @ ORBIT.field_at(at)[0])
-    torque += shapes(pressures(ORBIT, at), turned[None])[0] @ SIZE
-    w = w + seconds * np.linalg.inv(INERTIA) @ (torque - np.cross(w, INERTIA @ w))
-    return multiply(from_rotation_vector(seconds * w), q), w
 
 
 def test_it_holds_nadir_and_torques_known_ahead_cost_less_than_half_the_error(law: PointingLaw) -> None:

@@ -1,0 +1,26 @@
+"""Filter states that several tests of the estimation share."""
+
+from __future__ import annotations
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import FilterState, Parameters
+from knightcube.gnc.estimation.rotation import compose, exponential
+
+STATE = FilterState(
+    exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()
+)
+
+
+def moved(state: FilterState, error: FloatArray) -> FilterState:
+    """Return the state with an error put in."""
+    e = error.tolist()
+    return FilterState(
+        compose(exponential(*e[0:3]), state.quaternion),
+        (state.rate[0] + e[3], state.rate[1] + e[4], state.rate[2] + e[5]),
+        (state.bias[0] + e[6], state.bias[1] + e[7], state.bias[2] + e[8]),
+        (state.disturbance[0] + e[9], state.disturbance[1] + e[10], state.disturbance[2] + e[11]),
+        Parameters(*(p + d for p, d in zip(state.parameters, e[12:15], strict=True))),
+        state.kept,
+        state.latency + e[15],
+        (state.field_bias[0] + e[16], state.field_bias[1] + e[17], state.field_bias[2] + e[18]),
+    )
