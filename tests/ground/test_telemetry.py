@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET
+from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
 from ground.telemetry import ScanResult, decode, read_run, scan
@@ -18,7 +18,6 @@ from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock
 from tests.pace import ordinary_seconds
-from tests.studies.bench.scan import log
 
 SHORT = Recipe(duration=30.0, planned=30.0, hold=10.0, rate_hz=10.0)
 
@@ -195,8 +194,14 @@ def test_kinds_of_packets_are_distinguished_in_order() -> None:
     assert result.intact
 
 
+def log(cycles: int) -> bytes:
+    """Return the IMU, control and truth packets of `cycles` control cycles."""
+    packer = Packer()
+    kinds = [(kind, plain_contents(kind)) for kind in (IMU, CONTROL, TRUTH)]
+    return b"".join(packer.pack(kind, cycle, values) for cycle in range(cycles) for kind, values in kinds)
+
+
 def test_a_log_four_times_as_long_takes_about_four_times_as_long() -> None:
-    """`python -m tests.studies.bench scan` measures the log of 700 s."""
     short, long = log(1_000), log(4_000)
     assert scan(long).counts == {"imu": 4_000, "control": 4_000, "truth": 4_000}
     assert ordinary_seconds(lambda: scan(long), 5) < 6.0 * ordinary_seconds(lambda: scan(short), 5)

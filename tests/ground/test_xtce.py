@@ -19,7 +19,7 @@ from flight.loop.facts import FACTS, StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
 from tests.flight.link.telemetry.samples import plain_contents
-from tests.studies.interop.fields import compare, definition_of, shifted
+from tests.support.xtce_fields import compare, definition_of, shifted
 
 SPACE = {"x": "http://www.omg.org/spec/XTCE/20180204"}
 DOOR = Packet(

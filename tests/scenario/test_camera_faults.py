@@ -10,8 +10,7 @@ import pytest
 from flight.schema.reader import replace
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.faults import config_for
-from tests.support.flights import demo_world, event_names, fly
+from tests.support.flights import config_for, demo_world, event_names, fly
 
 AT, SPAN = 3.0, 4.0
 ABOUT_VISION = {"camera-late", "camera-lost", "camera-strange", "camera-torn", "vision-slow", "vision-failed"}

@@ -15,8 +15,8 @@ import pytest
 from flight.schema import reader as configuration
 from ground import report
 from ground.telemetry import Run, read_run
-from tests.studies.campaigns.controllers import clairvoyant_power
 from tests.support.flights import CONFIG, demo_config, demo_world, fly
+from tests.support.ideal_power import clairvoyant_power
 
 ROOT = CONFIG.parents[1]
 PIXELS_PER_RAD = 2904.0

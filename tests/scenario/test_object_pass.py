@@ -22,8 +22,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry, Simulation
-from tests.studies.campaigns.first_orbits import flow
 from tests.support.flights import event_names, fly
+from tests.support.short_arcs import flow
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "orbit_object_1u.yaml"
 DURATION, BLIND, GAP = 75.0, 48.0, 10.0

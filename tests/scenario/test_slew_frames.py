@@ -11,7 +11,7 @@ from flight.schema.devices import camera_model
 from ground.telemetry import Run
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from tests.studies.bench import slew_frames
+from tests.support import slew_frames
 from tests.support.flights import fly
 
 DURATION, BEGIN = 85.0, 6.0

@@ -40,7 +40,7 @@ from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import SkySection
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns import nadir
+from tests.support import limb_frames
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "step_demo.yaml"
@@ -127,14 +127,14 @@ def _draw_solved(path: Path) -> None:
 
 def _draw_horizons(path: Path) -> None:
     """Draw the Earth with its terminator in view, three times: edges that were found, the limb they fit."""
-    model = nadir.camera_model()
+    model = limb_frames.camera_model()
     pictures = []
     for seed in HORIZON_SEEDS:
         generator = np.random.default_rng(seed)
         scene = random_scene(generator, model, "terminator")
         pixels = render_earth(model, scene, generator)
-        knowledge = nadir.coarse_knowledge(scene, generator)
-        found = find_nadir(pixels, model.lens, knowledge, nadir.finder_settings(model))
+        knowledge = limb_frames.coarse_knowledge(scene, generator)
+        found = find_nadir(pixels, model.lens, knowledge, limb_frames.finder_settings(model))
         assert found.status is HorizonStatus.FOUND
         pictures.append(draw_horizon(grey_stretch(pixels), found, model.lens))
     write_picture(path, np.hstack(pictures))

@@ -13,7 +13,7 @@ from flight.app.flight import next_whole_second
 from flight.link.telemetry.packets import to_text
 from flight.loop.flight_loop import FlightLoop, RunLabel
 from flight.schema import reader as configuration
-from flight.schema.sections import Config
+from flight.schema.sections import Commands, CommandStep, Config, Modes
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import Run, read_run
 from hal.interfaces.wires import SECOND_NS, Rig
@@ -25,6 +25,10 @@ from sim_hal.worlds.testbed import Testbed
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "step_demo.yaml"
 TEXT = CONFIG.read_text(encoding="utf-8")
+DURATION = 26.0
+"""Duration (s) of a flight with one fault."""
+FRAME_PERIOD, FRAME_EXPOSURE, FRAME_LATE = 2.0, 0.2, 1.0
+"""Times (s) of the camera in flights with a fault; results later than `FRAME_LATE` are late."""
 
 
 @dataclass(frozen=True)
@@ -121,3 +125,31 @@ def _assert_off(lock: LockStep) -> None:
 def event_names(run: Run) -> list[str]:
     """Return the names of a run's events, in order."""
     return [to_text(name) for name in run["event"]["name"]]
+
+
+def config_for(mode: str, camera: bool, duration: float = DURATION) -> Config:
+    """Return half a minute of the demonstration in a mode; with a camera a small and quick one."""
+    config = demo_config(duration)
+    eye = None
+    if camera and config.camera is not None:
+        eye = configuration.replace(
+            config.camera,
+            columns=512,
+            rows=512,
+            exposure=FRAME_EXPOSURE,
+            period=FRAME_PERIOD,
+            max_age=4.5,
+            late_after=FRAME_LATE,
+        )
+    timeline: tuple[CommandStep, ...] = ()
+    initial = mode
+    if mode == "slew":
+        initial, timeline = "hold", (CommandStep(at=3.5, slew=-0.3), CommandStep(at=14.0, slew=0.1))
+    elif mode == "boot":
+        initial = "testbed-demo"
+    return configuration.replace(
+        config,
+        camera=eye,
+        modes=configuration.replace(Modes(), initial=initial),
+        commands=configuration.replace(Commands(), timeline=timeline),
+    )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, angle_of
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
 from tests.support.collocation_oracle import Slew
 from tests.support.shortest_step import shortest_time
@@ -145,3 +145,10 @@ def feasible_problems(
         if 1.0 < shortest < 20.0:  # a slew of less than a second is none
             problems.append((replace(drawn, horizon=factor * shortest), shortest))
     return problems
+
+
+def largest_ratio(problem: Problem, found: StepPlan) -> float:
+    """Return the largest of |I| and |q2| over their limits along the path."""
+    motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001))
+    current = float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
+    return max(current, float(np.abs(np.sin(0.5 * motion[0])).max()) / Q2_LIMIT)

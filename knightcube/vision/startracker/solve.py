@@ -191,7 +191,7 @@ _SHAPE_DOUBT = 0.05
 # the errors of their positions, within which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
 # Attitude error of an uncalibrated lens and of the air beyond the fit of the lens, in px across the boresight
-# and at the edge about it. Attitudes of photographs by other solvers differ by this (bench `untold_lens`).
+# and at the edge about it. Attitudes of photographs by other solvers differ by this.
 _UNTOLD_LENS_PX = 0.25
 # Minimum significance of a streaked star (standard deviations of its light) for identification.
 _LEAST_SIGNIFICANCE = 5.0

@@ -28,7 +28,7 @@ from flight.loop.facts import (
 )
 from flight.loop.modes import SAFING_REACTIONS, Trigger, modes_moved_by
 from knightcube.errors import FlightError
-from tests.flight.loop.fdir.records import EventRecord
+from tests.flight.loop.records import EventRecord
 from tests.support.flights import demo_config
 
 

@@ -12,7 +12,7 @@ import pytest
 from flight.loop import facts
 from flight.loop.health import Board, ClockWatch, ResourceMonitor, ResourceSample
 from flight.schema.sections import Health
-from tests.flight.loop.test_facts import EventRecord
+from tests.flight.loop.records import EventRecord
 
 MIB = 1024.0 * 1024.0
 SETTINGS = Health(look_period=5.0, warm_up=20.0, slope_window=100.0)

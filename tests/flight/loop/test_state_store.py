@@ -12,54 +12,25 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.link import events
-from flight.link.events import EventKind
 from flight.loop.state import (
     COPIES,
     Learned,
     LinuxFiles,
     StateStore,
     StoredState,
-    UncleanShutdown,
     decode,
     encode,
 )
 from tests.flight.loop.disk import Disk, PowerLostError
+from tests.flight.loop.stored_states import Reports, state_of
 
 FOLDER = Path("/state")
 ROOT = Path(__file__).resolve().parents[3]
-
-
-def state_of(number: int) -> StoredState:
-    """Return a state with something in every field."""
-    learned = Learned.of(np.array([1e-4, -2e-4, number * 1e-5]), np.diag([1e-8, 1e-8, 2e-8]))
-    crash = UncleanShutdown(number, 10.0 * number, "2026-01-01T00:00:00Z")
-    return StoredState(
-        boot_count=number,
-        operated=12.5 * number,
-        running=True,
-        unclean=(crash,),
-        mode="hold",
-        utc="1970-01-01T00:00:07Z",
-        learned={"gyro-bias": learned},
-    )
-
-
-class Reports:
-    """Collects events."""
-
-    def __init__(self) -> None:
-        self.kinds: list[EventKind] = []
-        self.texts: list[str] = []
-
-    def __call__(self, kind: EventKind, text: str) -> None:
-        self.kinds.append(kind)
-        self.texts.append(text)
 
 
 def test_what_is_stored_is_read_back_by_another_process_of_the_application(tmp_path: Path) -> None:
@@ -285,7 +256,7 @@ def test_real_files_are_replaced_by_name_and_the_temporary_one_is_gone(tmp_path:
 WRITER = """
 import os, signal, sys
 from pathlib import Path
-from tests.flight.loop.test_state_store import Reports, state_of
+from tests.flight.loop.stored_states import Reports, state_of
 from flight.loop.state import StateStore
 
 # A child for each round: it stores 1, 2, 3 ... until it is killed. The parent, which pays the imports once,

@@ -15,7 +15,7 @@ from knightcube.astro.quaternion import from_rotation_vector, multiply  # noqa: 
 from sim_hal.earth_camera import EarthCameraModel, nadir, render  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 from tests.sim_hal.earth_camera.scenes import limb_scene  # noqa: E402
-from tests.studies.campaigns.nadir import camera_model  # noqa: E402
+from tests.support.limb_frames import camera_model  # noqa: E402
 
 MODEL = camera_model()
 SCENE = limb_scene(zenith=np.array([1.0, 0.0, 0.1]), sun=np.array([1.0, 0.6, 0.5]), texture=3)

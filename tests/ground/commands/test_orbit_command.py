@@ -14,7 +14,7 @@ from flight.link.telemetry.packets import LAYOUTS
 from ground.commands import orbit as command
 from ground.orbits.from_run import orbits_of
 from knightcube.errors import UsageError
-from tests.studies.campaigns import first_orbits as passes
+from tests.support import short_arcs as passes
 
 UTC_NS = 1_774_008_000_000_000_000
 
@@ -32,7 +32,7 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
     middle = len(times) // 2
     own = np.array([6.878e6, 0.0, 0.0, 0.0, 4.0e3, 6.48e3])
     other = np.array([6.6e6, 1.9e6, 5e5, -914.0, 1.2e3, 7.5e3])
-    observer, true = (passes._flown(state, times, middle) for state in (own, other))
+    observer, true = (passes.flown_states(state, times, middle) for state in (own, other))
     way = true[:, :3] - observer[:, :3]
     # By the epoch's own Earth, as an almanac has it about the equinox: 29.9 km/s.
     earth = np.array([0.0, -29.9e3 * np.cos(np.radians(23.44)), -29.9e3 * np.sin(np.radians(23.44))])

@@ -10,7 +10,7 @@ import pytest
 from hal.drivers.vn100.protocol import build
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES
-from tests.hal.vn100.test_emulator import Bench
+from tests.hal.vn100.emulated_unit import Bench
 
 NOISELESS = Vn100EmulatorSettings(noise=PROFILES["none"])
 

@@ -7,48 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, Sentence, StreamParser, build
+from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, build
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.clock import NEVER
-from sim_hal.emulators.serial_line import EmulatedSerialLine
-from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
+from sim_hal.emulators.vn100 import Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS
 from sim_hal.emulators.vn100_sensors import PROFILES, REPORTS
-from sim_hal.worlds.world import about_thread
+from tests.hal.vn100.emulated_unit import Bench
 
 WATCHED = (1, 5, 6, 7, 21, 36, 38, 43, 44, 50, 51, 74, 75)
-
-
-class Bench:
-    """A unit on a line, and a host that only looks at bytes."""
-
-    def __init__(self, unit: Vn100EmulatorSettings | None = None) -> None:
-        rng = np.random.default_rng(2)
-        self.now_ns = 0
-        self.line = EmulatedSerialLine(lambda: self.now_ns, 115200, rng)
-        self.unit = Vn100Emulator(
-            lambda t: about_thread(t, 0.3, 0.02, 4.5e-4),
-            self.line.device,
-            rng,
-            unit or Vn100EmulatorSettings(noise=PROFILES["none"]),
-        )
-        self.parser = StreamParser()
-
-    def run(self, seconds: float) -> list[BinaryPacket | AsciiLine]:
-        """Return all that the unit says meanwhile."""
-        self.now_ns += round(seconds * 1e9)
-        self.unit.advance(self.now_ns)
-        return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]
-
-    def exchange(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
-        """Return the sentences that come after a command."""
-        self.line.host.send(line)
-        return [item.sentence for item in self.run(seconds) if isinstance(item, AsciiLine)]
-
-    def quiet(self) -> Bench:
-        """Pause its asynchronous output."""
-        self.exchange(build("ASY", 0), 0.05)
-        return self
 
 
 def test_out_of_the_box_it_speaks_vnymr_at_40_hz() -> None:

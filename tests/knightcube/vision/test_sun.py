@@ -23,7 +23,7 @@ from knightcube.vision.sun import LINEAR, SunSettings, SunStatus, find_sun, sun_
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction
 from sim_hal.orbit_assembly import wide_model
 from tests.sim_hal.earth_camera.scenes import LOW, pointing, random_sun_scene
-from tests.studies.bench.sun import CAMERAS, Outcome, frames_with_sun, frames_without_sun
+from tests.support.sun_frames import CAMERAS, Outcome, frames_with_sun, frames_without_sun
 
 MODEL, SETTINGS = CAMERAS["logarithmic"]
 CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))

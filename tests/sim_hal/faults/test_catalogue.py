@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from flight.schema import reader as configuration
 from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
@@ -16,6 +17,7 @@ from sim_hal.faults.schedule import parse, put
 from sim_hal.lockstep import LockStep
 from tests.sim_hal.faults.benches import bench_of
 from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
+from tests.support.flights import demo_config, demo_world
 
 OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
 SECOND_NS = 1_000_000_000
@@ -28,6 +30,12 @@ IN_ORBIT = {"gps", "strings", "wide"}
 def orbit() -> LockStep:
     """Return the devices of an orbit; every fault leaves them as they were."""
     return lockstep.build(orbit_config(), orbit_world(), None, SimClock())
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    config = configuration.replace(demo_config(10.0))
+    return lockstep.build(config, demo_world(), None, SimClock())
 
 
 def is_sound(lock: LockStep) -> bool:

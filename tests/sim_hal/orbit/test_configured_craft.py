@@ -10,7 +10,7 @@ from flight.schema import reader
 from flight.schema.orbit import as_orbit
 from sim_hal.settings import Simulation
 from sim_hal.worlds.free_body import CRAFTS
-from tests.studies.campaigns.orbit_pointing_flight import WEIGHTS
+from tests.support.pointing_settings import WEIGHTS
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 

@@ -11,130 +11,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
-import numpy as np
-from scipy.special import ndtr
-
-from knightcube.astro.arrays import FloatArray, Image, IntArray
-from knightcube.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
-from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
-from sim_hal.star_camera import StarCameraModel, render
-from tests.sim_hal.star_camera.scenes import at_pixels, still
+from knightcube.vision.startracker.detection.survey import CENTROIDS
+from sim_hal.star_camera import StarCameraModel
+from tests.support.centroid_bound import compare
 
 _SEED = 27_182
-_EXPOSURE = 0.2
-_GRID = 7
-_MATCHED = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One line of the table: px along one axis."""
-
-    psf_sigma: float
-    magnitude: float
-    method: str
-    found: int
-    stars: int
-    false: int
-    rms: float
-    bias: float
-    bias_error: float
-    ratio: float
-    nees: float
-    detect_ms: float
-    track_ms: float
-
-
-def star_places(rng: np.random.Generator, size: int, count: int = 40) -> FloatArray:
-    """Return `count` places (count, 2) px, none within a twentieth of `size` of another or of the border."""
-    cell = size / _GRID
-    chosen = rng.permutation(_GRID * _GRID)[:count]
-    corner = np.stack([chosen % _GRID, chosen // _GRID], axis=-1) * cell
-    return np.asarray(corner + rng.uniform(0.2 * cell, 0.8 * cell, (count, 2)))
-
-
-def frame_of(
-    camera: StarCameraModel, places: FloatArray, magnitudes: FloatArray, seed: Sequence[int]
-) -> Image:
-    """Return a frame of stars of `magnitudes` (n,) at `places` (n, 2) px, the camera at rest."""
-    rng = np.random.default_rng(seed)
-    return render(camera, at_pixels(camera, places), magnitudes, *still(_EXPOSURE), rng)
-
-
-def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
-    """Return the least covariance (2, 2) px^2 of a star's place, its light, sky and point spread unknown.
-
-    Poisson and read noise, rounding; pixels whose mean is saturated give no information.
-    """
-    reach = int(np.ceil(6.0 * camera.psf_sigma)) + 1
-    middle = np.rint(place)
-    pixel = np.arange(-reach, reach + 1)
-    shares = []
-    for axis in (0, 1):
-        edge = (np.append(pixel - 0.5, pixel[-1] + 0.5) + middle[axis] - place[axis]) / camera.psf_sigma
-        bell = np.exp(-0.5 * edge**2) / (np.sqrt(2.0 * np.pi) * camera.psf_sigma)
-        shares.append((np.diff(ndtr(edge)), -np.diff(bell), -np.diff(edge * bell)))
-    (x, dx, wx), (y, dy, wy) = shares
-    light = np.outer(y, x)
-    derivatives = np.stack(
-        [electrons * np.outer(y, dx), electrons * np.outer(dy, x), light, np.ones_like(light),
-         electrons * (np.outer(wy, x) + np.outer(y, wx))]
-    ).reshape(5, -1)  # fmt: skip
-    dark = camera.dark_current * _EXPOSURE
-    mean = electrons * light + dark
-    variance = mean + camera.read_noise**2 + camera.gain**2 / 12.0
-    top = min(camera.full_well, (camera.highest_count - camera.pedestal) * camera.gain)
-    good = (mean < top).reshape(-1)
-    scaled = derivatives[:, good] / np.sqrt(variance.reshape(-1)[good])
-    return np.asarray(np.linalg.inv(scaled @ scaled.T)[:2, :2])
-
-
-def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: int, seed: int) -> Row:
-    """Return the errors of `frames` frames of stars of `magnitude`, and the times of one frame."""
-    settings = DetectionSettings(method=method)
-    bounds: list[FloatArray] = []
-    errors, nees, false, total = [], [], 0, 0
-    detecting, tracking = [], []
-    electrons = float(np.asarray(camera.electrons(np.array([magnitude]), _EXPOSURE))[0])
-    for frame in range(frames):
-        places = star_places(np.random.default_rng([seed, frame, 1]), camera.columns)
-        pixels = frame_of(camera, places, np.full(len(places), magnitude), [seed, frame, 2])
-        begin = time.process_time()
-        found = detect(pixels, settings).stars()
-        detecting.append(time.process_time() - begin)
-        begin = time.process_time()
-        measure_near(pixels, places[:30] + 1.0, settings)
-        tracking.append(time.process_time() - begin)
-        star, detection = matched(found, places)
-        off = found.points[detection] - places[star]
-        errors.append(off)
-        bounds.extend(point_bound(camera, place, electrons) for place in places[star])
-        weighted = np.linalg.solve(found.covariance[detection], off[:, :, None])[:, :, 0]
-        nees.append(np.sum(off * weighted, axis=1) / 2.0)
-        false += len(found) - len(detection)
-        total += len(places)
-    error = np.concatenate(errors)
-    least = float(np.sqrt(np.mean([np.trace(bound) / 2.0 for bound in bounds]))) if bounds else np.nan
-    rms = float(np.sqrt(np.mean(error**2))) if len(error) else np.nan
-    bias = error.mean(axis=0) if len(error) else np.full(2, np.nan)
-    return Row(
-        camera.psf_sigma, magnitude, method, len(error), total, false, rms, float(np.abs(bias).max()),
-        rms / np.sqrt(max(len(error), 1)), rms / least, float(np.mean(np.concatenate(nees))),
-        1e3 * float(np.median(detecting)), 1e3 * float(np.median(tracking)),
-    )  # fmt: skip
-
-
-def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return the numbers of the stars found (k,) and of the detections (k,) they are."""
-    if not len(found):
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    apart = np.linalg.norm(places[:, None] - found.points, axis=-1)
-    star = np.flatnonzero(apart.min(axis=1) < _MATCHED)
-    return star, apart[star].argmin(axis=1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

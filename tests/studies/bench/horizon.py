@@ -22,7 +22,8 @@ from knightcube.vision.horizon.edges import find_edges, observe
 from knightcube.vision.horizon.nadir import find_nadir
 from sim_hal.earth_camera import nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns.nadir import VIEWS, camera_model, coarse_knowledge, finder_settings
+from tests.studies.campaigns.nadir import VIEWS
+from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
 
 BUDGET_MS = 5.0
 _SEED = 606

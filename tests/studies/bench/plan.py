@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan
+from knightcube.gnc.guidance.one_axis.vmc import PlanStatus
 from tests.support.collocation_oracle import solve
-from tests.support.step_problems import STEPS, THESIS, Problem, feasible_problems
+from tests.support.step_problems import STEPS, THESIS, Problem, feasible_problems, largest_ratio
 
 FEASIBLE = (1.1, 2.5)
 TOO_SHORT = (0.6, 0.99)
@@ -62,13 +61,6 @@ def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
         "worst_limit_ratio": max(passed),
         "worst_horizon_over_shortest": max(beyond),
     }
-
-
-def largest_ratio(problem: Problem, found: StepPlan) -> float:
-    """Return the largest of |I| and |q2| over their limits along the path."""
-    motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001))
-    current = float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
-    return max(current, float(np.abs(np.sin(0.5 * motion[0])).max()) / Q2_LIMIT)
 
 
 def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:

@@ -16,7 +16,6 @@ import json
 import math
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,85 +24,30 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.frame_job import solve_frame
-from knightcube.vision.startracker.sky_map import Pointing
-from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, RatePrior, SolveSettings
-from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers
+from tests.support.photographs import (
+    _HIGHEST_DEG,
+    _LOWEST_DEG,
+    _NARROW_KNOWN_DEG,
+    FIELD_SHARE,
+    NARROW_DEG,
+    PHOTOGRAPHS,
+    RIGHT_ARCSEC,
+    Photograph,
+    angle_arcsec,
+    centre_of,
+    photograph,
+    solved,
+)
 
 _SEED = 16_018
-PHOTOGRAPHS = Path(__file__).parents[4] / "shared" / "data" / "sky"
 _STREAKS_PX = (0.0, 10.0, 20.0, 40.0, 80.0)
 _OBLIQUE, _ACROSS = (30.0, 90.0), (90.0, 90.0)
 _EXPOSURE = 0.1
-# rad, of the prior for tracking: 1.5 px.
-_PRIOR_SIGMA = 3e-4
-FIELD_SHARE = 0.05
-_LOWEST_DEG, _HIGHEST_DEG = 10.0, 30.0
-NARROW_DEG, _NARROW_KNOWN_DEG = 12.0, 0.1
-RIGHT_ARCSEC = 60.0
-ARCSECONDS = math.degrees(1.0) * 3600.0
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """The result of one photograph; arcsec and ms are NaN where it was not solved."""
-
-    name: str
-    known: bool
-    solved: bool
-    arcsec: float
-    stars: int
-    ms: float
-
-
-def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a camera of `fov_deg` across and the range of its scale that fields `low` to `high` deg make."""
-    middle = math.tan(0.5 * math.radians(fov_deg))
-    rows, columns = pixels.shape
-    scale = tuple(math.tan(0.5 * math.radians(angle)) / middle for angle in (low, high))
-    return Pinhole(columns, rows, 0.5 * columns / middle), (scale[0], scale[1])
-
-
-def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) -> Photograph:
-    """Return what the star tracker makes of one photograph."""
-    pixels = read_image(folder / name)
-    fov = truth["fov"]
-    low, high = (
-        (fov * (1.0 - FIELD_SHARE), fov * (1.0 + FIELD_SHARE)) if known else (_LOWEST_DEG, _HIGHEST_DEG)
-    )
-    camera, scale = believed(pixels, fov if known else 17.0, low, high)
-    begin = time.process_time()
-    found = solve_frame(pixels, camera, scale, 1.0, sky(), SolveSettings())
-    ms = 1e3 * (time.process_time() - begin)
-    if found.fix is None:
-        return Photograph(name, known, False, math.nan, 0, ms)
-    pointing = Pointing.of(found.fix.quaternion)
-    place = direction(pointing.right_ascension, pointing.declination)
-    off = angle_arcsec(place, centre_of(truth))
-    return Photograph(name, known, True, off, len(found.matched), ms)
-
-
-def centre_of(truth: dict[str, float]) -> FloatArray:
-    """Return the direction (3,) of the centre of a photograph."""
-    return direction(math.radians(truth["ra"]), math.radians(truth["dec"]))
-
-
-def direction(right_ascension: float, declination: float) -> FloatArray:
-    """Return the unit vector (3,) of a place of the sky."""
-    cosine = math.cos(declination)
-    return np.array(
-        [cosine * math.cos(right_ascension), cosine * math.sin(right_ascension), math.sin(declination)]
-    )
-
-
-def angle_arcsec(one: FloatArray, other: FloatArray) -> float:
-    """Return the angle between two unit vectors (3,)."""
-    return ARCSECONDS * math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
 
 
 def photographs(folder: Path) -> list[Photograph]:
@@ -119,60 +63,10 @@ def _shown(folder: Path) -> Iterator[tuple[str, dict[str, float], bool]]:
             yield name, values, False
 
 
-@dataclass(frozen=True)
-class Solved:
-    """One simulated frame: errors over the whole attitude and the rate, with their bounds, and times.
-
-    Attributes:
-        across: arcsec, of the boresight; NaN when refused.
-        across_bound: arcsec, rms that the bound allows.
-        nees: squared error of the attitude over its covariance, per degree of freedom.
-        rate, rate_bound: % of the rate's magnitude; NaN without one.
-    """
-
-    across: float
-    across_bound: float
-    nees: float
-    rate: float
-    rate_bound: float
-    ms: float
-    tracking_ms: float
-
-
 def scene_of(length: float, theta_deg: tuple[float, float], frame: int) -> SkyFrame:
     """Return a frame with streaks of `length` px."""
     key = [_SEED, frame, round(length)] + ([1] if theta_deg == _ACROSS else [])
     return sky_frame(np.random.default_rng(key), length, _EXPOSURE, theta_deg=theta_deg)
-
-
-def solved(scene: SkyFrame, length: float) -> Solved:
-    """Return what the star tracker makes of a simulated frame, lost in space and with a prior."""
-    low, high = NARROW_DEG - _NARROW_KNOWN_DEG, NARROW_DEG + _NARROW_KNOWN_DEG
-    camera, scale = believed(scene.pixels, NARROW_DEG, low, high)
-    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(untold_lens=False)
-    prior = AttitudePrior(scene.attitude, _PRIOR_SIGMA)
-    exposure = scene.exposure
-    begin = time.process_time()
-    found = solve_frame(scene.pixels, camera, scale, exposure, sky(), settings, None, rate_prior)
-    middle = time.process_time()
-    solve_frame(scene.pixels, NARROW.pinhole, (1.0, 1.0), exposure, sky(), settings, prior, rate_prior)
-    tracked = time.process_time()
-    bound = ARCSECONDS * math.sqrt(float(np.trace(scene.attitude_bound()[:2, :2])))
-    across, nees, rate, rate_bound = math.nan, math.nan, math.nan, math.nan
-    if found.fix is not None:
-        boresights = (attitude_matrix(q)[2] for q in (found.fix.quaternion, scene.attitude))
-        across, nees = angle_arcsec(*boresights), _nees(found, scene.attitude)
-    if length and found.fix is not None and found.motion is not None and found.motion.rate is not None:
-        speed = float(np.linalg.norm(scene.rate))
-        rate = 100.0 * (float(np.linalg.norm(found.motion.rate)) / speed - 1.0)
-        rate_bound = 100.0 * scene.rate_bound() / speed
-    return Solved(across, bound, nees, rate, rate_bound, 1e3 * (middle - begin), 1e3 * (tracked - middle))
-
-
-def _nees(found: FrameSolution, truth: FloatArray) -> float:
-    assert found.fix is not None
-    error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
-    return float(error @ np.linalg.solve(found.fix.covariance, error)) / 3.0
 
 
 def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[str, Any]:

@@ -17,25 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.orbit.body import ORBIT, SatelliteControl, SatelliteEstimation
-from flight.link.telemetry.packets import to_text
 from flight.loop.body import BodyKind, FlightBody
 from flight.loop.facts import Services
 from flight.loop.state import Learned
-from flight.schema import reader as configuration
-from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from flight.schema.orbit import as_orbit
 from flight.schema.sections import Config
-from ground.telemetry import Run
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import from_rotation_vector, multiply
-from sim_hal.settings import Simulation
-from tests.scenario.orbit_flights import skyward
 from tests.support.flights import fly
-
-CONFIG = Path(__file__).resolve().parents[3] / "config" / "orbit_3u.yaml"
-SPEED = 5e-4
-"""rad/s, at the release."""
-BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
-"""s and s and rad, of the slew."""
+from tests.support.slew_frames import compared, flight
 
 
 class _Unscheduled(SatelliteControl):
@@ -55,65 +43,6 @@ def _as_they_come(config: Config, services: Services, learned: Mapping[str, Lear
 
 
 AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)
-
-
-def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[OrbitConfig, Simulation]:
-    """Return the configuration and the world of a flight; it slews `about` (3,), body axes, or any axis."""
-    text = CONFIG.read_text(encoding="utf-8")
-    config = as_orbit(configuration.parse(text))
-    section = configuration.simulation_section(text, CONFIG.name, Simulation)
-    assert section is not None
-    assert section.free_body is not None
-    assert config.camera is not None
-    away = skyward().free_body
-    assert away is not None
-    assert away.release.attitude is not None
-    start = away.release.attitude
-    rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3) if about is None else about
-    end = multiply(from_rotation_vector(TURN * axis / np.linalg.norm(axis)), np.array(start))
-    x, y, z, w = end.tolist()
-    release = configuration.replace(section.free_body.release, attitude=start, speed=SPEED)
-    world = configuration.replace(
-        section, seed=seed, free_body=configuration.replace(section.free_body, release=release)
-    )
-    return configuration.replace(
-        config,
-        body=body,
-        duration=BEGIN + SLEW + 10.0,
-        camera=configuration.replace(config.camera, fine_period=None),
-        detumble=configuration.replace(config.detumble, low_rate=0.0175, low_for=0.5),
-        pointing=configuration.replace(config.pointing, slew=SLEW),
-        targets=(
-            TargetStep(at=0.0, point="inertial", quaternion=start),
-            TargetStep(at=BEGIN, point="inertial", quaternion=(x, y, z, w)),
-        ),
-    ), world
-
-
-def compared(
-    run: Run, first: float = BEGIN + 5.0, last: float = BEGIN + SLEW
-) -> tuple[int, int, int, FloatArray]:
-    """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,).
-
-    It is judged from `first` to `last` s.
-    """
-    frames, truth = run["streak"], run["truth"]
-    times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)
-    began = frames["exposure_start_ns"] * 1e-9
-    within = (began > first) & (began < last)
-    found = []
-    for frame in frames[within]:
-        if to_text(frame["status"]) != "rate":
-            continue
-        begin = float(frame["exposure_start_ns"]) * 1e-9
-        at = np.linspace(begin, begin + float(frame["exposure"]), 201)
-        mean = np.mean([np.interp(at, times, part) for part in rates.T], axis=1)
-        xx, yy, zz, xy, xz, yz = frame["covariance"].astype(float)
-        covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        error = frame["rate"].astype(float) - mean
-        found.append(error @ np.linalg.solve(covariance, error) / 3.0)
-    return int(within.sum()), len(found), int(frames["accepted"][within].sum()), np.array(found)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -29,14 +29,11 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
-from sim_hal.settings import Simulation
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.support.collocation_oracle import Slew, solve
 from tests.support.flights import demo_config, demo_world, fly, thesis_config
+from tests.support.ideal_power import clairvoyant_power
 
 DURATION = 700.0
-REACHED_AFTER = 10.0
 FIGURES = (
     ("steady_state_deg", "steady, deg"),
     ("overshoot_percent", "overshoot, %"),
@@ -145,44 +142,6 @@ def run(case: Case) -> Result:
 def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
     """Return the largest figure; infinite when a step never came to it."""
     return max(np.inf if row[key] is None else row[key] for row in rows)
-
-
-def clairvoyant_power(config: TestbedConfig, world: Simulation) -> float:
-    """Return the mean R I^2 in W of the clairvoyant optimum of a demonstration's steps in a world."""
-    true = SingleAxisPlant(
-        world.truth.inertia or config.plant.inertia,
-        config.plant.coil_turns * config.plant.coil_area * (world.truth.field or config.plant.field),
-        (world.truth.resistance or config.coils.resistance)[0],
-        config.coils.current_limit,
-        world.thread.stiffness,
-        world.thread.damping,
-    )
-    assert world.release is not None, "the testbed has one"
-    angle, rate = angle_of(world.release.q2), world.release.rate
-    ends = [step.at for step in config.steps[1:]] + [config.duration]
-    energy = 0.0
-    for step, end in zip(config.steps, ends, strict=True):
-        target = angle_of(step.q2)
-        slew = Slew(
-            angle,
-            rate,
-            target,
-            0.0,
-            REACHED_AFTER,
-            true.inertia,
-            true.torque_constant,
-            true.resistance,
-            true.current_limit,
-            true.stiffness,
-            true.damping,
-        )
-        best = solve(slew, intervals=800)
-        if best is None:
-            raise ValueError(f"no trajectory reaches q2 {step.q2} in {REACHED_AFTER} s")
-        held = true.current(target, 0.0, 0.0)
-        energy += best.energy + true.resistance * held * held * (end - step.at - REACHED_AFTER)
-        angle, rate = target, 0.0
-    return energy / config.duration
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:

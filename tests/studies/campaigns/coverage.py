@@ -21,7 +21,6 @@ from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.orbit_world import FIRST_DATE
 from tests.support.orbit_geometry import (
     SUITES,
     Pass,
@@ -33,6 +32,7 @@ from tests.support.orbit_geometry import (
     revolution,
     suite,
 )
+from tests.support.orbit_world import FIRST_DATE
 from tests.support.sensor_suite import SensorSuite
 
 STEP = 20.0

@@ -25,7 +25,7 @@ from sim_hal.earth_camera.truth import sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.limbless import MAKERS, photographed
-from tests.studies.campaigns.nadir import camera_model, coarse_knowledge, finder_settings
+from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
 
 KNOWN = ("nothing", "altitude", "flight")
 CAMERAS = ((512, 512, 67.0), (480, 640, 60.0), (768, 1024, 30.0), (768, 1024, 12.8), (512, 512, 100.0))

@@ -17,10 +17,8 @@ from sim_hal.faults.bench import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.fault_table import REACTION, own_events, part_of
-from tests.support.flights import demo_world
+from tests.support.flights import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, demo_world
 
-DURATION = 26.0
-"""s, of each flight."""
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
 """s after the end of a fault: later events have another cause."""
@@ -28,8 +26,8 @@ BLIND_GRACE = 0.1
 """s: within this the coils are at zero after the last measurement."""
 ZERO = 1e-3
 """A: a coil that is off carries less."""
-FRAME_PERIOD, FRAME_EXPOSURE, FRAME_READOUT, FRAME_LATE = 2.0, 0.2, 0.05, 1.0
-"""s, of the campaign's camera."""
+FRAME_READOUT = 0.05
+"""Readout time (s) of the camera."""
 DRIVEN = 6.0e-3
 """A, from which on the monitor can judge a driven coil."""
 

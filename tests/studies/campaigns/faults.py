@@ -20,15 +20,14 @@ from typing import Any
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.sections import Commands, CommandStep, Config, Modes
 from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.fault_judgement import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, judge
+from tests.studies.campaigns.fault_judgement import judge
 from tests.studies.campaigns.fault_table import OWN, part_of
-from tests.support.flights import demo_config, demo_world, fly
+from tests.support.flights import DURATION, config_for, demo_config, demo_world, fly
 
 MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
 LASTING = ("coil", "bridge")
@@ -76,36 +75,8 @@ def fly_with(kind: FaultKind, mode: str, entry: FaultEntry, seed: int) -> Result
     """Fly half a minute with one fault."""
     section = configuration.replace(demo_world(), seed=seed, faults=(entry,), coil_field=COIL_FIELD)
     with tempfile.TemporaryDirectory() as place:
-        flown = fly(config_for(mode, kind.device in _LOOKS), Path(place) / "run", section=section)
+        flown = fly(config_for(mode, kind.device in _LOOKS, DURATION), Path(place) / "run", section=section)
         return {"fault": kind.name, "mode": mode, **judge(flown, kind, entry)}
-
-
-def config_for(mode: str, camera: bool) -> Config:
-    """Return half a minute of the demonstration in a mode; with a camera a small and quick one."""
-    config = demo_config(DURATION)
-    eye = None
-    if camera and config.camera is not None:
-        eye = configuration.replace(
-            config.camera,
-            columns=512,
-            rows=512,
-            exposure=FRAME_EXPOSURE,
-            period=FRAME_PERIOD,
-            max_age=4.5,
-            late_after=FRAME_LATE,
-        )
-    timeline: tuple[CommandStep, ...] = ()
-    initial = mode
-    if mode == "slew":
-        initial, timeline = "hold", (CommandStep(at=3.5, slew=-0.3), CommandStep(at=14.0, slew=0.1))
-    elif mode == "boot":
-        initial = "testbed-demo"
-    return configuration.replace(
-        config,
-        camera=eye,
-        modes=configuration.replace(Modes(), initial=initial),
-        commands=configuration.replace(Commands(), timeline=timeline),
-    )
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:

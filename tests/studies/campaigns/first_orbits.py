@@ -11,17 +11,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.tracking.first_orbit import ArcError, Bearings, first_orbit
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.short_arcs import LIGHT, circular, flown_states
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)
 ARCS = (60.0, 120.0, 240.0)
 PERIOD = 2.0
-EARTH, FLATTENING, EQUATOR, LIGHT = 3.986004418e14, 1.0826359e-3, 6_378_136.6, 299_792_458.0
-"""SI: the gravity of the Earth, J2 and its radius; the speed of light."""
 SUNWARD = np.array([0.0, 29_780.0, 0.0])
 
 
@@ -40,7 +38,7 @@ def run(case: Case) -> Result:
     times = np.arange(0.0, case.parameters["arc"] + 0.5, case.parameters["period"])
     middle = len(times) // 2
     own, other = _pass(rng)
-    observer, true = (_flown(state, times, middle) for state in (own, other))
+    observer, true = (flown_states(state, times, middle) for state in (own, other))
     way = true[:, :3] - observer[:, :3]
     late = np.linalg.norm(way, axis=1, keepdims=True) / LIGHT
     way = way - late * (true[:, 3:] + SUNWARD)
@@ -111,33 +109,6 @@ def _pass(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         rate = np.degrees(np.linalg.norm(np.cross(direction, relative))) / away
         if 6.7e6 < radius < 9e6 and 0.05 < rate < 0.6:
             return own, other
-
-
-def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
-    """Return a state over `place`, across it, at a speed over the circular one."""
-    up = place / np.linalg.norm(place)
-    ahead = np.cross(up, rng.normal(size=3))
-    ahead /= np.linalg.norm(ahead)
-    return np.concatenate([radius * up, np.sqrt(EARTH / radius) * speed * ahead])
-
-
-def _flown(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
-    """Return states (n, 6) at times of the one at `times[middle]`."""
-    parts = []
-    for sense in (times[middle::-1], times[middle:]):
-        found = solve_ivp(
-            flow, (sense[0], sense[-1]), state, t_eval=sense, method="DOP853", rtol=1e-12, atol=1e-6
-        )
-        parts.append(found.y.T)
-    return np.concatenate([parts[0][:0:-1], parts[1]])
-
-
-def flow(_: float, state: FloatArray) -> FloatArray:
-    x, y, z = state[:3]
-    square = x * x + y * y + z * z
-    flat = 1.5 * FLATTENING * EQUATOR**2 / square
-    share = np.array([1.0, 1.0, 3.0]) - 5.0 * z * z / square
-    return np.concatenate([state[3:], -EARTH / square**1.5 * state[:3] * (1.0 + flat * share)])
 
 
 FIRST_ORBITS = Campaign(

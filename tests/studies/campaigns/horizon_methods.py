@@ -38,10 +38,10 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.nadir import (
+from tests.studies.campaigns.nadir import WRONG_DEG
+from tests.support.limb_frames import (
     FIELD_SIGMA,
     SUN_SIGMA,
-    WRONG_DEG,
     camera_model,
     finder_settings,
     misread,

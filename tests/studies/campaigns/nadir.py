@@ -22,69 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
-from knightcube.vision.horizon.settings import (
-    EdgeSettings,
-    HorizonKnowledge,
-    HorizonSettings,
-    LogarithmicResponse,
-    SensedDirection,
-)
-from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
-from sim_hal.earth_camera.scene import Atmosphere
-from tests.sim_hal.earth_camera.scenes import random_direction, random_scene
+from sim_hal.earth_camera import nadir, render
+from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings, random_air
 
 VIEWS = ("sunlit", "terminator")
 AIRS = ("known", "unknown")
-KNOWN_LIMB = 1000.0
-"""m: to which the limb's height is believed where the air is known."""
-SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
-"""m, and times the standard optical depth: drawn where the air is not known."""
-SUN_SIGMA, FIELD_SIGMA = np.radians(5.0), np.radians(2.0)
 WRONG_DEG = 0.5
-K1, K2 = -0.05, 0.01
 RIGHT, WRONG = "right", "wrong"
-
-
-def camera_model() -> EarthCameraModel:
-    """Return the campaign's camera."""
-    return EarthCameraModel.fuga15d(seed=1, k1=K1, k2=K2)
-
-
-def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
-    """Return the default settings with the camera's response, for one of `AIRS`."""
-    response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
-    settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
-    return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings
-
-
-def random_air(generator: np.random.Generator) -> Atmosphere:
-    """Return air thinner or thicker than the standard one, its limb some 2 km lower or higher."""
-    standard = Atmosphere()
-    return replace(
-        standard,
-        scale_height=generator.uniform(*SCALE_HEIGHTS),
-        optical_depth=standard.optical_depth * generator.uniform(*HAZE),
-    )
-
-
-def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> HorizonKnowledge:
-    """Return what a satellite in that scene would know, its coarse sensors' errors drawn."""
-    sun, field = scene.sun / np.linalg.norm(scene.sun), random_direction(generator)
-    sensed = tuple(
-        SensedDirection(misread(scene.camera_matrix @ true, sigma, generator), true, sigma)
-        for true, sigma in ((sun, SUN_SIGMA), (field, FIELD_SIGMA))
-    )
-    return HorizonKnowledge(position=scene.position, sun=sun, pole=scene.pole, sensed=sensed)
-
-
-def misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
-    """Return a direction (3,) as a coarse sensor of `sigma` rad an axis shows it."""
-    error = from_rotation_vector(sigma * generator.standard_normal(3))
-    return np.asarray(attitude_matrix(error) @ direction)
 
 
 def cases(runs: int, seed: int) -> list[Case]:

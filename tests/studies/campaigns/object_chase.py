@@ -26,9 +26,9 @@ from knightcube.gnc.control.three_axes.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
 from sim_hal.settings import TipOff
-from tests.studies.campaigns.first_orbits import circular, flow
 from tests.studies.campaigns.free_flight import FreeFlight
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, PointingFlight
+from tests.support.short_arcs import circular, flow
 
 NEAREST, END = 120.0, 210.0
 """s: when the object turns the line of sight by the rate that was drawn, and when the flight ends."""

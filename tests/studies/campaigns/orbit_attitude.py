@@ -20,12 +20,12 @@ from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, Estimate
-from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
 from tests.studies.campaigns.orbit_attitude_figures import WHENS, draw, line_of, variant_facts
-from tests.studies.campaigns.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
+from tests.support import orbit_world
 from tests.support.orbit_geometry import suite as suite_of
+from tests.support.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
 from tests.support.sensor_suite import SensorSuite
 
 SUITE = "uw"

@@ -38,14 +38,14 @@ from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_su
 from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.emulators.solar_cells import SolarCellsModel
-from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
-from tests.studies.campaigns.nadir import camera_model, finder_settings, random_air
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
-from tests.studies.campaigns.orbit_world import STEP, World
+from tests.support import orbit_world
+from tests.support.limb_frames import camera_model, finder_settings, random_air
 from tests.support.orbit_geometry import suite as suite_of
+from tests.support.orbit_world import STEP, World
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "level": {"suite": "uw", "turned": False, "period": 60.0},

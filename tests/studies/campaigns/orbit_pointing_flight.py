@@ -29,7 +29,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.control.three_axes import pointing_job
 from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
 from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw, damping_dipole
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
     GYRO,
@@ -37,7 +37,7 @@ from knightcube.gnc.estimation.free_filter import (
     FreeFilter,
     FreeFilterSettings,
 )
-from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, law_of, references
+from knightcube.gnc.guidance.three_axes.attitude_law import law_of, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from sim_hal.settings import Disturbances, TipOff
 from tests.studies.campaigns.free_flight import (
@@ -49,6 +49,7 @@ from tests.studies.campaigns.free_flight import (
     WATTS,
     FreeFlight,
 )
+from tests.support.pointing_settings import AXES, WEIGHTS
 
 CYCLE, PAUSE = 2.0, 0.2
 """s."""
@@ -61,19 +62,10 @@ COAST = 12.0
 """s with the coils at rest, while the attitude is made sure of."""
 STAR_SIGMA = 5e-5
 """rad an axis, 10"."""
-AXES = BodyAxes(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
 TARGETS = {
     "nadir": PointingTarget(Goal.NADIR, roll=0.0),
     "sun": PointingTarget(Goal.SUN),
     "inertial": PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0)),
-}
-WEIGHTS = {
-    "knightcube": PointingWeights(
-        turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(30.0), axis=AXES.pointing
-    ),
-    "cubesat_3u": PointingWeights(
-        turn=np.radians(1.0), rate=1.0, dipole=1.5e-3, roll=np.radians(3.0), axis=AXES.pointing
-    ),
 }
 SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
 """s of a slew, as the configurations have it."""

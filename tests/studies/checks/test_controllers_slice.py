@@ -10,6 +10,7 @@ from flight.schema import reader as configuration
 from sim_hal.settings import Thread
 from tests.studies.campaigns import controllers, step_robust
 from tests.support.flights import demo_config, demo_world
+from tests.support.ideal_power import clairvoyant_power
 
 
 @pytest.mark.parametrize(("stiffness", "milliwatts"), [(0.0, 3.81), (1e-5, 8.52), (2e-5, 25.05)])
@@ -19,7 +20,7 @@ def test_the_clairvoyant_optimum_is_the_one_that_was_computed_elsewhere(
     """Three threads, by Hermite-Simpson collocation and an interior-point solver: issue 2's definition."""
     thread = Thread(stiffness=stiffness, damping=2e-6 if stiffness else 0.0)
     world = configuration.replace(demo_world(), thread=thread)
-    power = controllers.clairvoyant_power(demo_config(700.0), world)
+    power = clairvoyant_power(demo_config(700.0), world)
     assert 1e3 * power == pytest.approx(milliwatts, abs=0.01)
 
 

@@ -17,8 +17,8 @@ from knightcube.vision.horizon.settings import HorizonKnowledge
 from knightcube.vision.sun import SunSettings, find_sun
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Status, begin
-from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_attitude import settings_of
+from tests.support.limb_frames import camera_model, finder_settings
 from tests.support.orbit_geometry import local_frame, suite
 from tests.support.sensor_suite import WideCamera
 

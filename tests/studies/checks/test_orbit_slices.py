@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import attitude_matrix
-from tests.studies.campaigns import coverage, orbit_attitude, orbit_attitude_figures, orbit_world
+from tests.studies.campaigns import coverage, orbit_attitude, orbit_attitude_figures
 from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.consistency import band
+from tests.support import orbit_world
 from tests.support.orbit_geometry import limb, limb_in_daylight, revolution, suite
 
 SEED = 20_261_121

@@ -16,7 +16,7 @@ from knightcube.astro.quaternion import (
 )
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, fit_in_image
-from tests.studies.bench.untold_lens import drawn
+from tests.knightcube.vision.startracker.unknown_lenses import drawn
 
 _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
 _ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
@@ -145,7 +145,7 @@ def test_stars_that_belong_elsewhere_are_no_attitude() -> None:
 
 
 def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
-    """Slices of the bench `untold_lens`: axis 25 px off the middle, distortion of 2 % at the corner."""
+    """The optical axis is 25 px off the image centre, and the distortion is 2 % at the corner."""
     squares, off = [], []
     for number in range(12):
         found, truth = drawn("poor", number)

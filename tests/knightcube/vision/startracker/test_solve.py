@@ -40,8 +40,8 @@ from knightcube.vision.startracker.solve import (
 )
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
-from tests.studies.bench.sky import ARCSECONDS, photograph
 from tests.support.attitude_errors import attitude_error
+from tests.support.photographs import ARCSECONDS, photograph
 
 _KNOWN_TO_A_PERCENT = 0.99, 1.01
 _PHOTOGRAPHS = Path(__file__).parents[5] / "shared" / "data" / "sky"

@@ -30,7 +30,6 @@ from knightcube.gnc.guidance.one_axis.vmc_program import (
 )
 from tests.flight.loop.passing import passed
 from tests.pace import ordinary_seconds
-from tests.studies.bench.plan import largest_ratio
 from tests.support.collocation_oracle import solve
 from tests.support.shortest_step import shortest_time
 from tests.support.step_problems import (
@@ -40,6 +39,7 @@ from tests.support.step_problems import (
     Problem,
     feasible_problems,
     known_optima,
+    largest_ratio,
     random_problems,
 )
 

@@ -7,7 +7,7 @@ import numpy as np
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.gnc.guidance.three_axes.slew_search import SlewSolver, guesses
 from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd
-from tests.studies.bench.orbit_slews import slews
+from tests.support.random_slews import slews
 
 
 def test_first_guesses_need_no_torque_along_the_field_end_in_the_target_and_keep_the_cones() -> None:

@@ -30,7 +30,7 @@ from knightcube.vision.streaks.geometry import Motion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
-from tests.studies.bench.centroids import compare, frame_of, matched, point_bound, star_places
+from tests.support.centroid_bound import compare, frame_of, matched, point_bound, star_places
 from tests.support.streak_bound import star_information
 
 SMALL = StarCameraModel(columns=320, rows=256, field_of_view=np.radians(6.25))

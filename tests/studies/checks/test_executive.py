@@ -6,13 +6,10 @@ control thread had no processor. Its lateness is judged only where the machine w
 
 from __future__ import annotations
 
-import ctypes
 import mmap
 import os
-import sys
 import time
 from array import array
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +19,7 @@ import pytest
 
 from flight.app import flight as opening
 from flight.app.composition import workers
-from flight.loop.executive import Worker
-from flight.loop.worker_processes import ProcessRunner
 from flight.schema import reader as configuration
-from hal.buses.clock import SystemClock
 from tests.hal.guardian.live_flight import ROOT
 from tests.studies.bench import bare_loop, busy_jobs
 from tests.studies.bench.executive import Load, fly
@@ -40,13 +34,12 @@ from tests.support.executive_figures import (
     waits,
 )
 from tests.support.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
-from tests.support.process_watch import MIB, Look
+from tests.support.process_watch import Look
 
 FIRST = 1000
 CALM = 0.05
 """Share of the time that the control thread is ready without a processor; beyond it the machine is busy."""
 _IN_TIME = np.full(12, 100_000)
-_kept: list[npt.NDArray[np.float64]] = []
 
 
 def _grid(late_ns: npt.ArrayLike) -> Grid:
@@ -184,51 +177,6 @@ def test_a_cycle_that_waits_is_blocked_and_one_without_a_processor_is_queued() -
 
     assert found(0.08, 0.0) == pytest.approx({"queued": 0.0, "blocked": 0.72}, abs=0.01)
     assert found(0.08, 0.8) == pytest.approx({"queued": 0.8, "blocked": 0.0}, abs=0.01)
-
-
-def fill_and_free(_: Any) -> tuple[int, float]:
-    """Allocate 48 MiB in pieces and free all but the last: the heap cannot shrink, as after a frame.
-
-    Returns this process and the bytes that it holds then.
-    """
-    pieces = [np.ones(8192) for _ in range(768)]
-    _kept.append(pieces.pop())
-    del pieces
-    return os.getpid(), process_watch.look({"me": os.getpid()}).memory["me"]
-
-
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="this libc has no malloc_trim")
-def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
-    with closing(
-        ProcessRunner(SystemClock(), [Worker("filler", fill_and_free, 0, 20_000_000_000)])
-    ) as runner:
-        deadline = time.monotonic() + 20.0
-        assert runner.submit("filler", None)
-        while not (results := runner.collect()) and time.monotonic() < deadline:
-            time.sleep(0.005)
-        process, held = results[0].value
-        rest = held
-        while rest > held - 40 * MIB and time.monotonic() < deadline:
-            time.sleep(0.01)
-            rest = process_watch.look({"filler": process}).memory["filler"]
-    assert rest <= held - 40 * MIB
-
-
-def heavy_parts(_: Any) -> list[str]:
-    """Import scipy and return which parts of numpy it brought that no job uses."""
-    import scipy.linalg  # noqa: F401, PLC0415 - in the worker's process
-
-    return [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]
-
-
-def test_a_worker_holds_no_parts_of_numpy_that_no_job_uses() -> None:
-    with closing(ProcessRunner(SystemClock(), [Worker("lean", heavy_parts, 0, 20_000_000_000)])) as runner:
-        deadline = time.monotonic() + 20.0
-        assert runner.submit("lean", None)
-        while not (results := runner.collect()) and time.monotonic() < deadline:
-            time.sleep(0.005)
-    assert results[0].value is not None
-    assert list(results[0].value) == []
 
 
 runs: list[Any] = []

@@ -15,7 +15,7 @@ from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
 from tests.studies.campaigns.campaign import Case
-from tests.support.flights import demo_world, event_names, fly
+from tests.support.flights import config_for, demo_world, event_names, fly
 
 AT = 5.0
 BRIEF = 14.0
@@ -90,7 +90,7 @@ def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any
     """The log of a flight whose unit falls silent, as if the loop had gone on: both figures ring."""
     entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
     section = configuration.replace(demo_world(), seed=3, faults=(entry,))
-    run = fly(faults.config_for("testbed-demo", camera=False), tmp_path, section=section)
+    run = fly(config_for("testbed-demo", camera=False, duration=BRIEF), tmp_path, section=section)
     kind = CATALOGUE["imu: silent"]
     sound = fault_judgement.judge(run, kind, entry)
     assert (sound["reaction_right"], sound["blind_current_a"]) == (True, 0.0)
@@ -121,13 +121,13 @@ def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
 def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_path: Any) -> None:
     """The same seed and mode as the flights with faults above; the two other modes are below."""
     section = configuration.replace(demo_world(), seed=3)
-    run = fly(faults.config_for(mode, camera=False), tmp_path, section=section)
+    run = fly(config_for(mode, camera=False, duration=BRIEF), tmp_path, section=section)
     assert not set(event_names(run)) & frozenset().union(*fault_table.OWN.values(), {"stream-poor"})
 
 
 @pytest.mark.parametrize("mode", ["detumble", "slew"])
 def test_a_sound_flight_is_quiet_in_its_mode(mode: str, tmp_path: Any) -> None:
-    run = fly(faults.config_for(mode, camera=False), tmp_path)
+    run = fly(config_for(mode, camera=False), tmp_path)
     reported = set(event_names(run)) - {"started", "stopped", "target", "mode", "commanded", "plan-stretched"}
     assert reported == set()
 

@@ -1,6 +1,6 @@
 """Every field of every packet, read by `space-packet-parser` from our XTCE and by our own reader.
 
-`python -m tests.studies.interop.fields RUN...` prints how many fields of the runs' logs are equal; exit
+`python -m tests.support.xtce_fields RUN...` prints how many fields of the runs' logs are equal; exit
 status 1 when one differs, when a packet is not read, or when a shifted field is not noticed.
 """
 
@@ -100,7 +100,7 @@ def logs_of(run: Path) -> bytes:
 
 def main() -> int:
     """Print the comparison of each run."""
-    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.fields", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.support.xtce_fields", description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     sound = True
     for run in parser.parse_args().runs:

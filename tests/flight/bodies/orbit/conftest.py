@@ -1,0 +1,18 @@
+"""Fixtures of the tests of the orbiting body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.guidance.three_axes.attitude_law import references
+from tests.knightcube.gnc.control.three_axes.pointing_cases import INERTIA, LAW, ORBIT, STEP, WEIGHTS
+
+
+@pytest.fixture(scope="module")
+def table() -> PointingTable:
+    """Return a table of the nadir pointing law."""
+    times = STEP * np.arange(1.0, 20.0)
+    wanted = references(LAW, ORBIT, times)
+    return table_along(wanted, ORBIT.field_at(times), ORBIT.position_at(times), INERTIA, WEIGHTS)

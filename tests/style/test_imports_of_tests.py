@@ -1,0 +1,55 @@
+"""Imports among tests: product tests share helper modules, and import neither studies nor other tests."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+def forbidden(module: str, path: str) -> bool:
+    """Return whether the file `path` below `tests` may not import `module`."""
+    study = module == "tests.studies" or module.startswith("tests.studies.")
+    return (study and not path.startswith("studies/")) or any(
+        part.startswith("test_") for part in module.split(".") if module.startswith("tests.")
+    )
+
+
+def imports(source: str) -> list[str]:
+    """Return the modules that a source imports; `from a import b` counts as `a` and as `a.b`."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("module", "path", "refused"),
+    [
+        ("tests.studies.mutants", "flight/test_a.py", True),
+        ("tests.studies", "support/flights.py", True),
+        ("tests.studies.mutants", "studies/checks/test_mutants.py", False),
+        ("tests.flight.test_a", "hal/test_b.py", True),
+        ("tests.flight.test_a.CASES", "studies/campaigns/faults.py", True),
+        ("tests.support.flights", "flight/test_a.py", False),
+        ("numpy.testing.test_a", "flight/test_a.py", False),
+    ],
+)
+def test_studies_and_test_modules_are_refused(module: str, path: str, refused: bool) -> None:
+    assert forbidden(module, path) is refused
+
+
+def test_no_test_imports_a_study_or_another_test() -> None:
+    wrong = [
+        f"{path.relative_to(TESTS)}: {module}"
+        for path in sorted(TESTS.rglob("*.py"))
+        for module in imports(path.read_text(encoding="utf-8"))
+        if forbidden(module, path.relative_to(TESTS).as_posix())
+    ]
+    assert not wrong, "move what is shared to tests/support or to a helper module"

@@ -1,0 +1,38 @@
+"""Passes of objects over a satellite, integrated with J2, for orbit determination."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from knightcube.astro.arrays import FloatArray
+
+EARTH, FLATTENING, EQUATOR, LIGHT = 3.986004418e14, 1.0826359e-3, 6_378_136.6, 299_792_458.0
+"""SI: the gravity of the Earth, J2 and its radius; the speed of light."""
+
+
+def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
+    """Return a state over `place`, across it, at a speed over the circular one."""
+    up = place / np.linalg.norm(place)
+    ahead = np.cross(up, rng.normal(size=3))
+    ahead /= np.linalg.norm(ahead)
+    return np.concatenate([radius * up, np.sqrt(EARTH / radius) * speed * ahead])
+
+
+def flown_states(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
+    """Return states (n, 6) at times of the one at `times[middle]`."""
+    parts = []
+    for sense in (times[middle::-1], times[middle:]):
+        found = solve_ivp(
+            flow, (sense[0], sense[-1]), state, t_eval=sense, method="DOP853", rtol=1e-12, atol=1e-6
+        )
+        parts.append(found.y.T)
+    return np.concatenate([parts[0][:0:-1], parts[1]])
+
+
+def flow(_: float, state: FloatArray) -> FloatArray:
+    x, y, z = state[:3]
+    square = x * x + y * y + z * z
+    flat = 1.5 * FLATTENING * EQUATOR**2 / square
+    share = np.array([1.0, 1.0, 3.0]) - 5.0 * z * z / square
+    return np.concatenate([state[3:], -EARTH / square**1.5 * state[:3] * (1.0 + flat * share)])
