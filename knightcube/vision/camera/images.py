@@ -4,17 +4,16 @@
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
     write_picture(Path("found.png"), grey_stretch(pixels))
 
-Row 0 is the file's first row. FITS viewers show it at the bottom, other viewers at the top; confusing them
-mirrors the sky. The orientation in a photograph's EXIF data is ignored.
+Row 0 is the first row of the file. FITS viewers show it at the bottom, other viewers at the top; confusing
+them mirrors the sky. The orientation in the EXIF data of a photograph is ignored.
 
 The FITS reader follows FITS Standard 4.0, sections 3, 4.4.1 and 5. It reads the primary image with BITPIX 8,
 16, 32, -32 or -64, two axes, BZERO, BSCALE and BLANK. It rejects extensions, tables, compressed images and
 cubes.
 
-Keeps the newest frames on disk with what was found in them; the vision worker does it.
-
-A file is a PGM (Netpbm), which any image program opens: grey counts of 8 or 16 bits as the camera gave them,
-and before them, as comments, what was found, in JSON. A disk that takes nothing costs the frame alone.
+The vision worker keeps its newest frames on disk (`keep_frame`). A file is a PGM (Netpbm), which any image
+program opens: a comment with facts about the frame, in JSON, and grey counts of 8 or 16 bits as the camera
+gave them.
 """
 
 from __future__ import annotations
@@ -48,10 +47,10 @@ UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
 
 
 def primary_image(content: bytes, name: str) -> Image:
-    """Return the image (rows, columns) of a FITS file's `content`, row 0 the file's first.
+    """Return the image (rows, columns) of the `content` of a FITS file; row 0 is the first of the file.
 
-    Whole numbers without a scale keep their type; shifted unsigned 16 and 32-bit numbers become unsigned; any
-    other scale gives float64. Raises UsageError, with `name`, for other content.
+    Integers without a scale keep their type, shifted unsigned numbers of 16 and 32 bits become unsigned, and
+    any other scale gives float64. Raises UsageError, with `name`, for other content.
     """
     header, start = _header(content, name)
     bits = _whole(header, "BITPIX", name)
@@ -86,7 +85,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
 
 
 def _header(content: bytes, name: str) -> tuple[dict[str, str], int]:
-    """Return the cards' values as text, without their comments, and where the pixels begin."""
+    """Return the values of the cards as text, without comments, and the position of the first pixel."""
     header: dict[str, str] = {}
     for place in range(0, len(content) - CARD + 1, CARD):
         card = content[place : place + CARD].decode("ascii", errors="replace")
@@ -104,7 +103,7 @@ def _whole(header: dict[str, str], keyword: str, name: str) -> int:
     except KeyError:
         raise UsageError(f"{name}: its FITS header has no {keyword}") from None
     except ValueError:
-        raise UsageError(f"{name}: {keyword} = {header[keyword]!r} is no whole number") from None
+        raise UsageError(f"{name}: {keyword} = {header[keyword]!r} is not an integer") from None
 
 
 def _real(header: dict[str, str], keyword: str, otherwise: float, name: str) -> float:
@@ -114,7 +113,7 @@ def _real(header: dict[str, str], keyword: str, otherwise: float, name: str) -> 
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise UsageError(f"{name}: {keyword} = {header[keyword]!r} is no number")
+        raise UsageError(f"{name}: {keyword} = {header[keyword]!r} is not a number")
     return value
 
 
@@ -155,9 +154,9 @@ def read_image(path: Path) -> Image:
 
 
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
-    """Return the image (rows, columns) of a file of bare pixels, row by row: 8 bits, or 16 little-endian.
+    """Return the image (rows, columns) of a file of raw pixels, row by row, of 8 bits or 16 little-endian.
 
-    Any header before the pixels is skipped: the file's last bytes count.
+    Any header before the pixels is skipped: the last bytes of the file are used.
     Raises UsageError when the file is missing or too short.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
@@ -175,7 +174,7 @@ def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
 
 
 def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDArray[np.uint8]:
-    """Return a grey picture (rows, columns, 3), red, green, blue, to draw on.
+    """Return a grey image (rows, columns, 3) of red, green and blue, to draw on.
 
     The `low`th percentile of the pixels becomes black and the `high`th white. Raises UsageError unless
     0 <= low < high <= 100.
@@ -210,7 +209,7 @@ def _through_pillow(path: Path) -> Image:
     except ImportError as error:
         raise UsageError(f"{path}: {', '.join(FORMATS)} need Pillow: {EXTRA}") from error
     try:
-        # Its warnings concern metadata, which is not used here; damaged pixels raise.
+        # The warnings concern metadata, which is not used; damaged pixels raise.
         with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
             _check_kept(path, picture)
             if _is_deep(picture):
@@ -221,16 +220,16 @@ def _through_pillow(path: Path) -> Image:
             picture.load()
             return _grey(path, picture)
     except UnidentifiedImageError as error:
-        raise UsageError(f"{path}: is no {', '.join(FORMATS)} or FITS image: convert it to one") from error
+        raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
         raise UsageError(f"{path}: has too many pixels: {error}") from error
-    # What Pillow's readers raise on damaged files.
+    # The exceptions that Pillow raises for damaged files.
     except (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
         raise UsageError(f"{path}: is damaged: {error}") from error
 
 
 def _check_kept(path: Path, picture: Picture) -> None:
-    """Raise UsageError for images that Pillow would misread: 16-bit colour cut to 8, inverted grey."""
+    """Raise UsageError for images that Pillow misreads: truncated 16-bit colour, inverted grey."""
     deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
     if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
         raise UsageError(f"{path}: its 16-bit colour is not read: convert it to 16-bit grey")
@@ -240,18 +239,18 @@ def _check_kept(path: Path, picture: Picture) -> None:
 
 
 def _raw_mode(args: object) -> str:
-    """Return how Pillow unpacks a tile: the first of its decoder's arguments."""
+    """Return the raw mode of a tile: the first argument of its decoder."""
     return str(args[0]) if isinstance(args, tuple) and args else str(args)
 
 
 def _is_deep(picture: Picture) -> bool:
-    """Return whether it holds red, green and blue of 16 bits, of which Pillow keeps the high ones."""
+    """Return whether an image has 16-bit colours, of which Pillow keeps the high bytes."""
     modes = {_raw_mode(tile[3]) for tile in getattr(picture, "tile", ())}
     return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the decoder's arguments that take the other byte of each pair."""
+    """Return the arguments of the decoder that select the other byte of each pair."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 
@@ -268,13 +267,13 @@ def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
 def _grey(path: Path, picture: Picture) -> Image:
     mode = picture.mode
     if mode in COLOUR_MODES:
-        # Through RGB: Pillow has no direct way from all of them. Transparency is dropped.
+        # Pillow cannot convert all of these modes directly. Transparency is dropped.
         return np.asarray(picture.convert("RGB").convert("L"))
     if mode in GREY_MODES:
         grey = picture.convert("L") if mode == "1" else picture
         return np.asarray(grey).astype(GREY_MODES[mode])
     if mode == "I":
-        # 32 bits, but often of numbers that fit into 16.
+        # The numbers of 32 bits often fit into 16.
         pixels = np.asarray(picture)
         if pixels.min() >= 0 and pixels.max() <= np.iinfo(np.uint16).max:
             return pixels.astype(np.uint16)
@@ -287,7 +286,7 @@ KEPT_FRAMES_FOLDER = "frames"
 
 @dataclass(frozen=True, slots=True)
 class KeptFrames:
-    """Where frames are kept, and how many; `name` is that of one frame's file, without its ending."""
+    """The folder of kept frames, their maximum number, and the file name of one frame, without its suffix."""
 
     folder: Path
     most: int
@@ -295,7 +294,10 @@ class KeptFrames:
 
 
 def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
-    """Write a frame (rows, columns) and what was found in it; delete the oldest beyond the number."""
+    """Write a frame (rows, columns) with facts about it, and delete the oldest frames beyond the maximum.
+
+    An error of the disk loses the frame without an exception.
+    """
     with suppress(OSError):
         kept.folder.mkdir(exist_ok=True)
         beside = kept.folder / "frame~"
@@ -306,7 +308,7 @@ def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
 
 
 def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
-    """Return the bytes of a PGM of whole counts, 16 bits where 8 do not hold them."""
+    """Return the bytes of a PGM of integer counts, of 8 or 16 bits, with facts as a comment."""
     deep = pixels.dtype.itemsize > 1
     rows, columns = pixels.shape
     text = json.dumps(facts)
@@ -315,7 +317,7 @@ def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
 
 
 def facts_of(data: bytes) -> dict[str, Any]:
-    """Return what stands in a frame's file beside the picture. Raises ValueError where nothing does."""
+    """Return the facts in the file of a kept frame. Raises ValueError if the file is not one."""
     head, _, rest = data.partition(b"\n# ")
     if head != b"P5":
         raise ValueError("no kept frame")

@@ -8,7 +8,7 @@ The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 
 (Brown 1966, radial terms). Beyond the tangent where the distorted radius stops growing the polynomial folds
 back on itself. The lens images nothing there, and a lens that folds within its own detector is rejected.
 
-How long to expose: stars that streak should do so over enough pixels to tell their rate.
+`Exposures` gives the exposure at which streaks are long enough for an accurate rate.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Pinhole:
 
     @classmethod
     def from_field_of_view(cls, columns: int, rows: int, field_of_view: float) -> Pinhole:
-        """Return the camera whose columns span `field_of_view` rad, edge to edge (Sease 2.4)."""
+        """Return the camera whose columns span `field_of_view`, rad, edge to edge (Sease 2.4)."""
         return cls(columns, rows, 0.5 * columns / np.tan(0.5 * field_of_view))
 
     @property
@@ -68,7 +68,7 @@ class Pinhole:
         return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Tell which pixels (n, 2) lie on the detector, widened by `margin` pixels; NaN does not."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; NaN does not."""
         x, y = points[..., 0], points[..., 1]
         inside_x = (x >= -0.5 - margin) & (x <= self.columns - 0.5 + margin)
         inside_y = (y >= -0.5 - margin) & (y <= self.rows - 0.5 + margin)
@@ -76,35 +76,34 @@ class Pinhole:
 
     @property
     def half_diagonal(self) -> float:
-        """The angle in rad from the boresight to the detector's corner."""
+        """The angle from the boresight to a corner of the detector, rad."""
         return float(np.arctan(0.5 * np.hypot(self.columns, self.rows) / self.focal_length))
 
 
-_MOST_STEPS = 60
-# Newton's error is of the order of its last step's square: 1e-8 in tangent leaves rounding.
-_LAST_STEP = 1e-8
-# A fold at a tangent of a million is ignored.
+_MOST_STEPS, _LAST_STEP = 60, 1e-8
+"""Largest number of Newton steps, and the last step in tangent: the error is about its square."""
 _NO_FOLD = 1e-12
+"""Least denominator of a fold: a fold at a tangent of a million is ignored."""
 
 
 class LensError(FlightError):
-    """An impossible lens: no size, or a distortion that cannot be inverted."""
+    """A lens without size, or with a distortion that cannot be inverted."""
 
 
 class CameraModel(Protocol):
-    """The interface of `Pinhole` and `Lens`: directions to pixels and back."""
+    """The interface of `Pinhole` and `Lens`, which convert between directions and pixels."""
 
     @property
     def columns(self) -> int:
-        """Pixels in a row."""
+        """The number of pixels in a row."""
 
     @property
     def rows(self) -> int:
-        """Pixels in a column."""
+        """The number of pixels in a column."""
 
     @property
     def focal_length(self) -> float:
-        """Pixels."""
+        """The focal length, px."""
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -112,23 +111,23 @@ class CameraModel(Protocol):
 
     @property
     def half_diagonal(self) -> float:
-        """The angle in rad from the boresight to the farthest corner."""
+        """The angle from the boresight to the farthest corner, rad."""
 
     @property
     def ideal(self) -> Pinhole:
-        """The pinhole of the same focal length, its axis in the middle."""
+        """The pinhole camera of the same focal length with its axis in the image centre."""
 
     def rescaled(self, factor: float) -> Self:
         """Return the camera with its focal length multiplied by `factor`."""
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN where none is seen."""
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN if they are not imaged."""
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
         """Return unit vectors (n, 3) in the camera frame of pixels (n, 2)."""
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` pixels."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +135,13 @@ class Lens:
     """A camera of `columns` x `rows` pixels with radial distortion.
 
     Attributes:
-        focal_length: px, of the axis.
-        centre: the pixel (x, y) of the optical axis.
-        k1, k2: of the second and the fourth power of the undistorted tangent.
-        reach: the largest tangent that is imaged, infinite where the distortion never folds.
+        focal_length: focal length on the axis, px.
+        centre: pixel (x, y) of the optical axis.
+        k1, k2: coefficients of the second and the fourth power of the undistorted tangent.
+        reach: largest tangent that is imaged; infinite if the distortion never folds.
 
-    Raises LensError when the distortion cannot be inverted over the whole detector.
+    Raises:
+        LensError: if the distortion cannot be inverted over the whole detector.
     """
 
     columns: int
@@ -176,7 +176,7 @@ class Lens:
         return cls(camera.columns, camera.rows, camera.focal_length, camera.centre)
 
     def to_mapping(self) -> dict[str, int | float | list[float]]:
-        """Return the lens as plain numbers for a YAML file: pixels, and k1, k2 of tangents."""
+        """Return the lens as plain numbers for a YAML file: lengths in pixels, k1 and k2 of tangents."""
         return {
             "columns": int(self.columns),
             "rows": int(self.rows),
@@ -188,7 +188,7 @@ class Lens:
 
     @property
     def ideal(self) -> Pinhole:
-        """The pinhole of the same focal length, its axis in the middle."""
+        """The pinhole camera of the same focal length with its axis in the image centre."""
         return Pinhole(self.columns, self.rows, self.focal_length)
 
     def rescaled(self, factor: float) -> Lens:
@@ -196,7 +196,7 @@ class Lens:
         return replace(self, focal_length=self.focal_length * factor)
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN behind it or beyond reach."""
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN if they are not imaged."""
         v = np.asarray(vectors, dtype=float)
         z = v[..., 2:]
         tangent = v[..., :2] / np.where(z > 0.0, z, np.nan)
@@ -206,7 +206,7 @@ class Lens:
         return np.asarray(self.focal_length * stretched + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2); NaN beyond the image's edge."""
+        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2); NaN if they are not imaged."""
         stretched = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
         radius = np.hypot(stretched[..., :1], stretched[..., 1:])
         square = self._undistorted(radius) ** 2
@@ -216,12 +216,12 @@ class Lens:
         return np.asarray(v / np.sqrt(1.0 + square))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` pixels; NaN does not."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; NaN does not."""
         return Pinhole(self.columns, self.rows, self.focal_length).contains(points, margin)
 
     @property
     def half_diagonal(self) -> float:
-        """The angle in rad from the boresight to the detector's farthest corner."""
+        """The angle from the boresight to the farthest corner of the detector, rad."""
         return float(np.arccos(np.min(self.unit_vectors(self._corners())[:, 2])))
 
     def _corners(self) -> FloatArray:
@@ -229,21 +229,21 @@ class Lens:
         return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
-        """Return the stretched tangent at the reach: the image's edge."""
+        """Return the distorted tangent at the reach: the edge of the image."""
         square = self.reach**2
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the undistorted tangents, any shape; NaN beyond the image's edge.
+        """Return the undistorted tangents (...) of distorted ones; NaN beyond the edge of the image.
 
-        Newton's method from the distorted tangent, or from the curve's inflection if that is nearer the axis:
-        from there it passes the root at most once and then approaches it from one side.
+        Newton's method starts at the distorted tangent, or at the inflection of the curve if that is nearer
+        to the axis: from there it passes the root at most once and then approaches it from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:
             return stretched
         seen = stretched < self._limit()
-        # A NaN must not affect when the iteration stops.
+        # A NaN must not affect the end of the iteration.
         target = np.where(seen, stretched, 0.0)
         inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
         radius = np.minimum(target, inflection)
@@ -260,7 +260,7 @@ class Lens:
 
 
 def _reach(k1: float, k2: float) -> float:
-    """Return the least tangent where r (1 + k1 r^2 + k2 r^4) stops growing: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+    """Return the least tangent at which the distorted one stops growing: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf
@@ -286,9 +286,9 @@ class MountedCamera:
     """A lens and its mounting.
 
     Attributes:
-        lens: pixels to directions in the camera's axes.
-        mounting: quaternion (4,), body into camera.
-        to_camera: the matrix (3, 3) of that.
+        lens: the camera model.
+        mounting: attitude of the camera (4,), body into camera axes.
+        to_camera: its rotation matrix (3, 3).
     """
 
     lens: CameraModel
@@ -315,15 +315,16 @@ common."""
 
 @dataclass(frozen=True, slots=True)
 class CameraKnowledge:
-    """Standard deviations of a camera about its description; 0 where the description is exact.
+    """Standard deviations of the true camera from its description; 0 if the description is exact.
 
     The defaults hold for a camera without calibration whose field of view is correct.
 
     Attributes:
-        focal_length: share of itself.
-        centre: px, of the optical axis along x and along y.
-        distortion: share of its radius by which a corner may be displaced.
-        line_time: s from one row's exposure to the next's; None: exact where it is stated, else `UNSTATED`.
+        focal_length: relative standard deviation of the focal length.
+        centre: standard deviation of the optical axis along x and along y, px.
+        distortion: standard deviation of the displacement of a corner, relative to its radius.
+        line_time: standard deviation of the delay between the exposures of successive rows, s. None: 0 if
+            the delay is stated, otherwise `UNSTATED`.
     """
 
     focal_length: float = 0.0
@@ -336,20 +337,20 @@ EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
 """Knowledge of a camera that equals its description, such as an emulated camera."""
 
 
-STREAK = 20.0
-"""Wanted streak length (px): rates are poor below 5 px, and faint stars are lost above 100 px."""
-POINT = 1.0
+_STREAK = 20.0
+"""Desired streak length (px): rates are poor below 5 px, and faint stars are lost above 100 px."""
+_POINT = 1.0
 """Motion in the usual exposure (px) below which a star is a point."""
 
 
 @dataclass(frozen=True, slots=True)
 class Exposures:
-    """The exposures of a camera.
+    """The exposure times of a camera.
 
     Attributes:
-        usual: s, of points.
-        least, most: s, of streaks.
-        scale: px by rad.
+        usual: exposure for points, s.
+        least, most: range of the exposures for streaks, s.
+        scale: scale of the image, px per rad.
     """
 
     usual: float
@@ -358,8 +359,8 @@ class Exposures:
     scale: float
 
     def at(self, rate: float) -> float:
-        """Return the exposure, s, while the camera turns at `rate` rad/s across its boresight."""
+        """Return the exposure, s, at an angular rate, rad/s, across the boresight."""
         speed = rate * self.scale
-        if speed * self.usual < POINT:
+        if speed * self.usual < _POINT:
             return self.usual
-        return min(max(STREAK / speed, self.least), self.most)
+        return min(max(_STREAK / speed, self.least), self.most)

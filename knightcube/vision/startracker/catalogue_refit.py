@@ -1,11 +1,11 @@
-"""Refits the streaks of an identified frame with all stars of the catalogue, the unseen ones too.
+"""Refits the streaks of an identified frame with all stars of the catalogue, including faint ones.
 
 In long streaks most stars are below the noise of a pixel, yet their light overlaps the bright streaks and
-shifts them; close pairs are taken for one star. Once a frame is identified, the catalogue gives the places of
-all stars and, scaled by the light of those found, their brightness. The light of stars too faint, or too near
-to a brighter star, to be fitted is subtracted from the frame, with the uncertainty of the catalogue's
-magnitudes for the camera's colours; the others are fitted from their true places. Objects found that are not
-in the catalogue are fitted but do not affect the motion.
+shifts them; a close pair is measured as one star. Once a frame is identified, the catalogue gives the
+positions of all stars and, scaled by the light of the measured stars, their brightness. The light of stars
+too faint, or too near to a brighter star, to be fitted is subtracted from the frame, with the uncertainty of
+the catalogue's magnitudes for the camera's colours; the others are fitted from their true places. Objects
+found that are not in the catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations
@@ -43,25 +43,26 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Reaches: streaks closer than this to a bright one overlap its pixels.
+# Distance, in reaches of the fit, within which a streak overlaps the pixels of a bright one.
 _NEAR = 1.4
-# px: closer stars are not fitted separately.
+# Distance (px) below which two stars are not fitted separately.
 _TWIN = 2.0
-# A found star is a catalogue star that is within this distance, px, and has at least this share of its light.
+# Largest distance (px) of a measured star from its catalogue star, and the least ratio of their light.
 _SAME, _ALIKE = 5.0, 0.3
-# So many px beside the streak of such a star, and along it, a found star is a piece of that streak.
+# Distance (px) from the streak of a catalogue star within which a measured star is a segment of that streak.
 _BESIDE = 2.5
-# Relative error of a star's light as the catalogue predicts it.
+# Relative error of the light of a star as the catalogue predicts it.
 _LIGHT_ERROR = 0.15
-# Stars whose pixels are held at a time while their light is subtracted.
+# Number of stars whose light is subtracted at once.
 _AT_ONCE = 25
-# Instants at which a star is tested to be in the frame.
+# Number of instants at which a star is tested for being in the frame.
 _INSTANTS = 9
-# Pixels that the second fit looks at, in those of the first: places of faint stars are wanted, too.
+# Ratio of the number of pixels of the second fit to that of the first, because faint stars are fitted too.
 _ROOM = 1.7
-# Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are different motions.
+# Chi-square with 3 degrees of freedom, exceeded by chance once in 100,000: larger differences are different
+# motions.
 _ONE_MOTION = 25.9
-# px: added to the uncertainty of the previous attitude.
+# Increase (px) of the uncertainty of the previous attitude.
 _PRIOR_PX = 1.0
 
 
@@ -75,11 +76,11 @@ def refit_with_catalogue(
     """Return `solution` with motion and attitude refitted; unchanged if the refit fails.
 
     Args:
-        pixels: (rows, columns), the solved frame.
-        solution: of a frame of streaks; one whose scale was fitted is returned unchanged.
+        pixels: the solved frame (rows, columns).
+        solution: solution of a frame of streaks; a solution with a fitted scale is returned unchanged.
         sky: the guide stars.
-        settings: with which it was solved.
-        likelihood: settings of the streaks' fit.
+        settings: settings with which the frame was solved.
+        likelihood: settings of the fit of the streaks.
     """
     motion, fix = solution.motion, solution.fix
     if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:
@@ -103,8 +104,8 @@ def refit_motion(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
-    """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
-    # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
+    """Return `motion` refitted with all catalogue stars; None if the fit fails or gives another rate."""
+    # Under a rolling shutter an ambiguous rate lies between two motions and is no start of a fit.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
@@ -127,7 +128,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # What there was no room for is known from the catalogue: no fit of fewer streaks is better for it.
+    # The stars that were not fitted are known from the catalogue, so no fit of fewer streaks is better.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
@@ -149,7 +150,7 @@ def refit_motion(
 
 
 def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
-    """Return the course over the exposure by the mean `rate` (3,) rad/s and what else `motion` has found."""
+    """Return the rotation over the exposure from the mean `rate` (3,), rad/s, and the terms of `motion`."""
     exposure = motion.exposure
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
@@ -158,9 +159,12 @@ def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """Stars of the catalogue: `places` (n, 2) px at mid-exposure, `light` (n,) counts over the exposure.
+    """Catalogue stars in and around a frame.
 
-    `inside` (n,) is the part of the path that lies in the frame.
+    Attributes:
+        places: positions at mid-exposure (n, 2), px.
+        light: light over the exposure (n,), counts.
+        inside: fraction of the path that lies in the frame (n,).
     """
 
     places: FloatArray
@@ -171,7 +175,7 @@ class _Known:
     def seen(
         cls, pinhole: Pinhole, course: Motion, places: FloatArray, light: FloatArray, most: int
     ) -> _Known:
-        """Return at most `most` of stars (n, 2), (n,) that are in the frame, the most light in it first."""
+        """Return the stars in the frame, at most `most`, those with the most light in it first."""
         n = len(places)
         time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
         there = positions(pinhole, course, np.repeat(places, _INSTANTS, axis=0), time)
@@ -181,7 +185,7 @@ class _Known:
         return cls(places[order], light[order], inside[order])
 
     def twins(self) -> BoolArray:
-        """Return which have a brighter star too near to be fitted separately."""
+        """Return which stars (n,) have a brighter star too near to be fitted separately."""
         order = np.argsort(self.places[:, 0], kind="stable")
         fainter = np.zeros(len(order), dtype=np.bool_)
         for places_on in range(1, len(order)):
@@ -202,7 +206,7 @@ def _known_stars(
     course: Motion,
     most: int,
 ) -> _Known | None:
-    """Return the stars in the frame; None if no fitted star was identified, which scales their light."""
+    """Return the stars in the frame; None if no fitted star was identified, whose light gives the scale."""
     matched = solution.matched
     apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
     fitted = apart.argmin(axis=1)
@@ -224,7 +228,7 @@ def _known_stars(
 def _scenes(
     camera: ExposedCamera, course: Motion, known: _Known, motion: MotionResult
 ) -> tuple[Scene, Scene]:
-    """Return the stars to be fitted, the brightest trusted, and those whose light is only subtracted."""
+    """Return the stars to fit, of which the brightest are trusted, and the stars to subtract."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
@@ -250,9 +254,9 @@ def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, 
 
 
 def _foreign(pinhole: Pinhole, course: Motion, motion: MotionResult, known: _Known) -> IntArray:
-    """Return which stars found are not in the catalogue: it has no such light at their place.
+    """Return which measured stars are not in the catalogue, neither at their position nor along their streak.
 
-    Nor on their streak: the first fit may have made two stars of a bright one, one behind the other.
+    The first fit may have split a bright star into two, one behind the other.
     """
     near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
     polar, azimuth = circles(pinhole, course, motion.stars)
@@ -264,13 +268,13 @@ def _foreign(pinhole: Pinhole, course: Motion, motion: MotionResult, known: _Kno
 
 
 def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
-    """Return which streaks (n, 2, 2) px are none of those with `ends` (m, 2, 2)."""
+    """Return which streaks (n, 2, 2), px, differ from all streaks with `ends` (m, 2, 2), px."""
     worst = np.linalg.norm(faint[:, None] - ends, axis=-1).max(axis=-1)
     return np.asarray((worst > _SAME).all(axis=1))
 
 
 def _without(camera: ExposedCamera, hidden: Scene) -> ExposedFrame:
-    """Return the frame less the light of `hidden` stars, and as much noisier as that is uncertain."""
+    """Return the frame without the light of `hidden` stars, with their uncertainty added to its noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

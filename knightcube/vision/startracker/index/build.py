@@ -1,8 +1,8 @@
-"""Make the sky index: python -m knightcube.vision.startracker.index.build [--output FILE].
+"""Builds the sky index: python -m knightcube.vision.startracker.index.build [--output FILE].
 
-The default index is made on first use, in some seconds, and kept in the cache folder: $XDG_CACHE_HOME, or
-~/.cache, /knightcube. On board the installer makes it, and the configuration names its path.
-`python -m flight index --camera CONFIG` makes one for a mission's camera.
+The default index is built at the first use, in some seconds, and kept in the cache folder
+$XDG_CACHE_HOME/knightcube or ~/.cache/knightcube. On board the installer builds it, and the configuration
+names its path. `python -m flight index --camera CONFIG` builds the index for the camera of a mission.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class IndexSettings:
 
     Attributes:
         faintest: V of the faintest guide star.
-        epoch: Julian year of the directions; `SkyIndex.at` moves them to another.
-        resolution: rad, below which two stars are seen as one.
-        smallest, largest: rad, longest sides of the triangles.
-        density: number of stars that count as bright within 2.5 deg of a triangle of that size; larger for
-            larger ones, so that every octave of size has about as many triangles.
-        few: brightest stars of any circle whose triangles are in the index.
+        epoch: Julian year of the directions; `SkyIndex.at` changes it.
+        resolution: angle below which two stars are merged, rad.
+        smallest, largest: range of the longest sides of the triangles, rad.
+        density: number of stars that count as bright around a triangle of 2.5 deg. It is larger for larger
+            triangles, so that every octave of size has about the same number of triangles.
+        few: number of the brightest stars of any circle whose triangles are in the index.
     """
 
     faintest: float = 8.5
@@ -55,9 +55,9 @@ class IndexSettings:
 
     @classmethod
     def of_field(cls, fov: float, pixel: float | None = None) -> IndexSettings:
-        """Return the settings for a camera of `fov` rad across, its pixels `pixel` rad wide if given.
+        """Return the settings for a camera with a field of view `fov`, rad, and pixels of `pixel`, rad.
 
-        Raises UsageError for a field below 2 or above 120 deg.
+        Raises UsageError for a field of view below 2 or above 120 deg.
         """
         if not _NARROWEST <= fov <= _WIDEST:
             raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index serves 2 to 120 deg")
@@ -67,8 +67,9 @@ class IndexSettings:
 
 
 _NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
-# Of the largest triangle of a field: the smallest; and pixels between two stars that are seen as two.
+# Ratio of the smallest to the largest triangle of a field.
 _SMALLEST_SHARE = 0.2
+# Distance (px) of two stars that an image resolves.
 _RESOLVED_PIXELS = 2.5
 _MOST_STARS = 1 << 16
 DEFAULT = IndexSettings()
@@ -77,7 +78,7 @@ _REFERENCE_SIZE = float(np.deg2rad(2.5))
 
 
 def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
-    """Return the index of the catalogue's stars. Raises UsageError for too many or too few of them."""
+    """Return the index of the catalogue. Raises UsageError if it would hold too many or too few stars."""
     stars = catalogue.load()
     guide_stars = choose_guide_stars(stars, settings.faintest, settings.epoch, settings.resolution)
     if not 3 <= len(guide_stars) <= _MOST_STARS:
@@ -93,7 +94,7 @@ def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
 
 
 def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
-    """Return the change (n, 3) float32, rad/yr, of guide stars: that of the star whose number each bears."""
+    """Return the proper motion (n, 3), float32, rad/yr, of guide stars, by their Hipparcos numbers."""
     source = catalogue.load()
     order = np.argsort(source.hip)
     place = order[np.searchsorted(source.hip, stars.hip, sorter=order)]
@@ -102,38 +103,40 @@ def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
 
 
 def ensure_default_index() -> None:
-    """Make the default index now if it is missing, so that no flight waits for it."""
+    """Build the default index if it is missing, so that no flight waits for it."""
     if not PATH.exists():
         default_index()
 
 
 @cache
 def default_index() -> SkyIndex:
-    """Return the default index, read once a process; made and kept in the cache folder if missing."""
+    """Return the default index, read once per process; it is built and stored if it is missing."""
     path = PATH
     try:
         return load(path)
     except InputError:
-        sys.stderr.write(f"making the index of the sky, once, for {path} ...\n")
+        sys.stderr.write(f"building the sky index, once, for {path} ...\n")
     sky = build()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(sky, path)
     except OSError as error:
-        sys.stderr.write(f"{path}: cannot be kept: {error.strerror or error}\n")
+        sys.stderr.write(f"{path}: the sky index cannot be stored: {error.strerror or error}\n")
         return sky
     return load(path)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the index; 0 when done, 2 for wrong use."""
+    """Build and store the index. Return 0 if it was stored, 2 after wrong use."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=PATH, help="file (default %(default)s)")
     parser.add_argument(
         "--epoch", type=float, default=DEFAULT.epoch, help="Julian year (default %(default)s)"
     )
     parser.add_argument("--faintest", type=float, default=DEFAULT.faintest, help="V (default %(default)s)")
-    parser.add_argument("--fov", type=float, metavar="DEG", help="of a mission's camera (default: 4 to 60)")
+    parser.add_argument(
+        "--fov", type=float, metavar="DEG", help="field of view of a mission's camera (default: 4 to 60)"
+    )
     options = parser.parse_args(arguments)
     begin = time.monotonic()
     try:

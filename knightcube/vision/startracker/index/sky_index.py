@@ -1,11 +1,9 @@
-"""Table columns in one memory-mapped file with a version and a checksum.
+"""The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
 
 The file begins with a header: 8 bytes of magic that identify the kind of table, the version (uint32), the
 CRC-32 of everything after the header (uint32), and the length of the table of contents (uint32). The table of
 contents is JSON. The columns follow, little-endian, each at a multiple of 64 bytes. The same columns give the
 same bytes.
-
-The sky index for star identification: guide stars and their triangles, in one memory-mapped file.
 
 Guide stars are the catalogue as a given lens images it (Michalski 3.3): proper motion is applied up to the
 epoch of observation, and stars that the image cannot resolve are merged into one star at their centre of
@@ -25,8 +23,8 @@ of `CELL`; of whether the corners opposite the shortest, the middle and the long
 and of the longest side. The triangles of one cell within limits of size are one run of the sorted keys. Sides
 are chords.
 
-`python -m knightcube.vision.startracker.index.build` makes the index. The same
-stars and limits give the same bytes.
+`python -m knightcube.vision.startracker.index.build` builds the index. The same stars and limits give
+the same bytes.
 """
 
 from __future__ import annotations
@@ -397,7 +395,7 @@ KIND = TableKind(
     b"KCSKYIDX",
     _VERSION,
     "sky index",
-    "make it again with `python -m knightcube.vision.startracker.index.build`",
+    "build it again with `python -m knightcube.vision.startracker.index.build`",
 )
 PATH = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "knightcube" / f"sky-{_VERSION}.index"

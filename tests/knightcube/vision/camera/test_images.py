@@ -330,7 +330,7 @@ def test_a_third_axis_of_one_plane_is_no_matter() -> None:
         ({"NAXIS1": 0}, "0 x 2"),
         ({"NAXIS1": 3000}, "cut short"),
         ({"NAXIS2": None}, "no NAXIS2"),
-        ({"NAXIS1": "'three'"}, "no whole number"),
+        ({"NAXIS1": "'three'"}, "not an integer"),
         ({"BZERO": "'x'"}, "BZERO"),
         ({"BSCALE": "NaN"}, "BSCALE"),
         ({"BLANK": 128}, "blank pixels"),
