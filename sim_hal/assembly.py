@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
-from hal.drivers.h_bridge import CoilSettings, wirings
+from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation

@@ -32,8 +32,7 @@ from hal.buses.serial_port import PySerialPort
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
-from hal.drivers.coils import PwmTorqueCoils
-from hal.drivers.h_bridge import CoilSettings, wirings
+from hal.drivers.coils import CoilSettings, PwmTorqueCoils, wirings
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685, switch_off
 from hal.drivers.ublox import UbloxReceiver

@@ -24,8 +24,8 @@ from flight.link.telemetry.log import Recorder
 from flight.loop.facts import EventLog
 from hal.buses import linux_process
 from hal.buses.linux_process import ServiceManager
-from hal.drivers.h_bridge import DEVICE as COILS
-from hal.guardian.client import GuardianLine
+from hal.drivers.coils import DEVICE as COILS
+from hal.guardian import GuardianLine
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Ticker
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hal.drivers.h_bridge import CoilSettings, CoilWiring
+from hal.drivers.coils import CoilSettings, CoilWiring
 from hal.drivers.pca9685 import COUNTS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flight.loop.coil_monitor import STOOD_NS, CoilKnowledge, CurrentValidity
-from hal.guardian.process import SILENCE_NS
+from hal.guardian import SILENCE_NS
 from hal.interfaces.devices import CoilState
 
 MS = 1_000_000

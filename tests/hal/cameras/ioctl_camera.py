@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from hal.buses import v4l2
-from hal.buses.v4l2 import fourcc
+from hal.drivers import v4l2_camera as v4l2
+from hal.drivers.v4l2_camera import fourcc
 
 MILLISECOND_NS = 1_000_000
 

@@ -149,7 +149,7 @@ def aravis_rig(**changes: object) -> Rig:
 def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
     """Replace the kernel's V4L2 by a double."""
     kernel = IoctlCamera(folder, clock.now_ns)
-    monkeypatch.setattr("hal.buses.v4l2.ioctl", kernel)
+    monkeypatch.setattr("hal.drivers.v4l2_camera.ioctl", kernel)
     # Whatever this machine's kernel says of a driver that the double is not.
     monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
     return kernel

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hal.buses import v4l2
-from hal.buses.v4l2 import VideoDevice
-from hal.drivers.v4l2_camera import Stamp
+from hal.drivers import v4l2_camera as v4l2
+from hal.drivers.v4l2_camera import Stamp, VideoDevice
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
 from tests.hal.cameras.rig import EXPOSURE_NS, VideoRig, video_rig
@@ -265,7 +264,7 @@ def test_a_broken_exchange_is_not_a_crash(
         raise OSError(5, os.strerror(5))
 
     with monkeypatch.context() as broken:
-        broken.setattr("hal.buses.v4l2.ioctl", fail)
+        broken.setattr("hal.drivers.v4l2_camera.ioctl", fail)
         video.rig.wait(400_000_000)
         assert video.camera.poll() is None, "it may pass"
         video.rig.wait(120_000_000)

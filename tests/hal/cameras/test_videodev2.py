@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from hal.buses import v4l2
-from hal.buses.v4l2 import fourcc, fourcc_name
+from hal.drivers import v4l2_camera as v4l2
+from hal.drivers.v4l2_camera import fourcc, fourcc_name
 
 # Of linux/videodev2.h on x86-64.
 CODES = {

@@ -6,8 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from hal.drivers.coils import PwmTorqueCoils
-from hal.drivers.h_bridge import CoilSettings, CoilWiring
+from hal.drivers.coils import CoilSettings, CoilWiring, PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
 from hal.interfaces.devices import TorqueCoils
 from hal.interfaces.wires import Clock, I2cBus

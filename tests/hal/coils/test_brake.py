@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hal.drivers.h_bridge import brake
+from hal.drivers.coils import brake
 from hal.drivers.pca9685 import FULL_ON
 from hal.interfaces.errors import Refused
 from sim_hal.emulators.coil_circuit import CoilCondition

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.h_bridge import CoilWiring
+from hal.drivers.coils import CoilWiring
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
 from sim_hal.emulators.coil_circuit import Bridge, Chopping, CoilCircuit
 from tests.hal.coils.rig import THESIS, THESIS_COILS, Rig

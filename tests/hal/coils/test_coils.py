@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.h_bridge import CoilWiring, current_step
+from hal.drivers.coils import CoilWiring, current_step
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from tests.hal.coils.rig import PCA, THESIS, UNEQUAL, Rig, limited_to
 

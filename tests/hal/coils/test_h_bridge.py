@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from hal.drivers.h_bridge import (
+from hal.drivers.coils import (
     counts_for,
     current_step,
     inputs_for,

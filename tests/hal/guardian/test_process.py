@@ -15,8 +15,7 @@ from pathlib import Path
 import pytest
 
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL
-from hal.guardian.client import GuardianLine
-from hal.guardian.process import FINAL_ZEROS
+from hal.guardian import FINAL_ZEROS, GuardianLine
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach, GuardianNews
 from tests.hal.guardian.states import state, wait_until
@@ -103,7 +102,7 @@ def test_signals_that_end_a_flight_do_not_end_its_guardian(guardian: GuardianLin
 _FLIGHT = """
 import sys, time
 from hal.interfaces.guardian import CoilReach
-from hal.guardian.client import GuardianLine
+from hal.guardian import GuardianLine
 line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], int(sys.argv[2])))
 line.wait_ready(20.0)
 print(line.process_id, flush=True)

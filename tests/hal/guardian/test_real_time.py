@@ -11,7 +11,7 @@ import pytest
 
 from flight.app import supervision as watchers
 from hal.buses import linux_process
-from hal.drivers.h_bridge import DEVICE as COILS
+from hal.drivers.coils import DEVICE as COILS
 
 
 def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:

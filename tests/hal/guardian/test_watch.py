@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.guardian.process import FINAL_ZEROS, PATIENCE_NS, REPEAT_NS, SILENCE_NS, Watch
+from hal.guardian import FINAL_ZEROS, PATIENCE_NS, REPEAT_NS, SILENCE_NS, Watch
 
 MS = 1_000_000
 

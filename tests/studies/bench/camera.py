@@ -60,7 +60,7 @@ def measure(seconds: float) -> dict[str, float]:
         kernel.shortest_ns = FRAME_NS
         kernel.draws = False
         empty = _busy(clock, None, seconds / 4, 0)[0]
-        with mock.patch("hal.buses.v4l2.ioctl", kernel):
+        with mock.patch("hal.drivers.v4l2_camera.ioctl", kernel):
             settings = V4l2Settings(str(kernel.path), COLUMNS, ROWS, "GREY", EXPOSURE_NS, None, Stamp.TOLD, 0)
             camera = ServedCamera(V4l2Camera(settings, clock), clock)
             idle = _busy(clock, camera, seconds / 4, 0)[0]
