@@ -46,7 +46,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, Po
 _MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)
 _NUMBERS = (
     "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad; object: right ascension, "
-    "declination, rad, where it is looked for, NaN: where the camera looks"
+    "declination, rad, of the search; NaN searches along the camera's boresight"
 )
 _GOALS = tuple((int(goal), goal.label) for goal in Goal)
 
@@ -56,26 +56,29 @@ def _command(name: str, apid: int, meaning: str, *fields: Field, hazard: str = "
 
 
 PING = _command(
-    "ping", 0x201, "Answer, and do nothing else", Field("number", "u4", "-", "comes back in the answer")
+    "ping",
+    0x201,
+    "Answer without any other effect",
+    Field("number", "u4", "-", "number that the answer repeats"),
 )
 SAFE = _command(
     "safe",
     0x202,
-    "Abort: coils to zero, mode safe",
-    Field("reason", "S64", "-", "for the log"),
-    hazard="ends pointing, slews and braking until the next command",
+    "Abort: set the coils to zero and change to safe mode",
+    Field("reason", "S64", "-", "reason for the log"),
+    hazard="ends pointing, slews and detumbling until the next command",
 )
 MODE = _command(
     "mode",
     0x203,
     "Change the mode",
-    Field("mode", "u1", "-", "what the satellite shall do", states=_MODES),
-    hazard="moves the body, or stops moving it",
+    Field("mode", "u1", "-", "new mode", states=_MODES),
+    hazard="moves the body or stops its motion",
 )
 SLEW = _command(
     "slew",
     0x204,
-    "Go to an attitude, then hold it",
+    "Slew to an attitude and hold it",
     Field("q2", "f8", "-", "commanded final q2", valid=(-Q2_LIMIT, Q2_LIMIT)),
     hazard="moves the body",
 )
@@ -83,39 +86,39 @@ CLEAR = _command(
     "clear",
     0x205,
     "Clear a latched event",
-    Field("event", "S32", "-", "its name, as in the log"),
-    hazard="what the event barred is used again, as a broken coil",
+    Field("event", "S32", "-", "name of the event, as in the log"),
+    hazard="uses again what the event excluded, for example a broken coil",
 )
 POINT = _command(
     "point",
     0x206,
     "Point a satellite to a goal",
-    Field("goal", "u1", "-", "where to point", states=_GOALS),
+    Field("goal", "u1", "-", "goal to point to", states=_GOALS),
     Field("numbers", "f8", "-", _NUMBERS, 4),
-    Field("roll", "f8", "rad", "about the pointing axis, NaN: free"),
+    Field("roll", "f8", "rad", "roll about the pointing axis; NaN for a free roll"),
     hazard="moves the body",
 )
 
 LOAD_PARAMETERS = _command(
     "load-parameters",
     0x210,
-    "Fly another table of parameters, all of them at once",
+    "Replace the whole table of parameters",
     Field(
         "replaced",
         "u4",
         "-",
-        "CRC-32 of the table that it replaces: another one has come between, if not equal",
+        "CRC-32 of the table to be replaced; the command is refused if another table is in use",
     ),
     Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
     *PARAMETERS,
-    hazard="moves the limits at which the satellite brakes, gives up or warns",
+    hazard="changes the limits at which the satellite detumbles, stops or warns",
 )
-DUMP_PARAMETERS = _command("dump-parameters", 0x211, "Report the table of parameters that flies")
+DUMP_PARAMETERS = _command("dump-parameters", 0x211, "Report the table of parameters in use")
 
 COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT, LOAD_PARAMETERS, DUMP_PARAMETERS)
 
 LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
-"""Their bytes, by name."""
+"""Layouts of the command packets by name."""
 
 
 class CommandError(FlightError):

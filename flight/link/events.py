@@ -28,7 +28,7 @@ class Reaction(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class EventKind:
-    """One row of the table. The code is for ever; names are for people."""
+    """One row of the table. A code is never used for another event."""
 
     code: int
     name: str
@@ -37,200 +37,188 @@ class EventKind:
     reaction: Reaction = Reaction.NOTE
 
 
-_TOLD, _WARNED, _FAULT = Severity.INFORMATION, Severity.WARNING, Severity.FAULT
+def _info(code: int, name: str, meaning: str) -> EventKind:
+    return EventKind(code, name, Severity.INFORMATION, meaning)
 
-STARTED = EventKind(1, "started", _TOLD, "the loop begins")
-STOPPED = EventKind(2, "stopped", _TOLD, "the loop ends, with the reason")
-CYCLE_SLIP = EventKind(3, "cycle-slip", _WARNED, "slots of the control group were skipped")
-TASK_FAILED = EventKind(
-    4, "task-failed", _FAULT, "a task raised an exception; where it was the control task, coils to zero"
+
+def _warning(code: int, name: str, meaning: str, reaction: Reaction = Reaction.NOTE) -> EventKind:
+    return EventKind(code, name, Severity.WARNING, meaning, reaction)
+
+
+def _fault(code: int, name: str, meaning: str, reaction: Reaction = Reaction.NOTE) -> EventKind:
+    return EventKind(code, name, Severity.FAULT, meaning, reaction)
+
+
+STARTED = _info(1, "started", "the control loop started")
+STOPPED = _info(2, "stopped", "the control loop ended; the text gives the reason")
+CYCLE_SLIP = _warning(3, "cycle-slip", "control cycles were skipped")
+TASK_FAILED = _fault(
+    4, "task-failed", "a task raised an exception; if it is the control task, the coils go to zero"
 )
-MODE = EventKind(5, "mode", _TOLD, "another mode than at the start, with what led to it")
-CRASHED_OFTEN = EventKind(
-    6, "crashed-often", _WARNED, "too many unclean shutdowns of late: the start leads to safe"
+MODE = _info(5, "mode", "the mode changed; the text gives the cause")
+CRASHED_OFTEN = _warning(
+    6, "crashed-often", "too many recent unclean shutdowns: the flight starts in safe mode"
 )
-BOOT_WAITS = EventKind(7, "boot-waits", _WARNED, "the devices give no good data: still booting")
-TASK_FAILING = EventKind(8, "task-failing", _FAULT, "the control task fails cycle after cycle", Reaction.SAFE)
-NO_PROGRESS = EventKind(
-    9, "no-progress", _FAULT, "a rate group or worker stands still: the watchdog is fed no more"
+BOOT_WAITS = _warning(7, "boot-waits", "the flight is still booting because the devices give no valid data")
+TASK_FAILING = _fault(8, "task-failing", "the control task fails in every cycle", Reaction.SAFE)
+NO_PROGRESS = _fault(
+    9, "no-progress", "a rate group or worker makes no progress, so the watchdog is no longer fed"
 )
-SERVICE_FAILING = EventKind(
-    96, "service-failing", _FAULT, "a job beside the loop, as the coils' or the log's, fails or stands still"
+SERVICE_FAILING = _fault(
+    96, "service-failing", "a background job, such as writing the log, fails or makes no progress"
 )
-SERVICE_RECOVERED = EventKind(97, "service-recovered", _TOLD, "the jobs beside the loop run again")
-IMU_SILENT = EventKind(10, "imu-silent", _FAULT, "no bytes come from the inertial unit")
-IMU_CORRUPT = EventKind(11, "imu-corrupt", _WARNED, "bytes come from the inertial unit that are no packets")
-IMU_IMPLAUSIBLE = EventKind(12, "imu-implausible", _WARNED, "values out of range or not finite")
-IMU_LINE_LOST = EventKind(13, "imu-line-lost", _FAULT, "the serial port is gone")
-IMU_RECOVERED = EventKind(14, "imu-recovered", _TOLD, "good packets come again")
-IMU_REFUSED = EventKind(
-    15, "imu-refused", _WARNED, "measurements disagree with the estimate and are left out"
+SERVICE_RECOVERED = _info(97, "service-recovered", "all background jobs run again")
+IMU_SILENT = _fault(10, "imu-silent", "the inertial unit sends nothing")
+IMU_CORRUPT = _warning(11, "imu-corrupt", "the inertial unit sends bytes that form no packet")
+IMU_IMPLAUSIBLE = _warning(
+    12, "imu-implausible", "the inertial unit sends values that are out of range or not finite"
 )
-IMU_UNUSABLE = EventKind(
-    16, "imu-unusable", _FAULT, "bytes come from the inertial unit, but no reading in them"
+IMU_LINE_LOST = _fault(13, "imu-line-lost", "the serial port of the inertial unit is lost")
+IMU_RECOVERED = _info(14, "imu-recovered", "the inertial unit sends valid packets again")
+IMU_REFUSED = _warning(
+    15, "imu-refused", "inertial measurements that disagree with the estimate are rejected"
 )
-CONTROL_LOST = EventKind(
-    20, "control-lost", _FAULT, "no trustworthy estimate: coils to zero", Reaction.COILS_OFF
+IMU_UNUSABLE = _fault(16, "imu-unusable", "the inertial unit sends bytes that contain no reading")
+CONTROL_LOST = _fault(
+    20, "control-lost", "the coils are set to zero because there is no valid estimate", Reaction.COILS_OFF
 )
-CONTROL_REGAINED = EventKind(21, "control-regained", _TOLD, "the estimate is trustworthy again")
-BLIND = EventKind(22, "blind", _FAULT, "no trustworthy estimate for too long", Reaction.SAFE)
-TUMBLING = EventKind(
-    23, "tumbling", _WARNED, "the body turns faster than it may outside detumbling", Reaction.DETUMBLE
+CONTROL_REGAINED = _info(21, "control-regained", "the estimate is valid again")
+BLIND = _fault(22, "blind", "there has been no valid estimate for too long", Reaction.SAFE)
+TUMBLING = _warning(
+    23, "tumbling", "the body rotates too fast for any mode but detumbling", Reaction.DETUMBLE
 )
-HOLD_IMPOSSIBLE = EventKind(
-    24, "hold-impossible", _FAULT, "the attitude cannot be held: far off and not coming back", Reaction.SAFE
+HOLD_IMPOSSIBLE = _fault(
+    24,
+    "hold-impossible",
+    "the attitude cannot be held: its error is large and does not decrease",
+    Reaction.SAFE,
 )
-STREAM_POOR = EventKind(25, "stream-poor", _WARNED, "a stream of readings is late, slow or out of its range")
-STREAM_GOOD = EventKind(26, "stream-good", _TOLD, "a stream of readings is as it should be again")
-COIL_FAULT = EventKind(30, "coil-fault", _FAULT, "the PWM chip does not take commands", Reaction.COILS_OFF)
-COIL_RECOVERED = EventKind(31, "coil-recovered", _TOLD, "the PWM chip takes commands again")
-COIL_BROKEN = EventKind(
-    34, "coil-broken", _FAULT, "a coil does not carry what is commanded: left out", Reaction.ISOLATE
+STREAM_POOR = _warning(25, "stream-poor", "a stream of readings is late, slow or out of range")
+STREAM_GOOD = _info(26, "stream-good", "a stream of readings is normal again")
+COIL_FAULT = _fault(30, "coil-fault", "the PWM chip does not accept commands", Reaction.COILS_OFF)
+COIL_RECOVERED = _info(31, "coil-recovered", "the PWM chip accepts commands again")
+COIL_BROKEN = _fault(
+    34, "coil-broken", "a coil does not carry the commanded current and is isolated", Reaction.ISOLATE
 )
-COIL_TRUSTED = EventKind(35, "coil-trusted", _TOLD, "by command a coil is used again")
-COIL_SUSPECT = EventKind(
-    36, "coil-suspect", _WARNED, "the supply current is not what the coils are told; which one is not known"
+COIL_TRUSTED = _info(35, "coil-trusted", "a coil is used again by command")
+COIL_SUSPECT = _warning(
+    36, "coil-suspect", "the supply current does not match the commanded currents; the faulty coil is unknown"
 )
-POWER_DOUBTED = EventKind(
-    37, "power-doubted", _WARNED, "the current monitor says what the body does not feel"
+POWER_DOUBTED = _warning(37, "power-doubted", "the current monitor contradicts the measured motion")
+POWER_FAULT = _warning(32, "power-fault", "the current monitor does not answer")
+POWER_RECOVERED = _info(33, "power-recovered", "the current monitor answers again")
+COMMANDS_DOUBTED = _warning(
+    38, "commands-doubted", "the body does not move as commanded, so the filter uses the gyro alone"
 )
-POWER_FAULT = EventKind(32, "power-fault", _WARNED, "the current monitor does not answer")
-POWER_RECOVERED = EventKind(33, "power-recovered", _TOLD, "the current monitor answers again")
-COMMANDS_DOUBTED = EventKind(
-    38,
-    "commands-doubted",
-    _WARNED,
-    "the body does not move as commanded: the filter follows the gyro alone",
+COMMANDS_TRUSTED = _info(39, "commands-trusted", "the body moves as commanded again")
+TARGET = _info(40, "target", "a new attitude is commanded")
+PLAN_STRETCHED = _info(41, "plan-stretched", "no path fits into the horizon, so the horizon was extended")
+PLAN_REFUSED = _warning(42, "plan-refused", "a plan was rejected; the text gives the reason")
+PLANNER_BUSY = _warning(43, "planner-busy", "the planner has not finished its previous job")
+PLANNER_FAILED = _warning(44, "planner-failed", "the planner found no plan; the text gives the reason")
+HOLDING = _warning(45, "holding", "the last valid path has ended and its final attitude is held")
+SLEW_LATE = _warning(46, "slew-late", "a slew does not arrive in time", Reaction.HOLD)
+WORKER_DIED = _warning(47, "worker-died", "a worker process ended or was killed")
+WORKER_READY = _info(48, "worker-ready", "a worker runs again")
+WORKER_RESTS = _fault(
+    49, "worker-rests", "a worker died too often in a row and is restarted after some minutes"
 )
-COMMANDS_TRUSTED = EventKind(39, "commands-trusted", _TOLD, "the body follows the commands again")
-TARGET = EventKind(40, "target", _TOLD, "a new attitude is commanded")
-PLAN_STRETCHED = EventKind(41, "plan-stretched", _TOLD, "no path within the horizon: stretched")
-PLAN_REFUSED = EventKind(42, "plan-refused", _WARNED, "a plan was not flown, with the reason")
-PLANNER_BUSY = EventKind(43, "planner-busy", _WARNED, "the planner has not finished the last job")
-PLANNER_FAILED = EventKind(44, "planner-failed", _WARNED, "the planner gave no plan, with the reason")
-HOLDING = EventKind(45, "holding", _WARNED, "the last good path has ended: holding its final attitude")
-SLEW_LATE = EventKind(46, "slew-late", _WARNED, "a slew does not arrive", Reaction.HOLD)
-WORKER_DIED = EventKind(47, "worker-died", _WARNED, "the process of a worker ended or was killed")
-WORKER_READY = EventKind(48, "worker-ready", _TOLD, "a worker runs again")
-WORKER_RESTS = EventKind(
-    49, "worker-rests", _FAULT, "a worker died too often in a row: it is started again minutes later"
+CAMERA_LOST = _warning(50, "camera-lost", "the camera has delivered no frame for too long")
+CAMERA_RECOVERED = _info(51, "camera-recovered", "the camera delivers frames again")
+CAMERA_FROZEN = _warning(52, "camera-frozen", "the camera delivers the same frame repeatedly")
+CAMERA_BLACK = _warning(53, "camera-black", "a frame is completely dark or completely saturated")
+VISION_FAILED = _warning(54, "vision-failed", "vision found no result; the text gives the reason")
+STREAK_REFUSED = _warning(55, "streak-refused", "a rate from star streaks disagrees with the estimate")
+STARS_REFUSED = _warning(56, "stars-refused", "an attitude from stars disagrees with the estimate")
+CAMERA_TORN = _warning(57, "camera-torn", "a frame contains parts of an earlier frame")
+CAMERA_STRANGE = _warning(
+    58, "camera-strange", "many stars were detected but none match the catalogue: check the camera's pixels"
 )
-CAMERA_LOST = EventKind(50, "camera-lost", _WARNED, "no frame has come for too long")
-CAMERA_RECOVERED = EventKind(51, "camera-recovered", _TOLD, "frames come again")
-CAMERA_FROZEN = EventKind(52, "camera-frozen", _WARNED, "the camera gives the same frame again")
-CAMERA_BLACK = EventKind(53, "camera-black", _WARNED, "the frame holds no light, or only light")
-VISION_FAILED = EventKind(54, "vision-failed", _WARNED, "vision gave no result, with the reason")
-STREAK_REFUSED = EventKind(55, "streak-refused", _WARNED, "a rate from streaks disagrees with the estimate")
-STARS_REFUSED = EventKind(56, "stars-refused", _WARNED, "the stars' attitude disagrees with the estimate")
-CAMERA_TORN = EventKind(57, "camera-torn", _WARNED, "parts of a frame are of an earlier one")
-CAMERA_STRANGE = EventKind(
-    58, "camera-strange", _WARNED, "many stars in a frame, and no sky that has them: are its pixels in order?"
+VISION_SLOW = _warning(59, "vision-slow", "the processing of a frame takes too long")
+FRAME_UNUSED = _info(69, "frame-unused", "a frame of the rotating body gave neither rate nor attitude")
+CAMERA_LATE = _warning(66, "camera-late", "a frame arrived late or is overdue")
+LOG_FAULT = _fault(60, "log-fault", "the flight log cannot be written")
+LOG_RECOVERED = _info(65, "log-recovered", "the flight log is written again")
+RECORD_LOST = _fault(110, "record-lost", "a record was lost because its values did not fit their packet")
+STATE_RECOVERED = _warning(
+    61, "state-recovered", "one copy of the stored state is damaged; the other copy is used"
 )
-VISION_SLOW = EventKind(59, "vision-slow", _WARNED, "vision takes long over a frame")
-FRAME_UNUSED = EventKind(
-    69,
-    "frame-unused",
-    _TOLD,
-    "a frame of a body in motion gave no rate and no attitude",
+STATE_LOST = _warning(
+    62, "state-lost", "both copies of the stored state are damaged; default values are used"
 )
-CAMERA_LATE = EventKind(
-    66, "camera-late", _WARNED, "a frame comes long after its exposure, or has not come yet"
+STATE_UNWRITTEN = _warning(63, "state-unwritten", "the state cannot be written to disk")
+STATE_OLD = _warning(98, "state-old", "the stored state misses boots, which counts as an unclean shutdown")
+PARAMETERS_LEFT = _warning(
+    115, "parameters-left", "the loaded parameter table is rejected and the previous table is used"
 )
-LOG_FAULT = EventKind(60, "log-fault", _FAULT, "the flight log cannot be written")
-LOG_RECOVERED = EventKind(65, "log-recovered", _TOLD, "packets reach the disk again")
-RECORD_LOST = EventKind(110, "record-lost", _FAULT, "values did not fit their packet: the record is lost")
-STATE_RECOVERED = EventKind(
-    61, "state-recovered", _WARNED, "a copy of the kept state is bad: the other is used"
+START_WAITED = _warning(99, "start-waited", "the start failed and was repeated; the text gives the reason")
+CONFIG_DAMAGED = _warning(
+    67, "config-damaged", "the configuration is not the accepted one; the last flown configuration is used"
 )
-STATE_LOST = EventKind(62, "state-lost", _WARNED, "both copies of the kept state are bad: defaults")
-STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be kept on disk")
-STATE_OLD = EventKind(
-    98, "state-old", _WARNED, "the kept state counts fewer boots than there were: an unclean shutdown"
-)
-PARAMETERS_LEFT = EventKind(
-    115, "parameters-left", _WARNED, "the loaded table of parameters is not flown: the one before it is"
-)
-START_WAITED = EventKind(99, "start-waited", _WARNED, "the start failed and was tried again, with the reason")
-CONFIG_DAMAGED = EventKind(
-    67, "config-damaged", _WARNED, "the configuration is not the accepted one: the last that flew is flown"
-)
-LEARNED_REFUSED = EventKind(
-    68, "learned-refused", _WARNED, "what an earlier boot learned is not believed: begun without it"
-)
-UNCLEAN_SHUTDOWN = EventKind(64, "unclean-shutdown", _WARNED, "the last boot did not end by itself")
-CLOCK_STEP = EventKind(70, "clock-step", _WARNED, "the wall clock was set; nothing steers by it")
-CPU_HIGH = EventKind(71, "cpu-high", _WARNED, "the control process takes more of a core than it should")
-MEMORY_GROWS = EventKind(72, "memory-grows", _WARNED, "the memory of the flight processes grows")
-MEMORY_HIGH = EventKind(
-    73, "memory-high", _FAULT, "the flight processes take too much memory", Reaction.RESTART
-)
-DISK_LOW = EventKind(74, "disk-low", _WARNED, "little room is left for the flight log")
-HOT = EventKind(75, "hot", _WARNED, "the board is warm")
-TOO_HOT = EventKind(76, "too-hot", _FAULT, "the board is too hot to drive coils", Reaction.SAFE)
-RESOURCE_NORMAL = EventKind(77, "resource-normal", _TOLD, "a resource is within its bounds again")
-RELEASE_LEFT = EventKind(
+LEARNED_REFUSED = _warning(68, "learned-refused", "values that an earlier boot learned were rejected")
+UNCLEAN_SHUTDOWN = _warning(64, "unclean-shutdown", "the previous boot did not end cleanly")
+CLOCK_STEP = _warning(70, "clock-step", "the wall clock was changed; control does not use it")
+CPU_HIGH = _warning(71, "cpu-high", "the control process uses too much processor time")
+MEMORY_GROWS = _warning(72, "memory-grows", "the memory use of the flight processes grows")
+MEMORY_HIGH = _fault(73, "memory-high", "the flight processes use too much memory", Reaction.RESTART)
+DISK_LOW = _warning(74, "disk-low", "little disk space is left for the flight log")
+HOT = _warning(75, "hot", "the board is warm")
+TOO_HOT = _fault(76, "too-hot", "the board is too hot to drive coils", Reaction.SAFE)
+RESOURCE_NORMAL = _info(77, "resource-normal", "a resource is within its limits again")
+RELEASE_LEFT = _fault(
     79,
     "release-left",
-    _FAULT,
-    "the current release or releases.py is damaged or did not start: the text names the one that flies",
+    "the current release or releases.py is damaged or did not start; the text names the release in use",
 )
-COMMANDED = EventKind(80, "commanded", _TOLD, "a command was obeyed")
-COMMAND_REFUSED = EventKind(81, "command-refused", _WARNED, "a command was not obeyed, with the reason")
-COMMAND_SOCKET = EventKind(
-    82, "command-socket", _WARNED, "the file of the command socket was removed: it is bound again"
+COMMANDED = _info(80, "commanded", "a command was executed")
+COMMAND_REFUSED = _warning(81, "command-refused", "a command was refused; the text gives the reason")
+COMMAND_SOCKET = _warning(
+    82, "command-socket", "the file of the command socket was removed, so the socket is bound again"
 )
-GUARDIAN_LOST = EventKind(90, "guardian-lost", _FAULT, "the guardian has died or hangs: another is started")
-GUARDIAN_READY = EventKind(91, "guardian-ready", _TOLD, "a guardian is on watch again")
-GUARDIAN_ACTED = EventKind(
-    92, "guardian-acted", _WARNED, "heartbeats stopped: the guardian held the coils at 0"
+GUARDIAN_LOST = _fault(90, "guardian-lost", "the guardian died or hangs; another one is started")
+GUARDIAN_READY = _info(91, "guardian-ready", "a guardian watches the heartbeats again")
+GUARDIAN_ACTED = _warning(
+    92, "guardian-acted", "the heartbeats stopped and the guardian held the coils at zero"
 )
-GUARDIAN_BLIND = EventKind(
-    93, "guardian-blind", _FAULT, "the guardian cannot reach the PWM chip; it goes on trying"
-)
-REAL_TIME = EventKind(94, "real-time", _TOLD, "what was obtained of real-time scheduling and locked memory")
-REAL_TIME_REFUSED = EventKind(95, "real-time-refused", _WARNED, "scheduling or locked memory was refused")
+GUARDIAN_BLIND = _fault(93, "guardian-blind", "the guardian cannot reach the PWM chip and keeps trying")
+REAL_TIME = _info(94, "real-time", "the real-time scheduling and locked memory that were obtained")
+REAL_TIME_REFUSED = _warning(95, "real-time-refused", "real-time scheduling or locked memory was refused")
 
-ATTITUDE_KNOWLEDGE = EventKind(100, "attitude-knowledge", _TOLD, "how well the attitude is known has changed")
-GPS_LOST = EventKind(101, "gps-lost", _WARNED, "no fix of use has come for too long")
-GPS_RECOVERED = EventKind(102, "gps-recovered", _TOLD, "fixes of use come again")
-GPS_REFUSED = EventKind(103, "gps-refused", _WARNED, "a fix contradicts what is known of the orbit")
-STRINGS_LOST = EventKind(104, "strings-lost", _WARNED, "the solar strings give no readings")
-STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar strings give readings again")
-SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
-SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
-CLOCK_OFF = EventKind(
-    130, "clock-off", _WARNED, "the wall clock differs from the receiver's time, by which the place is known"
+ATTITUDE_KNOWLEDGE = _info(100, "attitude-knowledge", "the quality of the attitude estimate changed")
+GPS_LOST = _warning(101, "gps-lost", "the GPS receiver has delivered no usable fix for too long")
+GPS_RECOVERED = _info(102, "gps-recovered", "the GPS receiver delivers usable fixes again")
+GPS_REFUSED = _warning(103, "gps-refused", "a GPS fix contradicts the known orbit")
+STRINGS_LOST = _warning(104, "strings-lost", "the solar strings deliver no readings")
+STRINGS_RECOVERED = _info(105, "strings-recovered", "the solar strings deliver readings again")
+SUN_UNCLEAR = _warning(106, "sun-unclear", "the solar strings detect no Sun although the satellite is sunlit")
+SUN_CLEAR = _info(107, "sun-clear", "the solar strings detect the Sun again")
+CLOCK_OFF = _warning(
+    130, "clock-off", "the wall clock differs from the time of the GPS receiver, which is used"
 )
-FIELD_REFUSED = EventKind(
-    131, "field-refused", _WARNED, "the magnetometer repeats its value, or contradicts the estimate: left out"
+FIELD_REFUSED = _warning(
+    131, "field-refused", "the magnetometer is ignored because its value is stuck or contradicts the estimate"
 )
-FIELD_TRUSTED = EventKind(132, "field-trusted", _TOLD, "the magnetometer agrees with the estimate again")
-SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the target begins")
-SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
-WIDE_LOST = EventKind(133, "wide-lost", _WARNED, "a wide camera gives no frames")
-WIDE_RECOVERED = EventKind(134, "wide-recovered", _TOLD, "all wide cameras give frames again")
-WIDE_FALSE = EventKind(
-    135, "wide-false", _WARNED, "a wide camera's pictures are not of what it must see by a fine attitude"
-)
-WIDE_TRUSTED = EventKind(
-    136, "wide-trusted", _TOLD, "the wide cameras' pictures are of what they must see again"
+FIELD_TRUSTED = _info(132, "field-trusted", "the magnetometer agrees with the estimate again")
+SLEW_BEGUN = _info(108, "slew-begun", "a slew to the target with minimum heat begins")
+SLEW_ENDED = _info(109, "slew-ended", "a slew has ended and the target is tracked from now on")
+WIDE_LOST = _warning(133, "wide-lost", "a wide camera delivers no frames")
+WIDE_RECOVERED = _info(134, "wide-recovered", "all wide cameras deliver frames again")
+WIDE_FALSE = _warning(135, "wide-false", "the frames of a wide camera contradict the fine attitude")
+WIDE_TRUSTED = _info(136, "wide-trusted", "the frames of the wide cameras agree with the attitude again")
+
+OBJECT_FOUND = _info(120, "object-found", "the track of a moving object is confirmed")
+OBJECT_LOST = _info(
+    121, "object-lost", "the track of an object ended because it was not detected for too long"
 )
 
-OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
-OBJECT_LOST = EventKind(
-    121, "object-lost", _TOLD, "the track of an object ended: it was not seen for too long"
+OBJECT_FOLLOWED = _info(122, "object-followed", "the boresight of the star camera follows an object")
+OBJECT_ESCAPES = _warning(
+    123, "object-escapes", "the torque of the coils is too small to keep an object in the field of view"
 )
 
-OBJECT_FOLLOWED = EventKind(122, "object-followed", _TOLD, "the star camera's boresight follows an object")
-OBJECT_ESCAPES = EventKind(
-    123, "object-escapes", _WARNED, "the coils' torque does not suffice to keep an object in the field"
-)
-
-SUN_FOUND = EventKind(140, "sun-found", _TOLD, "in safe mode the Sun is seen, and the body turns to it")
-SUN_MISSED = EventKind(141, "sun-missed", _WARNED, "in safe mode no Sun is seen: the body is only held still")
-ASTRAY = EventKind(
-    142, "astray", _WARNED, "far off its path the body is held still until it is slow, then planned for"
-)
+SUN_FOUND = _info(140, "sun-found", "the Sun was detected in safe mode and the body turns towards it")
+SUN_MISSED = _warning(141, "sun-missed", "no Sun was detected in safe mode, so the body is only held still")
+ASTRAY = _warning(142, "astray", "the body is far from its path and is slowed down before a new plan")
 
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)

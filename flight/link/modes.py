@@ -1,4 +1,4 @@
-"""The modes: what the satellite does, as packets, commands and configurations name it."""
+"""Modes of the satellite, with their names in packets, commands and configurations."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from enum import IntEnum
 
 
 class Mode(IntEnum):
-    """What the satellite is doing; the values are those of the mode packet."""
+    """Mode of the satellite; the values are those of the mode packet."""
 
     BOOT = 0
-    """Coils at zero until the devices give good data."""
+    """The coils are at zero until the devices deliver valid data."""
     SAFE = 1
-    """Listening, coils at zero; a satellite is braked and turns to the Sun by its solar strings."""
+    """The testbed's coils are at zero. A satellite detumbles and turns to the Sun by its solar strings."""
     DETUMBLE = 2
-    """The magnetometer's B-dot takes the rate out."""
+    """The coils reduce the rate by the magnetometer alone."""
     HOLD = 3
-    """Keeps an attitude."""
+    """The body holds an attitude."""
     SLEW = 4
-    """On the way to a commanded attitude."""
+    """The body slews to a commanded attitude."""
     TESTBED_DEMO = 5
-    """Flies the configured steps."""
+    """The testbed flies the configured steps."""
     ACQUIRE = 6
-    """Coils at zero: the body turns slowly, and its attitude is not known yet."""
+    """The coils are at zero while the attitude of the slowly rotating body is determined."""
     SUN = 7
-    """Points to the Sun."""
+    """The satellite points to the Sun."""
     POINT = 8
-    """Points to the targets of the configuration, or to a commanded one."""
+    """The satellite points to the configured targets or to a commanded one."""
 
     @property
     def label(self) -> str:
@@ -34,7 +34,7 @@ class Mode(IntEnum):
 
     @classmethod
     def named(cls, label: str) -> Mode:
-        """Return the mode of a label. Raises ValueError for a word that is none."""
+        """Return the mode of a label. Raises ValueError for an unknown label."""
         for mode in cls:
             if mode.label == label:
                 return mode
@@ -51,4 +51,4 @@ ORBITAL = POINTING | {Mode.ACQUIRE}
 """The modes of a body that must acquire its attitude."""
 
 STEERING = POINTING | {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
-"""The modes in which planner and controller turn the body."""
+"""The modes in which planner and controller rotate the body."""

@@ -62,10 +62,10 @@ class CoilReach:
 class GuardianNews(Enum):
     """Events of the guardian; the values are texts for the event log."""
 
-    LOST = "it has died or hangs: another is started"
-    READY = "it is on watch"
+    LOST = "the guardian died or hangs; another one is started"
+    READY = "the guardian watches the heartbeats"
     ACTED = "no heartbeat for 0.3 s: the coils were held at zero"
-    FAILED = "it cannot reach the coils' PWM chip"
+    FAILED = "the guardian cannot reach the coils' PWM chip"
 
 
 class CoilGuardian(Protocol):

@@ -23,7 +23,7 @@ from flight.link.telemetry.packets import (
 SUM_BYTES = 32
 _NAME = f"S{LONGEST_NAME}"
 _TO = Field(
-    "entity", "u2", "-", "who gets it", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
+    "entity", "u2", "-", "receiving entity", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
 )
 
 LIST_FILES = Packet(
@@ -31,25 +31,25 @@ LIST_FILES = Packet(
     0x223,
     "at will",
     "Send the list of files on board, as the file listing.json",
-    (_TO, Field("under", _NAME, "-", "names that begin so, empty for all")),
+    (_TO, Field("under", _NAME, "-", "beginning of the listed names; empty lists all files")),
     telecommand=True,
 )
 SEND_FILE = Packet(
     "send-file",
     0x224,
     "at will",
-    "Send a file down, or what its receiver lacks of it",
-    (_TO, Field("name", _NAME, "-", "as the list has it")),
+    "Send a file down, or the missing parts of it",
+    (_TO, Field("name", _NAME, "-", "name in the list of files")),
     telecommand=True,
 )
 CANCEL_FILE = Packet(
     "cancel-file",
     0x225,
     "at will",
-    "End a transfer; what came of the file is deleted",
+    "End a transfer and delete the received part of the file",
     (
-        Field("source", "u2", "-", "entity that sends, as in the packet transfer"),
-        Field("number", "u4", "-", "of the transfer there"),
+        Field("source", "u2", "-", "sending entity, as in the packet transfer"),
+        Field("number", "u4", "-", "number of the transfer at the sending entity"),
     ),
     telecommand=True,
 )
@@ -57,22 +57,22 @@ USE_FILE = Packet(
     "use-file",
     0x226,
     "at will",
-    "Choose a received file, whose SHA-256 is checked, as the one of its kind that the board shall take",
+    "Check the SHA-256 of a received file and select it for use by the board",
     (
-        Field("name", _NAME, "-", "as the list has it, such as received/configuration/flight.yaml"),
-        Field("sum", "u1", "-", "its SHA-256", SUM_BYTES),
+        Field("name", _NAME, "-", "name in the list, such as received/configuration/flight.yaml"),
+        Field("sum", "u1", "-", "SHA-256 of the file", SUM_BYTES),
     ),
     telecommand=True,
-    hazard="the board may fly with it from then on",
+    hazard="the board may use the file from now on",
 )
 DELETE_FILE = Packet(
     "delete-file",
     0x227,
     "at will",
     "Delete a received file",
-    (Field("name", _NAME, "-", "as the list has it"),),
+    (Field("name", _NAME, "-", "name in the list of files"),),
     telecommand=True,
-    hazard="the file is gone",
+    hazard="deletes the file",
 )
 FILE_PACKETS: tuple[Packet, ...] = (LIST_FILES, SEND_FILE, CANCEL_FILE, USE_FILE, DELETE_FILE)
 
@@ -174,11 +174,11 @@ PLAY = Packet(
     "play",
     0x2A0,
     "at will",
-    "Play a stretch of the archive back",
+    "Play back an interval of the archive",
     (
-        Field("run", "u4", "-", "number of the run, 0 the newest"),
-        Field("begin", "f8", "s", "mission time"),
-        Field("end", "f8", "s", "mission time"),
+        Field("run", "u4", "-", "number of the run; 0 for the newest"),
+        Field("begin", "f8", "s", "mission time of the first packet"),
+        Field("end", "f8", "s", "mission time of the last packet"),
     ),
     telecommand=True,
 )
@@ -187,11 +187,11 @@ NEW_KEY = Packet(
     "new-key",
     0x2A2,
     "at will",
-    "Change the key of an SPI; its counter begins at 0 again",
+    "Change the key of an SPI and reset its counter to 0",
     (
-        Field("spi", "u2", "-", "whose key: 1 to 4"),
-        Field("generation", "u4", "-", "of the new key, one more than the old one's"),
-        Field("key", "u1", "-", "AES-256", KEY_BYTES),
+        Field("spi", "u2", "-", "SPI of the key, 1 to 4"),
+        Field("generation", "u4", "-", "generation of the new key, one above the old generation"),
+        Field("key", "u1", "-", "new key of AES-256", KEY_BYTES),
     ),
     telecommand=True,
 )
@@ -200,25 +200,25 @@ SCHEDULE = Packet(
     "schedule",
     0x220,
     "at will",
-    "Execute a command at a UTC, also after a restart",
+    "Execute a command at a time in UTC, also after a restart",
     (
-        Field("at", f"S{_LONGEST_UTC}", "-", "UTC, such as 2026-11-23T21:00:00"),
+        Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
         Field(
             "words",
             f"S{LONGEST_COMMAND}",
             "-",
-            "a command, such as slew 0.2; units as in its form",
+            "command in words, such as slew 0.2, with the units of its fields",
         ),
     ),
     telecommand=True,
-    hazard="does later what the command does",
+    hazard="executes the command later",
 )
 UNSCHEDULE = Packet(
     "unschedule",
     0x221,
     "at will",
     "Delete a scheduled command",
-    (Field("number", "u4", "-", "as the list has it; 0: all"),),
+    (Field("number", "u4", "-", "number in the list; 0 deletes all"),),
     telecommand=True,
 )
 LIST = Packet("list-schedule", 0x222, "at will", "Report each scheduled command", (), telecommand=True)

@@ -21,6 +21,7 @@ from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
 
 Range = tuple[float, float]
 States = tuple[tuple[int, str], ...]
+NO_YES: States = ((0, "no"), (1, "yes"))
 Level = Literal["warning", "fault"]
 Alarms = tuple[tuple[int, Level], ...]
 
@@ -66,6 +67,11 @@ def counter(name: str, meaning: str, kind: str = "u4") -> Field:
     return Field(name, kind, "-", meaning, wraps=True)
 
 
+def flag(name: str, meaning: str) -> Field:
+    """Return the field of a condition, no or yes."""
+    return Field(name, "u1", "-", meaning, states=NO_YES)
+
+
 @dataclass(frozen=True, slots=True)
 class Packet:
     """One packet: its application process identifier (APID), rate and fields.
@@ -88,22 +94,34 @@ def _parameter(key: str, unit: str, low: float, high: float, meaning: str) -> Fi
 
 
 PARAMETER_FIELDS: tuple[Field, ...] = (
-    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "a slew has arrived within this angle"),
-    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "and below this rate"),
-    _parameter("modes.arrived_for", "s", 0.1, 600.0, "for this time"),
-    _parameter("modes.slew_limit", "s", 1.0, 1e5, "a slew that takes longer is late"),
-    _parameter("modes.hold_error", "rad", 1e-3, math.pi, "a hold that is off by more is impossible"),
-    _parameter("modes.hold_patience", "s", 0.1, 3600.0, "once it was for this time"),
-    _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "a faster body is braked"),
-    _parameter("modes.blind_limit", "s", 1.0, 1e5, "without an estimate for longer the mode is safe"),
-    _parameter("modes.known_for", "s", 0.1, 3600.0, "attitude known for this time ends the acquisition"),
-    _parameter("modes.lost_for", "s", 0.1, 3600.0, "attitude lost for this time begins it again"),
-    _parameter("health.cpu_share", "-", 0.01, 64.0, "of one core: the control process takes more"),
-    _parameter("health.memory", "B", 1e6, 1e12, "the flight processes take more memory"),
-    _parameter("health.memory_slope", "B/h", 1e3, 1e12, "it grows faster"),
-    _parameter("health.disk_free", "B", 1.0, 1e13, "the disk has less left"),
-    _parameter("health.temperature", "degree C", -40.0, 150.0, "the board is warm beyond it"),
-    _parameter("health.hottest", "degree C", -40.0, 150.0, "and too hot beyond it"),
+    _parameter("modes.arrived_angle", "rad", 1e-4, 0.5, "largest angle error of an arrived slew"),
+    _parameter("modes.arrived_rate", "rad/s", 1e-5, 0.5, "largest rate error of an arrived slew"),
+    _parameter(
+        "modes.arrived_for", "s", 0.1, 600.0, "time within both limits after which a slew has arrived"
+    ),
+    _parameter("modes.slew_limit", "s", 1.0, 1e5, "time after which a slew is late"),
+    _parameter(
+        "modes.hold_error", "rad", 1e-3, math.pi, "angle error above which an attitude cannot be held"
+    ),
+    _parameter("modes.hold_patience", "s", 0.1, 3600.0, "time above `hold_error` after which a hold fails"),
+    _parameter("modes.tumble_rate", "rad/s", 1e-3, 10.0, "rate above which the body is detumbled"),
+    _parameter("modes.blind_limit", "s", 1.0, 1e5, "time without an estimate after which the mode is safe"),
+    _parameter("modes.known_for", "s", 0.1, 3600.0, "time with an attitude after which acquisition ends"),
+    _parameter(
+        "modes.lost_for",
+        "s",
+        0.1,
+        3600.0,
+        "time without an attitude after which acquisition starts",
+    ),
+    _parameter("health.cpu_share", "-", 0.01, 64.0, "largest processor share of the control process"),
+    _parameter("health.memory", "B", 1e6, 1e12, "largest memory of all flight processes"),
+    _parameter("health.memory_slope", "B/h", 1e3, 1e12, "largest growth of the memory of all processes"),
+    _parameter("health.disk_free", "B", 1.0, 1e13, "smallest free disk space"),
+    _parameter("health.temperature", "degree C", -40.0, 150.0, "board temperature that causes a warning"),
+    _parameter(
+        "health.hottest", "degree C", -40.0, 150.0, "board temperature at which the mode changes to safe"
+    ),
 )
 """Fields of the parameters, in their order in the packets."""
 
@@ -112,7 +130,7 @@ PARAMETER_KEYS: tuple[str, ...] = tuple(parameter.name.replace("_", ".", 1) for 
 
 
 def crc_of(values: Sequence[float]) -> int:
-    """Return the CRC-32 of a table's values, as big-endian doubles in the order of `KEYS`."""
+    """Return the CRC-32 of a table's values, as big-endian doubles in the order of `PARAMETER_KEYS`."""
     return zlib.crc32(struct.pack(f">{len(PARAMETER_FIELDS)}d", *values))
 
 
@@ -130,8 +148,7 @@ def problem_of(values: Mapping[str, float]) -> str:
 
 
 TABLES: States = ((0, "configuration"), (1, "loaded"))
-"""Where the table of parameters comes from that flies."""
-NO_YES: States = ((0, "no"), (1, "yes"))
+"""Source of the table of parameters in use."""
 MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
@@ -139,7 +156,7 @@ STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking")
 STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
 """The quality of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
-"""How well the attitude is known (`flight.bodies.orbit.body`)."""
+"""Quality of the attitude estimate (`flight.bodies.orbit.body`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
 """The coils, by body axis."""
 STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
@@ -196,7 +213,7 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("wide-lost", "warning"),
     ("wide-false", "warning"),
 )
-"""The facts that monitors keep, in the order of `flight.loop.facts`, as grave as their events."""
+"""Conditions that monitors detect, in the order of `flight.loop.facts`, with the severity of their events."""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))
 FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS))
 
@@ -205,20 +222,20 @@ RUN = Packet(
     "run",
     0x101,
     "once, at start",
-    "What is being flown",
+    "Configuration, software and devices of the run",
     (
         Field("config_name", "S64", "-", "name of the configuration"),
-        Field("config_crc", "u4", "-", "CRC-32 of the configuration as it stands in the run's folder"),
+        Field("config_crc", "u4", "-", "CRC-32 of the configuration in the folder of the run"),
         Field("software", "S32", "-", "version of the flight application"),
         Field("seed", "u8", "-", "seed of the simulation, 0 on hardware"),
-        Field("utc_ns", "i8", "ns", "UTC at mission time zero, nanoseconds since 1970: a label only"),
-        Field("simulated", "u1", "-", "the devices are emulated", states=NO_YES),
-        Field("realtime", "u1", "-", "flown on the machine's clock; no: in lock-step", states=NO_YES),
+        Field("utc_ns", "i8", "ns", "UTC at mission time zero since 1970; only a label"),
+        flag("simulated", "whether the devices are emulated"),
+        flag("realtime", "whether the run uses the machine's clock; no means lock-step simulation"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
-        Field("duration", "f8", "s", "planned length of the run, NaN when open"),
-        Field("coil_resistance", "f8", "ohm", "resistance of each coil, NaN where none is fitted", 3),
-        Field("supply_voltage", "f8", "V", "coil supply after losses, as configured"),
-        Field("current_limit", "f8", "A", "largest current that a coil may carry"),
+        Field("duration", "f8", "s", "planned duration of the run; NaN for an unlimited run"),
+        Field("coil_resistance", "f8", "ohm", "resistance of each coil; NaN if not fitted", 3),
+        Field("supply_voltage", "f8", "V", "configured supply voltage of the coils after losses"),
+        Field("current_limit", "f8", "A", "largest permitted current of a coil"),
     ),
 )
 
@@ -226,13 +243,13 @@ EVENT = Packet(
     "event",
     0x130,
     "when it happens",
-    "Something a reader of the log at night wants to know",
+    "An event of the flight",
     (
         Field("code", "u2", "-", "number of the event (flight.link.events)"),
-        Field("severity", "u1", "-", "how grave it is", states=SEVERITIES, alarms=SEVERITY_ALARMS),
-        counter("suppressed", "how many of its kind the throttle held back since the last report"),
+        Field("severity", "u1", "-", "severity of the event", states=SEVERITIES, alarms=SEVERITY_ALARMS),
+        counter("suppressed", "events of this kind that the rate limit suppressed since the last report"),
         Field("name", "S32", "-", "name of the event"),
-        Field("text", "S160", "-", "what happened, with its values"),
+        Field("text", "S160", "-", "description of the event with values"),
     ),
 )
 
@@ -240,24 +257,24 @@ HOUSEKEEPING = Packet(
     "housekeeping",
     0x131,
     "1 Hz",
-    "Health of the devices and of the loop",
+    "Counters and measurements of the devices and the loop",
     (
         Field("state", "u1", "-", "use of the coils", states=STEERING),
-        counter("imu_packets", "packets accepted since start"),
-        counter("imu_bad_checksum", "packets with a wrong checksum"),
-        counter("imu_discarded_bytes", "bytes that belonged to no packet"),
-        counter("imu_out_of_range", "packets with implausible values"),
-        counter("imu_not_finite", "packets with NaN or infinity"),
+        counter("imu_packets", "packets of the inertial unit accepted since start"),
+        counter("imu_bad_checksum", "packets of the inertial unit with a wrong checksum"),
+        counter("imu_discarded_bytes", "bytes from the inertial unit that belonged to no packet"),
+        counter("imu_out_of_range", "packets of the inertial unit with values out of range"),
+        counter("imu_not_finite", "packets of the inertial unit with NaN or infinity"),
         counter("coil_faults", "failed transactions with the PWM chip"),
-        Field("coil_voltage", "f8", "V", "voltage of the bus before the bridges, measured; NaN when unknown"),
-        Field("coil_current", "f8", "A", "current from the bus to the coils, measured; NaN when unknown"),
-        Field("coil_power", "f8", "W", "power from the bus to the coils, measured; NaN when unknown"),
+        Field("coil_voltage", "f8", "V", "measured supply voltage of the bridges; NaN if unknown"),
+        Field("coil_current", "f8", "A", "measured supply current of the coils; NaN if unknown"),
+        Field("coil_power", "f8", "W", "measured supply power of the coils; NaN if unknown"),
         counter("plans_accepted", "plans flown since start"),
-        counter("plans_refused", "plans refused since start"),
+        counter("plans_refused", "plans rejected since start"),
         counter("frames", "frames received since start"),
-        counter("streak_rates", "rates from streaks that entered the estimate"),
-        counter("events", "events since start, suppressed ones counted"),
-        counter("records_lost", "records since start whose values did not fit their packet"),
+        counter("streak_rates", "rates from star streaks that the estimate used"),
+        counter("events", "events since start, including suppressed events"),
+        counter("records_lost", "records lost since start because their values did not fit their packet"),
     ),
     version=2,
 )
@@ -266,26 +283,26 @@ HEALTH = Packet(
     "health",
     0x132,
     "1 Hz",
-    "Mode, streams, facts and resources",
+    "Mode, streams of readings, facts and resources of the board",
     (
-        Field("mode", "u1", "-", "what the satellite does", states=MODES, alarms=SAFE_ALARM),
+        Field("mode", "u1", "-", "current mode", states=MODES, alarms=SAFE_ALARM),
         Field("mode_age", "f8", "s", "time in this mode"),
-        Field("imu", "u1", "-", "the inertial unit", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("field", "u1", "-", "the magnetometer", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("coils", "u1", "-", "acknowledged commands of the coils", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("power", "u1", "-", "the current monitor", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("camera", "u1", "-", "the camera's frames", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("facts", "u8", "-", "what the monitors find", bits=FACTS, alarms=FACT_ALARMS),
-        Field("coils_in_use", "u1", "-", "the coils that control uses", bits=COILS),
-        counter("fed", "how often the watchdog was fed"),
-        counter("slips", "slots of the control group skipped since start"),
-        counter("clock_steps", "how often the wall clock was set"),
-        Field("cpu_share", "f8", "-", "processor time of the control process over time; NaN when unknown"),
-        Field("resident", "f8", "B", "resident set of the control process; NaN when unknown"),
-        Field("proportional", "f8", "B", "proportional set of all flight processes; NaN when unknown"),
-        Field("memory_slope", "f8", "B/s", "of the proportional set, by least squares; NaN when unknown"),
-        Field("disk_free", "f8", "B", "room for the flight log; NaN when unknown"),
-        Field("temperature", "f8", "deg C", "of the warmest zone of the board; NaN when unknown"),
+        Field("imu", "u1", "-", "readings of the inertial unit", states=STREAMS, alarms=STREAM_ALARMS),
+        Field("field", "u1", "-", "readings of the magnetometer", states=STREAMS, alarms=STREAM_ALARMS),
+        Field("coils", "u1", "-", "acknowledgements of the coils", states=STREAMS, alarms=STREAM_ALARMS),
+        Field("power", "u1", "-", "readings of the current monitor", states=STREAMS, alarms=STREAM_ALARMS),
+        Field("camera", "u1", "-", "frames of the camera", states=STREAMS, alarms=STREAM_ALARMS),
+        Field("facts", "u8", "-", "conditions that the monitors found", bits=FACTS, alarms=FACT_ALARMS),
+        Field("coils_in_use", "u1", "-", "coils in use by control", bits=COILS),
+        counter("fed", "number of times the watchdog was fed"),
+        counter("slips", "control cycles skipped since start"),
+        counter("clock_steps", "number of changes of the wall clock"),
+        Field("cpu_share", "f8", "-", "processor share of the control process; NaN if unknown"),
+        Field("resident", "f8", "B", "resident memory of the control process; NaN if unknown"),
+        Field("proportional", "f8", "B", "proportional memory of all flight processes; NaN if unknown"),
+        Field("memory_slope", "f8", "B/s", "growth of the proportional memory; NaN if unknown"),
+        Field("disk_free", "f8", "B", "free disk space for the flight log; NaN if unknown"),
+        Field("temperature", "f8", "deg C", "highest temperature of the board; NaN if unknown"),
     ),
 )
 
@@ -293,20 +310,20 @@ COMMAND = Packet(
     "command",
     0x133,
     "each command",
-    "What became of a command; also the answer to whoever sent it",
+    "Outcome of a command, also sent as the answer to its sender",
     (
-        Field("obeyed", "u1", "-", "no: refused", states=NO_YES),
-        Field("name", "S16", "-", "name of the command; empty for bytes that are none"),
-        Field("source", "S16", "-", "socket, udp or timeline"),
-        counter("count", "commands since start"),
-        Field("mode", "u1", "-", "mode after it", states=MODES),
-        Field("text", "S128", "-", "its values, or why it was refused"),
+        flag("obeyed", "whether the command was executed; no means refused"),
+        Field("name", "S16", "-", "name of the command; empty for bytes that are no command"),
+        Field("source", "S16", "-", "source of the command: socket, udp or timeline"),
+        counter("count", "commands received since start"),
+        Field("mode", "u1", "-", "mode after the command", states=MODES),
+        Field("text", "S128", "-", "values of the command, or the reason of its refusal"),
     ),
 )
 
 
 MAX_NODES = 40
-"""Room for the nodes of a path."""
+"""Maximum number of nodes of a path in its packet."""
 
 _Q2 = Limits(fault=(-Q2_LIMIT, Q2_LIMIT))
 
@@ -314,11 +331,11 @@ IMU = Packet(
     "imu",
     0x110,
     "40 Hz",
-    "One sample of the inertial unit as the driver gave it",
+    "One sample of the inertial unit",
     (
         Field("sample_time_ns", "i8", "ns", "mission time of the sample"),
-        Field("device_time_ns", "u8", "ns", "the unit's own clock"),
-        Field("quaternion", "f8", "-", "reference frame into body, scalar last", 4),
+        Field("device_time_ns", "u8", "ns", "time of the unit's own clock"),
+        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last", 4),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
         Field("field", "f8", "T", "magnetic field, body axes", 3),
         Field("acceleration", "f8", "m/s^2", "specific force, body axes", 3),
@@ -331,22 +348,22 @@ CONTROL = Packet(
     "40 Hz",
     "One control cycle: estimate, path, command",
     (
-        Field("cycle", "u8", "-", "slot of the control grid since start, skipped ones counted"),
+        Field("cycle", "u8", "-", "number of the control cycle since start, including skipped cycles"),
         Field("state", "u1", "-", "use of the coils", states=STEERING),
         Field("estimate_age", "f8", "s", "age of the newest measurement in the estimate"),
-        Field("angle", "f8", "rad", "estimated turn about the thread"),
+        Field("angle", "f8", "rad", "estimated rotation angle about the thread"),
         Field("q2", "f8", "-", "estimated second quaternion component"),
         Field("rate", "f8", "rad/s", "estimated rate about the thread"),
         Field("angle_sigma", "f8", "rad", "standard deviation of the angle"),
         Field("rate_sigma", "f8", "rad/s", "standard deviation of the rate"),
         Field("target_q2", "f8", "-", "commanded final q2", limits=_Q2),
-        Field("path_q2", "f8", "-", "planned q2 now", limits=_Q2),
-        Field("path_rate", "f8", "rad/s", "planned rate now"),
-        Field("path_acceleration", "f8", "rad/s^2", "planned angular acceleration now"),
-        counter("plan", "number of the plan being flown, 0 when none"),
-        Field("current_command", "f8", "A", "currents asked of the coils", 3),
-        Field("current_written", "f8", "A", "currents on the wire, limited and quantised", 3),
-        Field("saturated", "u1", "-", "a coil was limited", states=NO_YES),
+        Field("path_q2", "f8", "-", "current q2 of the path", limits=_Q2),
+        Field("path_rate", "f8", "rad/s", "current rate of the path"),
+        Field("path_acceleration", "f8", "rad/s^2", "current angular acceleration of the path"),
+        counter("plan", "number of the plan in use, 0 for none"),
+        Field("current_command", "f8", "A", "requested currents of the coils", 3),
+        Field("current_written", "f8", "A", "currents written to the PWM chip, limited and quantised", 3),
+        flag("saturated", "whether the current of a coil was limited"),
     ),
     version=2,
 )
@@ -355,17 +372,17 @@ ATTITUDE = Packet(
     "attitude",
     0x114,
     "10 Hz",
-    "The attitude of any body: estimate, path, target, dipole",
+    "Attitude estimate, path, target and dipole of any body",
     (
-        Field("mode", "u1", "-", "what the satellite does", states=MODES),
-        Field("quaternion", "f8", "-", "estimated, reference frame into body, scalar last", 4),
+        Field("mode", "u1", "-", "current mode", states=MODES),
+        Field("quaternion", "f8", "-", "estimated rotation of reference frame into body, scalar last", 4),
         Field("rate", "f8", "rad/s", "estimated body rate, body axes", 3),
-        Field("angle_sigma", "f4", "rad", "standard deviation of small turns about the body's axes", 3),
+        Field("angle_sigma", "f4", "rad", "standard deviation of the attitude about the body axes", 3),
         Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate", 3),
-        Field("wanted", "f8", "-", "attitude of the path now, NaN without a path", 4),
-        Field("wanted_rate", "f8", "rad/s", "rate of the path now, body axes", 3),
-        Field("target", "f8", "-", "attitude to be reached, NaN without a target", 4),
-        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
+        Field("wanted", "f8", "-", "current attitude of the path; NaN without a path", 4),
+        Field("wanted_rate", "f8", "rad/s", "current rate of the path, body axes", 3),
+        Field("target", "f8", "-", "target attitude; NaN without a target", 4),
+        Field("dipole", "f4", "A m^2", "commanded dipole of the coils, body axes", 3),
     ),
 )
 
@@ -375,7 +392,7 @@ TARGET = Packet(
     "at each command",
     "A new commanded attitude",
     (
-        counter("index", "number of the step, from 0; of a commanded slew from 1001"),
+        counter("index", "number of the step from 0, or of a commanded slew from 1001"),
         Field("q2", "f8", "-", "commanded final q2", limits=_Q2),
         Field("rate", "f8", "rad/s", "commanded final rate"),
     ),
@@ -386,13 +403,13 @@ MODE = Packet(
     "mode",
     0x113,
     "at each change",
-    "A new mode, and what led to it",
+    "A change of the mode with its cause",
     (
-        Field("before", "u1", "-", "mode until now", states=MODES),
-        Field("mode", "u1", "-", "mode from now on", states=MODES),
-        Field("trigger", "S32", "-", "what led to it (flight.loop.modes)"),
-        Field("reason", "S96", "-", "of the trigger: the event, the values"),
-        Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
+        Field("before", "u1", "-", "mode before the change", states=MODES),
+        Field("mode", "u1", "-", "mode after the change", states=MODES),
+        Field("trigger", "S32", "-", "trigger of the change (flight.loop.modes)"),
+        Field("reason", "S96", "-", "event or values that caused the trigger"),
+        Field("target_q2", "f8", "-", "target q2 of a hold or slew; NaN if not known yet"),
     ),
 )
 
@@ -400,22 +417,22 @@ PLAN = Packet(
     "plan",
     0x120,
     "every 5 s",
-    "One result of the path planner, flown or not",
+    "One result of the path planner",
     (
         counter("number", "number of the plan, from 1"),
-        Field("accepted", "u1", "-", "flown", states=NO_YES),
-        Field("status", "S32", "-", "optimal, stretched, or the reason of refusal"),
-        Field("origin_ns", "i8", "ns", "mission time of the path's start"),
-        Field("horizon_asked", "f8", "s", "horizon asked for"),
-        Field("horizon", "f8", "s", "horizon planned"),
-        Field("start_q2", "f8", "-", "q2 at the start"),
-        Field("start_rate", "f8", "rad/s", "rate at the start"),
-        Field("target_q2", "f8", "-", "q2 at the end"),
-        Field("cost", "f8", "J", "planned integral of R I^2"),
+        flag("accepted", "whether the plan is flown"),
+        Field("status", "S32", "-", "optimal, stretched, or the reason of the rejection"),
+        Field("origin_ns", "i8", "ns", "mission time of the start of the path"),
+        Field("horizon_asked", "f8", "s", "requested horizon"),
+        Field("horizon", "f8", "s", "planned horizon"),
+        Field("start_q2", "f8", "-", "q2 at the start of the path"),
+        Field("start_rate", "f8", "rad/s", "rate at the start of the path"),
+        Field("target_q2", "f8", "-", "q2 at the end of the path"),
+        Field("cost", "f8", "J", "planned integral of R I^2 over the path"),
         Field("peak_current", "f8", "A", "largest current between and on the nodes"),
-        Field("evaluations", "u4", "-", "evaluations of the cost"),
-        Field("nodes", "u1", "-", "number of nodes in use"),
-        Field("node_q2", "f8", "-", "q2 on the Legendre-Gauss-Lobatto nodes, NaN past the last", MAX_NODES),
+        Field("evaluations", "u4", "-", "number of evaluations of the cost function"),
+        Field("nodes", "u1", "-", "number of nodes of the path"),
+        Field("node_q2", "f8", "-", "q2 at the Legendre-Gauss-Lobatto nodes; NaN if unused", MAX_NODES),
     ),
 )
 
@@ -423,11 +440,11 @@ TRUTH = Packet(
     "truth",
     0x140,
     "40 Hz, simulation only",
-    "What the simulated world really did; written by sim_hal into a log of its own",
+    "True state of the simulated world, which sim_hal writes to a separate log",
     (
-        Field("quaternion", "f8", "-", "reference frame into body, scalar last", 4),
+        Field("quaternion", "f8", "-", "rotation of reference frame into body, scalar last", 4),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("current", "f8", "A", "mean coil currents as the world felt them", 3),
+        Field("current", "f8", "A", "true mean currents of the coils", 3),
         Field("energy", "f8", "J", "integral of R I^2 over all coils since mission time zero"),
         Field("supply_energy", "f8", "J", "integral of V |I| over all coils since mission time zero"),
     ),
@@ -438,14 +455,14 @@ SPIN = Packet(
     "spin",
     0x115,
     "4 Hz",
-    "The rate by the magnetometer alone, of a satellite in orbit",
+    "Rate of a satellite in orbit from the magnetometer alone",
     (
-        Field("known", "u1", "-", "enough samples of the field agree", states=NO_YES),
+        flag("known", "whether enough samples of the field agree"),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
+        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate about its worst axis"),
         Field("field", "f8", "T", "magnetic field, body axes", 3),
-        counter("restarts", "how often the samples contradicted the rate until it was found again"),
-        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
+        counter("restarts", "number of restarts because the samples contradicted the rate"),
+        Field("dipole", "f4", "A m^2", "commanded dipole of the coils, body axes", 3),
     ),
 )
 
@@ -453,16 +470,18 @@ NAVIGATION = Packet(
     "navigation",
     0x116,
     "1 Hz",
-    "How well a satellite in orbit knows its attitude, and what its filter has learned",
+    "Quality of a satellite's attitude estimate, and the constants that its filter has learned",
     (
-        Field("knowledge", "u1", "-", "of the attitude", states=KNOWLEDGE, alarms=LOST_ALARM),
-        Field("placed", "u1", "-", "the orbit is known", states=NO_YES),
-        counter("refused", "measurements that did not pass their gate, replays included"),
-        counter("fixes_refused", "GPS fixes that contradict what is known of the orbit"),
-        counter("restarts", "how often the estimate was discarded for a new one"),
-        Field("gyro_bias", "f8", "rad/s", "body axes, NaN before an estimate", 3),
-        Field("field_bias", "f8", "T", "of the magnetometer, body axes", 3),
-        Field("residual_dipole", "f8", "A m^2", "in the present light, body axes", 3),
+        Field(
+            "knowledge", "u1", "-", "quality of the attitude estimate", states=KNOWLEDGE, alarms=LOST_ALARM
+        ),
+        flag("placed", "whether the orbit is known"),
+        counter("refused", "rejected measurements, including those of replays"),
+        counter("fixes_refused", "GPS fixes that contradict the known orbit"),
+        counter("restarts", "number of times the estimate was discarded and restarted"),
+        Field("gyro_bias", "f8", "rad/s", "gyro bias, body axes; NaN before the first estimate", 3),
+        Field("field_bias", "f8", "T", "magnetometer bias, body axes", 3),
+        Field("residual_dipole", "f8", "A m^2", "residual dipole in the current sunlight, body axes", 3),
     ),
 )
 
@@ -470,20 +489,18 @@ DIRECTIONS = Packet(
     "directions",
     0x117,
     "each round of the wide cameras",
-    "The Sun and nadir that the wide cameras show, of a satellite in orbit",
+    "Directions of the Sun and nadir from the wide cameras of a satellite in orbit",
     (
-        Field("middle_ns", "i8", "ns", "mission time of the exposures' middle"),
-        Field("frames", "u1", "-", "cameras whose frames were read, by bits"),
-        Field("sun", "f8", "-", "direction of the Sun, body axes; NaN when none", 3),
-        Field("sun_sigma", "f4", "rad", "standard deviation of an axis; NaN when none"),
-        Field(
-            "sun_cameras", "u1", "-", "the camera that shows it, by bits; none: the solar strings stand in"
-        ),
-        Field("sun_used", "u1", "-", "entered the estimate", states=NO_YES),
-        Field("nadir", "f8", "-", "direction of nadir, body axes; NaN when none", 3),
-        Field("nadir_sigma", "f4", "rad", "standard deviation of an axis; NaN when none"),
-        Field("nadir_cameras", "u1", "-", "those whose limb gave it, by bits; none: the light in all frames"),
-        Field("nadir_used", "u1", "-", "entered the estimate", states=NO_YES),
+        Field("middle_ns", "i8", "ns", "mission time of the middle of the exposures"),
+        Field("frames", "u1", "-", "bit mask of the cameras whose frames were read"),
+        Field("sun", "f8", "-", "direction of the Sun, body axes; NaN if unknown", 3),
+        Field("sun_sigma", "f4", "rad", "standard deviation per axis; NaN if unknown"),
+        Field("sun_cameras", "u1", "-", "bit mask of the cameras that show the Sun; 0: solar strings"),
+        flag("sun_used", "whether the estimate used the Sun's direction"),
+        Field("nadir", "f8", "-", "direction of nadir, body axes; NaN if unknown", 3),
+        Field("nadir_sigma", "f4", "rad", "standard deviation per axis; NaN if unknown"),
+        Field("nadir_cameras", "u1", "-", "bit mask of the cameras that show the limb; 0: brightness of all"),
+        flag("nadir_used", "whether the estimate used the nadir"),
     ),
 )
 
@@ -491,20 +508,20 @@ ORBIT_TRUTH = Packet(
     "orbit_truth",
     0x141,
     "1 Hz, simulation of an orbit only",
-    "What surrounded the satellite and turned it; written by sim_hal beside truth; NaN is not known",
+    "True environment and torques of the simulated satellite, which sim_hal writes; NaN if unknown",
     (
         Field("utc", "f8", "day", "Julian date UTC of the simulated world"),
-        Field("position", "f8", "m", "geocentric, ICRS", 3),
-        Field("velocity", "f8", "m/s", "ICRS", 3),
-        Field("field", "f8", "T", "of the Earth, ICRS", 3),
+        Field("position", "f8", "m", "geocentric position, ICRS", 3),
+        Field("velocity", "f8", "m/s", "geocentric velocity, ICRS", 3),
+        Field("field", "f8", "T", "magnetic field of the Earth, ICRS", 3),
         Field("sun", "f8", "-", "direction of the Sun, ICRS", 3),
-        Field("sunlit", "f8", "-", "share of the Sun's disc that is seen"),
-        Field("residual_dipole", "f8", "A m^2", "body axes", 3),
-        Field("coil_torque", "f8", "N m", "body axes", 3),
-        Field("dipole_torque", "f8", "N m", "of the residual dipole, body axes", 3),
-        Field("gravity_torque", "f8", "N m", "of the gravity gradient, body axes", 3),
-        Field("drag_torque", "f8", "N m", "body axes", 3),
-        Field("sunlight_torque", "f8", "N m", "body axes", 3),
+        Field("sunlit", "f8", "-", "visible share of the Sun's disc"),
+        Field("residual_dipole", "f8", "A m^2", "true residual dipole, body axes", 3),
+        Field("coil_torque", "f8", "N m", "torque of the coils, body axes", 3),
+        Field("dipole_torque", "f8", "N m", "torque of the residual dipole, body axes", 3),
+        Field("gravity_torque", "f8", "N m", "torque of the gravity gradient, body axes", 3),
+        Field("drag_torque", "f8", "N m", "torque of air drag, body axes", 3),
+        Field("sunlight_torque", "f8", "N m", "torque of solar pressure, body axes", 3),
     ),
 )
 
@@ -513,19 +530,25 @@ STREAK = Packet(
     "streak",
     0x121,
     "each frame",
-    "What vision found in one frame",
+    "Star streaks in one frame, and the rate from them",
     (
-        counter("sequence", "the camera's count"),
-        Field("exposure_start_ns", "i8", "ns", "mission time of the exposure's start"),
+        counter("sequence", "frame number of the camera"),
+        Field("exposure_start_ns", "i8", "ns", "mission time of the start of the exposure"),
         Field("exposure", "f8", "s", "exposure time"),
         Field("status", "S32", "-", "rate, ambiguous, too-short, too-few, failed, black, saturated, frozen"),
         Field("streaks", "u2", "-", "streaks found"),
         Field("used", "u2", "-", "streaks used in the rate"),
         Field("length", "f8", "px", "median length of the streaks"),
-        Field("rate", "f8", "rad/s", "mean body rate over the exposure, body axes; NaN when none", 3),
-        Field("covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate, body axes; NaN when none", 6),
-        Field("residual", "f8", "rad", "rms residual of the endpoints; NaN when none"),
-        Field("accepted", "u1", "-", "entered the estimate", states=NO_YES),
+        Field("rate", "f8", "rad/s", "mean body rate over the exposure, body axes; NaN if unknown", 3),
+        Field(
+            "covariance",
+            "f8",
+            "rad^2/s^2",
+            "xx yy zz xy xz yz of the rate's covariance, body axes; NaN if unknown",
+            6,
+        ),
+        Field("residual", "f8", "rad", "rms residual of the end points; NaN without a result"),
+        flag("accepted", "whether the estimate used the rate"),
     ),
 )
 
@@ -533,42 +556,40 @@ STARS = Packet(
     "stars",
     0x122,
     "each frame",
-    "Which stars one frame shows, and the attitude that they give",
+    "Stars in one frame, and the attitude from them",
     (
-        counter("sequence", "the camera's count"),
-        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
+        counter("sequence", "frame number of the camera"),
+        Field("middle_ns", "i8", "ns", "mission time of the middle of the exposure"),
         Field("status", "S32", "-", "solved, no-stars, too-few-stars, no-match, ambiguous"),
+        flag("tracked", "whether the search began at the estimated attitude; no means lost in space"),
+        Field("found", "u2", "-", "detected stars"),
+        Field("matched", "u2", "-", "detected stars that match guide stars"),
+        Field("quaternion", "f8", "-", "reference frame into body, scalar last; NaN if unknown", 4),
         Field(
-            "tracked",
-            "u1",
-            "-",
-            "searched at the estimate's attitude; no: lost in space",
-            states=NO_YES,
+            "covariance", "f8", "rad^2", "xx yy zz xy xz yz of its covariance, body axes; NaN if unknown", 6
         ),
-        Field("found", "u2", "-", "what was taken for a star"),
-        Field("matched", "u2", "-", "of them guide stars"),
-        Field("quaternion", "f8", "-", "reference into body, scalar last; NaN when none", 4),
-        Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of small turns, body axes; NaN when none", 6),
-        Field("log10_false_alarm", "f8", "-", "log10 of the chance matches expected in the whole sky"),
-        Field("accepted", "u1", "-", "entered the estimate", states=NO_YES),
+        Field(
+            "log10_false_alarm", "f8", "-", "log10 of the expected number of chance matches in the whole sky"
+        ),
+        flag("accepted", "whether the estimate used the attitude"),
     ),
 )
 
 MOST_SIGHTINGS = 8
-"""Of a frame that its packet holds."""
+"""Maximum number of sightings in a packet."""
 
 SIGHTINGS = Packet(
     "sightings",
     0x123,
     "each frame searched for objects",
-    "What in one frame is no star: objects, and what only tracks over frames distinguish from them",
+    "Detections in one frame that match no star, such as moving objects",
     (
-        counter("sequence", "the camera's count"),
-        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
-        Field("found", "u2", "-", "sightings, of which the packet holds the brightest"),
-        Field("x", "f4", "px", "column of each, brightest first; NaN for none", MOST_SIGHTINGS),
-        Field("y", "f4", "px", "row of each; NaN for none", MOST_SIGHTINGS),
-        Field("magnitude", "f4", "mag", "V by the frame's stars; NaN when unknown", MOST_SIGHTINGS),
+        counter("sequence", "frame number of the camera"),
+        Field("middle_ns", "i8", "ns", "mission time of the middle of the exposure"),
+        Field("found", "u2", "-", "number of sightings; the packet holds the brightest of them"),
+        Field("x", "f4", "px", "column of each sighting, brightest first; NaN if unused", MOST_SIGHTINGS),
+        Field("y", "f4", "px", "row of each sighting; NaN if unused", MOST_SIGHTINGS),
+        Field("magnitude", "f4", "mag", "magnitude V of each sighting; NaN if unknown", MOST_SIGHTINGS),
     ),
 )
 
@@ -576,26 +597,29 @@ TRACK = Packet(
     "track",
     0x124,
     "each object in each frame searched",
-    "The line of sight to an object, tracked over frames; directions in the axes of the attitude's reference",
+    "Line of sight to an object, tracked over frames, in the reference frame of the attitude",
     (
-        Field("number", "u4", "-", "of the object in this flight, from 1"),
-        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
-        Field("seen", "u1", "-", "the frame shows it; no: predicted", states=NO_YES),
-        Field("sightings", "u4", "-", "since the start of the track"),
-        Field("measured", "f8", "-", "direction in this frame; NaN when not seen", 3),
+        Field("number", "u4", "-", "number of the object in this flight, from 1"),
+        Field("middle_ns", "i8", "ns", "mission time of the middle of the exposure"),
+        flag("seen", "whether the frame shows the object; no means predicted"),
+        Field("sightings", "u4", "-", "sightings since the start of the track"),
+        Field("measured", "f8", "-", "measured direction in this frame; NaN if not detected", 3),
         Field(
-            "measured_sigma", "f8", "rad", "along an axis, the attitude's share included; NaN when not seen"
+            "measured_sigma",
+            "f8",
+            "rad",
+            "standard deviation per axis, with that of the attitude; NaN if none",
         ),
-        Field("direction", "f8", "-", "of the track", 3),
-        Field("rate", "f8", "rad/s", "change of the direction", 3),
-        Field("acceleration", "f8", "rad/s^2", "change of the rate, at right angles to the direction", 3),
-        Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of the direction", 6),
-        Field("rate_covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate", 6),
-        Field("magnitude", "f8", "mag", "V, mean over the last sightings; NaN when unknown"),
-        Field("magnitude_sigma", "f8", "mag", "of that, by their scatter; NaN when unknown"),
-        Field("place", "f8", "m", "of the camera, about the Earth's centre; NaN when unknown", 3),
-        Field("velocity", "f8", "m/s", "likewise", 3),
-        Field("place_sigma", "f8", "m", "of an axis of the place"),
+        Field("direction", "f8", "-", "estimated direction to the object", 3),
+        Field("rate", "f8", "rad/s", "rate of change of the direction", 3),
+        Field("acceleration", "f8", "rad/s^2", "acceleration perpendicular to the direction", 3),
+        Field("covariance", "f8", "rad^2", "covariance xx yy zz xy xz yz of the direction", 6),
+        Field("rate_covariance", "f8", "rad^2/s^2", "covariance xx yy zz xy xz yz of the rate", 6),
+        Field("magnitude", "f8", "mag", "mean magnitude V of the last sightings; NaN if unknown"),
+        Field("magnitude_sigma", "f8", "mag", "standard deviation of the magnitude; NaN if unknown"),
+        Field("place", "f8", "m", "geocentric position of the camera; NaN if unknown", 3),
+        Field("velocity", "f8", "m/s", "geocentric velocity of the camera; NaN if unknown", 3),
+        Field("place_sigma", "f8", "m", "standard deviation of the position per axis"),
     ),
     version=2,
 )
@@ -605,12 +629,12 @@ PARAMETERS = Packet(
     "parameters",
     0x184,
     "at the start of a flight that takes commands, at each load, at will",
-    "The table of parameters that flies",
+    "Table of the parameters in use",
     (
-        counter("loads", "tables loaded, earlier boots included"),
+        counter("loads", "number of loaded tables, including earlier boots"),
         Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
-        Field("table", "u1", "-", "where it comes from", states=TABLES),
-        Field("kept", "u1", "-", "it outlives the process", states=NO_YES),
+        Field("table", "u1", "-", "source of the table", states=TABLES),
+        flag("kept", "whether the table is stored on disk"),
         *(replace(field, valid=None) for field in PARAMETER_FIELDS),
     ),
 )
@@ -620,27 +644,32 @@ LINK = Packet(
     "link",
     0x170,
     "1 Hz, of the link process; not in the flight log",
-    "Frames that came, by their fate, and the counters of the security associations",
+    "Counts of received frames, and counters of the security associations",
     (
-        counter("received", "frames that came since the link's start"),
-        counter("admitted", "of them let in"),
-        counter("refused_crc", "refused: the CRC is wrong"),
-        counter("refused_header", "refused: no frame of this spacecraft"),
-        counter("refused_spi", "refused: no association of that SPI"),
-        counter("refused_lost", "refused: both copies of the counter of that SPI are lost"),
-        counter("refused_mac", "refused: the MAC is wrong, as of a forgery or of an old key"),
-        counter("refused_repeated", "refused: the counter was used"),
-        counter("refused_beyond", "refused: the counter is 65,536 or more ahead"),
-        counter("refused_unstored", "refused: the counter could not be stored"),
-        counter("refused_command", "let in, but no command; no answer; or refused by the flight"),
-        Field("highest", "i8", "-", "highest accepted counter of SPI 1 and 2; -1 none yet, -2 lost", 2),
-        Field("generation", "u4", "-", "of the keys of SPI 1 to 4; 0 lost", 4),
-        Field("copies", "u1", "-", "good copies of the counters of SPI 1 to 4", 4),
-        counter("sent", "telemetry frames sent since the link's start"),
-        counter("thinned", "live packets left out for want of rate; the archive has them"),
-        Field("playing", "u1", "-", "the archive is played back", states=NO_YES),
-        Field("played_ns", "i8", "ns", "mission time that the playback has reached"),
-        counter("unreported", "reports of the link whose values did not fit, or that newer ones displaced"),
+        counter("received", "frames received since the start of the link"),
+        counter("admitted", "accepted frames"),
+        counter("refused_crc", "frames refused because of a wrong CRC"),
+        counter("refused_header", "frames refused because they are not for this spacecraft"),
+        counter("refused_spi", "frames refused because their SPI has no association"),
+        counter("refused_lost", "frames refused because both copies of the counter of their SPI are lost"),
+        counter("refused_mac", "frames refused because of a wrong MAC, for example a forgery or an old key"),
+        counter("refused_repeated", "frames refused because their counter was used before"),
+        counter("refused_beyond", "frames refused because their counter is 65,536 or more ahead"),
+        counter("refused_unstored", "frames refused because their counter could not be stored"),
+        counter(
+            "refused_command",
+            "accepted frames without a command, without an answer, or refused by the flight",
+        ),
+        Field("highest", "i8", "-", "highest accepted counter of SPI 1 and 2; -1 none, -2 lost", 2),
+        Field("generation", "u4", "-", "generation of the keys of SPI 1 to 4; 0 for lost", 4),
+        Field("copies", "u1", "-", "valid copies of the counters of SPI 1 to 4", 4),
+        counter("sent", "telemetry frames sent since the start of the link"),
+        counter("thinned", "live packets omitted because of the limited rate; the archive contains them"),
+        flag("playing", "whether a playback of the archive is running"),
+        Field("played_ns", "i8", "ns", "mission time of the newest packet of the playback"),
+        counter(
+            "unreported", "reports of the link that were lost because of invalid values or newer reports"
+        ),
     ),
     version=2,
 )
@@ -649,14 +678,14 @@ VERIFICATION = Packet(
     "verification",
     0x171,
     "at each step of a command, of the link process; not in the flight log",
-    "What became of a command that came by the link",
+    "Stage of a command that was received over the link",
     (
-        Field("spi", "u2", "-", "of its frame"),
-        Field("counter", "i8", "-", "of its frame: with the SPI its identifier; 2^63 - 1 for all beyond"),
-        Field("stage", "u1", "-", "how far the command is", states=STAGES),
-        Field("name", "S16", "-", "name of the command, empty for none"),
-        Field("text", "S128", "-", "its values, or the reason"),
-        Field("packet", "u2", "-", "first 16 bits of the command's packet, 0 where it was not read"),
+        Field("spi", "u2", "-", "SPI of the command's frame"),
+        Field("counter", "i8", "-", "counter of the command's frame; at most 2^63 - 1"),
+        Field("stage", "u1", "-", "stage of the command", states=STAGES),
+        Field("name", "S16", "-", "name of the command, empty if unknown"),
+        Field("text", "S128", "-", "values of the command, or the reason of the stage"),
+        Field("packet", "u2", "-", "first 16 bits of the command's packet; 0 if it was not read"),
         Field("sequence", "u2", "-", "sequence count of the command's packet"),
     ),
     version=2,
@@ -666,34 +695,34 @@ TRANSFER = Packet(
     "transfer",
     0x172,
     "1 Hz of each open transfer and at its end, of the link process; not in the flight log",
-    "How a file's transfer stands",
+    "Progress of a file transfer",
     (
-        Field("down", "u1", "-", "the satellite sends the file", states=NO_YES),
-        Field("source", "u2", "-", "entity that sends: 1 the satellite, 2 the ground, 3 another's ground"),
-        Field("number", "u4", "-", "of the transfer there"),
-        Field("name", "S96", "-", "of the file, empty while it is not known"),
-        Field("size", "u4", "bytes", "of the file"),
-        Field("done", "u4", "bytes", "sent and not asked for again; or received"),
-        Field("open", "u1", "-", "the transfer goes on", states=NO_YES),
-        Field("condition", "u1", "-", "why it ended, CCSDS 727.0-B condition code; 0 whole, or open"),
-        Field("text", "S64", "-", "how it ended"),
+        flag("down", "whether the satellite sends the file"),
+        Field("source", "u2", "-", "sending entity: 1 satellite, 2 ground, 3 another ground station"),
+        Field("number", "u4", "-", "number of the transfer at the sending entity"),
+        Field("name", "S96", "-", "name of the file, empty while it is unknown"),
+        Field("size", "u4", "bytes", "size of the file"),
+        Field("done", "u4", "bytes", "bytes received, or bytes sent and not requested again"),
+        flag("open", "whether the transfer continues"),
+        Field("condition", "u1", "-", "condition code of the end (CCSDS 727.0-B); 0 if complete or open"),
+        Field("text", "S64", "-", "reason of the end"),
     ),
 )
 
 
 _LATENESS = Limits(fault=(0.0, 0.0125))
-"""s, half a period of the demonstration's 40 Hz: a slot later than that is skipped."""
+"""Nominal delay of a control cycle, s: half a period of 40 Hz, after which the cycle is skipped."""
 _EXECUTION = Limits(warning=(0.0, 0.0125), fault=(0.0, 0.025))
 
 CYCLE_TIMING = Packet(
     "cycle_timing",
     0x150,
     "40 Hz, performance record",
-    "When a control cycle ran and how long it took, on the machine's clock",
+    "Start and duration of a control cycle on the machine's clock",
     (
-        Field("cycle", "u8", "-", "slot of the control grid"),
-        Field("lateness", "f8", "s", "start of the cycle after its slot", limits=_LATENESS),
-        Field("execution", "f8", "s", "time spent in the cycle", limits=_EXECUTION),
+        Field("cycle", "u8", "-", "number of the control cycle"),
+        Field("lateness", "f8", "s", "delay of the start of the cycle", limits=_LATENESS),
+        Field("execution", "f8", "s", "duration of the cycle", limits=_EXECUTION),
     ),
     version=2,
 )
@@ -702,12 +731,12 @@ RATE_GROUP = Packet(
     "rate_group",
     0x151,
     "1 Hz each, performance record",
-    "One rate group of the executive since start",
+    "Statistics of a rate group of the executive since start",
     (
-        Field("name", "S16", "-", "name of the group"),
-        Field("period", "f8", "s", "its period"),
-        counter("cycles", "slots that ran"),
-        counter("slips", "slots that were skipped"),
+        Field("name", "S16", "-", "name of the rate group"),
+        Field("period", "f8", "s", "period of the rate group"),
+        counter("cycles", "cycles that ran"),
+        counter("slips", "cycles that were skipped"),
         counter("overruns", "cycles longer than the period"),
         Field("mean", "f8", "s", "mean execution time"),
         Field("max", "f8", "s", "longest execution time"),
@@ -718,11 +747,11 @@ JOB_TIMING = Packet(
     "job_timing",
     0x152,
     "each job, performance record",
-    "One job of a worker",
+    "Duration and outcome of a worker's job",
     (
         Field("name", "S16", "-", "name of the worker"),
-        Field("execution", "f8", "s", "time spent in the job"),
-        Field("outcome", "S16", "-", "done, failed, timed-out, died"),
+        Field("execution", "f8", "s", "duration of the job"),
+        Field("outcome", "S16", "-", "outcome: done, failed, timed-out or died"),
     ),
 )
 
