@@ -25,7 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet, crc_of
@@ -51,45 +51,46 @@ _NUMBERS = (
 _GOALS = tuple((int(goal), goal.label) for goal in Goal)
 
 
-def _command(name: str, apid: int, meaning: str, *fields: Field, hazard: str = "") -> Packet:
+def telecommand(name: str, apid: int, meaning: str, *fields: Field, hazard: str = "") -> Packet:
+    """Return the definition of a telecommand packet."""
     return Packet(name, apid, "at will", meaning, fields, telecommand=True, hazard=hazard)
 
 
-PING = _command(
+PING = telecommand(
     "ping",
     0x201,
     "Answer without any other effect",
     Field("number", "u4", "-", "number that the answer repeats"),
 )
-SAFE = _command(
+SAFE = telecommand(
     "safe",
     0x202,
     "Abort: set the coils to zero and change to safe mode",
     Field("reason", "S64", "-", "reason for the log"),
     hazard="ends pointing, slews and detumbling until the next command",
 )
-MODE = _command(
+MODE = telecommand(
     "mode",
     0x203,
     "Change the mode",
     Field("mode", "u1", "-", "new mode", states=_MODES),
     hazard="moves the body or stops its motion",
 )
-SLEW = _command(
+SLEW = telecommand(
     "slew",
     0x204,
     "Slew to an attitude and hold it",
     Field("q2", "f8", "-", "commanded final q2", valid=(-Q2_LIMIT, Q2_LIMIT)),
     hazard="moves the body",
 )
-CLEAR = _command(
+CLEAR = telecommand(
     "clear",
     0x205,
     "Clear a latched event",
     Field("event", "S32", "-", "name of the event, as in the log"),
     hazard="uses again what the event excluded, for example a broken coil",
 )
-POINT = _command(
+POINT = telecommand(
     "point",
     0x206,
     "Point a satellite to a goal",
@@ -99,7 +100,7 @@ POINT = _command(
     hazard="moves the body",
 )
 
-LOAD_PARAMETERS = _command(
+LOAD_PARAMETERS = telecommand(
     "load-parameters",
     0x210,
     "Replace the whole table of parameters",
@@ -113,7 +114,7 @@ LOAD_PARAMETERS = _command(
     *PARAMETERS,
     hazard="changes the limits at which the satellite detumbles, stops or warns",
 )
-DUMP_PARAMETERS = _command("dump-parameters", 0x211, "Report the table of parameters in use")
+DUMP_PARAMETERS = telecommand("dump-parameters", 0x211, "Report the table of parameters in use")
 
 COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT, LOAD_PARAMETERS, DUMP_PARAMETERS)
 
@@ -132,17 +133,24 @@ class MalformedError(CommandError):
     """
 
 
-@dataclass(frozen=True, slots=True)
-class Ping:
-    """Answer."""
+class _Plain:
+    """Command whose attributes have the names of the packet's fields."""
 
-    number: int = 0
-    packet = PING
+    __slots__ = ()
+    packet: ClassVar[Packet]
 
     @property
     def fields(self) -> dict[str, Any]:
         """The packet's fields, by name."""
-        return {"number": self.number}
+        return {field.name: getattr(self, field.name) for field in self.packet.fields}
+
+
+@dataclass(frozen=True, slots=True)
+class Ping(_Plain):
+    """Answer."""
+
+    number: int = 0
+    packet = PING
 
     @property
     def text(self) -> str:
@@ -174,16 +182,11 @@ class ChangeMode:
 
 
 @dataclass(frozen=True, slots=True)
-class Slew:
+class Slew(_Plain):
     """Go to an attitude."""
 
     q2: float
     packet = SLEW
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name."""
-        return {"q2": self.q2}
 
     @property
     def text(self) -> str:
@@ -192,16 +195,11 @@ class Slew:
 
 
 @dataclass(frozen=True, slots=True)
-class Clear:
+class Clear(_Plain):
     """Clear a latched event, so that it can be raised again."""
 
     event: str
     packet = CLEAR
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name."""
-        return {"event": self.event}
 
     @property
     def text(self) -> str:
@@ -258,15 +256,10 @@ class LoadParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class DumpParameters:
+class DumpParameters(_Plain):
     """Report the table of parameters."""
 
     packet = DUMP_PARAMETERS
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The packet's fields: none."""
-        return {}
 
     @property
     def text(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from flight.link.commands import CommandError
+from flight.link.commands import CommandError, telecommand
 from flight.link.files.store import LONGEST_NAME
 from flight.link.files.transfer import FOREIGN, GROUND
 from flight.link.security import KEY_BYTES
@@ -21,60 +21,68 @@ from flight.link.telemetry.packets import (
 )
 
 SUM_BYTES = 32
-_NAME = f"S{LONGEST_NAME}"
-_TO = Field(
+LONGEST_COMMAND = 96
+"""Length (bytes) of a command in words, including the zero at its end."""
+_LONGEST_UTC = 32
+
+_ENTITY = Field(
     "entity", "u2", "-", "receiving entity", states=((GROUND, "ground"), (FOREIGN, "another-ground-station"))
 )
+_NAME = Field("name", f"S{LONGEST_NAME}", "-", "name in the list of files, such as received/elements/tle.txt")
 
-LIST_FILES = Packet(
+LIST_FILES = telecommand(
     "list-files",
     0x223,
-    "at will",
     "Send the list of files on board, as the file listing.json",
-    (_TO, Field("under", _NAME, "-", "beginning of the listed names; empty lists all files")),
-    telecommand=True,
+    _ENTITY,
+    Field("under", f"S{LONGEST_NAME}", "-", "beginning of the listed names; empty lists all files"),
 )
-SEND_FILE = Packet(
-    "send-file",
-    0x224,
-    "at will",
-    "Send a file down, or the missing parts of it",
-    (_TO, Field("name", _NAME, "-", "name in the list of files")),
-    telecommand=True,
-)
-CANCEL_FILE = Packet(
+SEND_FILE = telecommand("send-file", 0x224, "Send a file down, or the missing parts of it", _ENTITY, _NAME)
+CANCEL_FILE = telecommand(
     "cancel-file",
     0x225,
-    "at will",
     "End a transfer and delete the received part of the file",
-    (
-        Field("source", "u2", "-", "sending entity, as in the packet transfer"),
-        Field("number", "u4", "-", "number of the transfer at the sending entity"),
-    ),
-    telecommand=True,
+    Field("source", "u2", "-", "sending entity, as in the packet transfer"),
+    Field("number", "u4", "-", "number of the transfer at the sending entity"),
 )
-USE_FILE = Packet(
+USE_FILE = telecommand(
     "use-file",
     0x226,
-    "at will",
     "Check the SHA-256 of a received file and select it for use by the board",
-    (
-        Field("name", _NAME, "-", "name in the list, such as received/configuration/flight.yaml"),
-        Field("sum", "u1", "-", "SHA-256 of the file", SUM_BYTES),
-    ),
-    telecommand=True,
+    _NAME,
+    Field("sum", "u1", "-", "SHA-256 of the file", SUM_BYTES),
     hazard="the board may use the file from now on",
 )
-DELETE_FILE = Packet(
-    "delete-file",
-    0x227,
-    "at will",
-    "Delete a received file",
-    (Field("name", _NAME, "-", "name in the list of files"),),
-    telecommand=True,
-    hazard="deletes the file",
+DELETE_FILE = telecommand("delete-file", 0x227, "Delete a received file", _NAME, hazard="deletes the file")
+PLAY = telecommand(
+    "play",
+    0x2A0,
+    "Play back an interval of the archive",
+    Field("run", "u4", "-", "number of the run; 0 for the newest"),
+    Field("begin", "f8", "s", "mission time of the first packet"),
+    Field("end", "f8", "s", "mission time of the last packet"),
 )
-FILE_PACKETS: tuple[Packet, ...] = (LIST_FILES, SEND_FILE, CANCEL_FILE, USE_FILE, DELETE_FILE)
+STOP = telecommand("stop-playback", 0x2A1, "End the playback")
+NEW_KEY = telecommand(
+    "new-key",
+    0x2A2,
+    "Change the key of an SPI and reset its counter to 0",
+    Field("spi", "u2", "-", "SPI of the key, 1 to 4"),
+    Field("generation", "u4", "-", "generation of the new key, one above the old generation"),
+    Field("key", "u1", "-", "new key of AES-256", KEY_BYTES),
+)
+SCHEDULE = telecommand(
+    "schedule",
+    0x220,
+    "Execute a command at a time in UTC, also after a restart",
+    Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
+    Field("words", f"S{LONGEST_COMMAND}", "-", "command in words, such as slew 0.2"),
+    hazard="executes the command later",
+)
+UNSCHEDULE = telecommand(
+    "unschedule", 0x221, "Delete a scheduled command", Field("number", "u4", "-", "its number; 0 deletes all")
+)
+LIST = telecommand("list-schedule", 0x222, "Report each scheduled command")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +120,7 @@ class CancelFile:
 
 @dataclass(frozen=True, slots=True)
 class UseFile:
-    """Choose a received file with this SHA-256."""
+    """Select a received file with this SHA-256."""
 
     name: str
     sum: bytes
@@ -129,103 +137,6 @@ class DeleteFile:
 
     def __str__(self) -> str:
         return f"delete {self.name}"
-
-
-FileDirective = ListFiles | SendFile | CancelFile | UseFile | DeleteFile
-_FILE_PACKET_OF: dict[type[Any], Packet] = {
-    ListFiles: LIST_FILES,
-    SendFile: SEND_FILE,
-    CancelFile: CANCEL_FILE,
-    UseFile: USE_FILE,
-    DeleteFile: DELETE_FILE,
-}
-
-
-def _file_fields(directive: FileDirective) -> dict[str, Any]:
-    """Return the fields of a directive's packet. Raises CommandError for values that do not fit."""
-    fields: dict[str, Any] = {name: getattr(directive, name) for name in type(directive).__slots__}
-    if isinstance(directive, UseFile):
-        fields["sum"] = list(directive.sum)
-    for text in (value for value in fields.values() if isinstance(value, str)):
-        if len(text.encode()) >= LONGEST_NAME:
-            raise CommandError(f"{text}: names have less than {LONGEST_NAME} bytes")
-    return fields
-
-
-def _file_directive(name: str, row: Any) -> FileDirective:
-    """Return the directive of a packet's row. Raises CommandError."""
-    kind = next(kind for kind, packet in _FILE_PACKET_OF.items() if packet.name == name)
-    values: dict[str, Any] = {}
-    for item in _FILE_PACKET_OF[kind].fields:
-        raw = row[item.name]
-        text = item.kind.startswith("S")
-        values[item.name] = to_text(raw) if text else bytes(raw.tolist()) if item.count > 1 else int(raw)
-    if values.get("entity", GROUND) not in dict(_TO.states):
-        raise CommandError(f"entity {values['entity']} is none that files are sent to")
-    directive: FileDirective = kind(**values)
-    return directive
-
-
-_LONGEST_UTC = 32
-LONGEST_COMMAND = 96
-"""Bytes of a command in words, with the zero that ends it."""
-
-PLAY = Packet(
-    "play",
-    0x2A0,
-    "at will",
-    "Play back an interval of the archive",
-    (
-        Field("run", "u4", "-", "number of the run; 0 for the newest"),
-        Field("begin", "f8", "s", "mission time of the first packet"),
-        Field("end", "f8", "s", "mission time of the last packet"),
-    ),
-    telecommand=True,
-)
-STOP = Packet("stop-playback", 0x2A1, "at will", "End the playback", (), telecommand=True)
-NEW_KEY = Packet(
-    "new-key",
-    0x2A2,
-    "at will",
-    "Change the key of an SPI and reset its counter to 0",
-    (
-        Field("spi", "u2", "-", "SPI of the key, 1 to 4"),
-        Field("generation", "u4", "-", "generation of the new key, one above the old generation"),
-        Field("key", "u1", "-", "new key of AES-256", KEY_BYTES),
-    ),
-    telecommand=True,
-)
-
-SCHEDULE = Packet(
-    "schedule",
-    0x220,
-    "at will",
-    "Execute a command at a time in UTC, also after a restart",
-    (
-        Field("at", f"S{_LONGEST_UTC}", "-", "time in UTC, such as 2026-11-23T21:00:00"),
-        Field(
-            "words",
-            f"S{LONGEST_COMMAND}",
-            "-",
-            "command in words, such as slew 0.2, with the units of its fields",
-        ),
-    ),
-    telecommand=True,
-    hazard="executes the command later",
-)
-UNSCHEDULE = Packet(
-    "unschedule",
-    0x221,
-    "at will",
-    "Delete a scheduled command",
-    (Field("number", "u4", "-", "number in the list; 0 deletes all"),),
-    telecommand=True,
-)
-LIST = Packet("list-schedule", 0x222, "at will", "Report each scheduled command", (), telecommand=True)
-
-DIRECTIVES: tuple[Packet, ...] = (PLAY, STOP, NEW_KEY, SCHEDULE, UNSCHEDULE, LIST, *FILE_PACKETS)
-LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
-_BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,8 +201,8 @@ class Listing:
         return "list scheduled commands"
 
 
+FileDirective = ListFiles | SendFile | CancelFile | UseFile | DeleteFile
 Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | FileDirective
-
 
 _PACKETS: dict[type[Any], Packet] = {
     Play: PLAY,
@@ -300,8 +211,18 @@ _PACKETS: dict[type[Any], Packet] = {
     Scheduled: SCHEDULE,
     Deletion: UNSCHEDULE,
     Listing: LIST,
-    **_FILE_PACKET_OF,
+    ListFiles: LIST_FILES,
+    SendFile: SEND_FILE,
+    CancelFile: CANCEL_FILE,
+    UseFile: USE_FILE,
+    DeleteFile: DELETE_FILE,
 }
+"""Packet of each directive; the fields have the names of the directive's attributes."""
+_KINDS = {packet.name: kind for kind, packet in _PACKETS.items()}
+
+DIRECTIVES: tuple[Packet, ...] = tuple(_PACKETS.values())
+LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
+_BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
 
 def name_of(directive: Directive) -> str:
@@ -311,26 +232,16 @@ def name_of(directive: Directive) -> str:
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
     """Return the packet of a directive. Raises CommandError for values that do not fit."""
+    packet, values = _PACKETS[type(directive)], dict[str, Any]()
+    for one in packet.fields:
+        value = getattr(directive, one.name)
+        if isinstance(value, str) and len(value.encode()) >= int(one.kind[1:]):
+            raise CommandError(f"{value}: too long, {one.name} has less than {one.kind[1:]} bytes")
+        values[one.name] = list(value) if isinstance(value, bytes) else value
     try:
-        return Packer(LAYOUTS).pack(_PACKETS[type(directive)], utc_ns, _fields(directive))
+        return Packer(LAYOUTS).pack(packet, utc_ns, values)
     except TelemetryError as error:
         raise CommandError("these values fit no directive of the link") from error
-
-
-def _fields(directive: Directive) -> dict[str, Any]:
-    """Return the fields of a directive's packet. Raises CommandError."""
-    if isinstance(directive, FileDirective):
-        return _file_fields(directive)
-    fields = {name: getattr(directive, name) for name in type(directive).__slots__}
-    match directive:
-        case NewKey(key=key):
-            fields["key"] = list(key)
-        case Scheduled(at, words):
-            if len(at.encode()) >= _LONGEST_UTC or len(words.encode()) >= LONGEST_COMMAND:
-                raise CommandError(f"{at}: {words}: too long")
-        case _:
-            pass
-    return fields
 
 
 def unpack(data: bytes) -> Directive | None:
@@ -340,27 +251,16 @@ def unpack(data: bytes) -> Directive | None:
         return None
     if len(data) != layout.length or crc16(data) != 0 or data[HEADER_BYTES] != layout.packet.version:
         raise CommandError(f"its length, CRC or version is not that of {layout.packet.name}")
-    return _directive_of(layout.packet.name, layout.array(data)[0])
-
-
-def _directive_of(name: str, row: Any) -> Directive:
-    """Return the directive of a packet's row. Raises CommandError."""
-    directive: Directive
-    match name:
-        case PLAY.name:
-            directive = Play(int(row["run"]), float(row["begin"]), float(row["end"]))
-            if not directive.begin <= directive.end:  # NaN compares false
-                raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is no stretch of time")
-        case NEW_KEY.name:
-            directive = NewKey(int(row["spi"]), int(row["generation"]), bytes(row["key"].tolist()))
-        case SCHEDULE.name:
-            directive = Scheduled(to_text(row["at"]), to_text(row["words"]))
-        case UNSCHEDULE.name:
-            directive = Deletion(int(row["number"]))
-        case LIST.name:
-            directive = Listing()
-        case STOP.name:
-            directive = Stop()
-        case _:
-            directive = _file_directive(name, row)
+    row, values = layout.array(data)[0], dict[str, Any]()
+    for one in layout.packet.fields:
+        raw = row[one.name]
+        if one.kind.startswith("S"):
+            values[one.name] = to_text(raw)
+        else:
+            values[one.name] = bytes(raw.tolist()) if one.count > 1 else raw.item()
+    directive: Directive = _KINDS[layout.packet.name](**values)
+    if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
+        raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is no stretch of time")
+    if values.get("entity", GROUND) not in dict(_ENTITY.states):
+        raise CommandError(f"entity {values['entity']} does not receive files")
     return directive
