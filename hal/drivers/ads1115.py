@@ -1,8 +1,8 @@
-"""Solar strings on ADS1115 converters (TI SBAS444): four voltages to a part, one conversion at a time.
+"""Currents of solar strings from ADS1115 converters (TI SBAS444), each with four inputs.
 
 A string's current runs through a shunt whose amplifier gives `volt_per_ampere`. A job of the clock reads the
-conversion that is complete and starts the next channel's, on all parts at once, so nothing here waits: at 128
-conversions a second one takes 7.8 ms, a step of the job at least 10 ms.
+completed conversion and starts that of the next channel, on all converters at once. No call waits: a
+conversion takes 7.8 ms, a step of the job at least 10 ms.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hal.interfaces.devices import StringReading
-from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from hal.interfaces.errors import DeviceError, OutOfRange, Refused, answering
 from hal.interfaces.wires import Clock, I2cBus
 
 CONVERSION, CONFIG = 0x00, 0x01
 START = 0x8000
-"""Of Config: written, a conversion starts; read, none is under way."""
+"""Bit of Config that starts a conversion if written, and that no conversion is running if read."""
 _SINGLE_ENDED, _MUX_BIT = 0b100, 12
 _RANGE_2_048 = 0b010 << 9
 _SINGLE_SHOT = 1 << 8
@@ -27,20 +27,20 @@ _RATE_128 = 0b100 << 5
 _NO_COMPARATOR = 0b11
 FULL_SCALE = 2.048
 STEP = FULL_SCALE / 32_768
-"""V, of the converter."""
+"""Voltage of one count, V."""
 CHANNELS = 4
 _SHORTEST_NS = 10_000_000
 
 
 def config_for(channel: int) -> int:
-    """Return the Config word that starts a conversion of a channel: against ground, +-2.048 V, 128 a s."""
+    """Return the Config word that starts a conversion against ground, +-2.048 V, 128 conversions per s."""
     mux = (_SINGLE_ENDED | channel) << _MUX_BIT
     return START | mux | _RANGE_2_048 | _SINGLE_SHOT | _RATE_128 | _NO_COMPARATOR
 
 
 @dataclass(frozen=True, slots=True)
 class StringWiring:
-    """Where a string is measured: the converter's address, its channel, and V per A of its amplifier."""
+    """The converter's address and channel of a string, and the gain of its amplifier (V/A)."""
 
     address: int
     channel: int
@@ -53,7 +53,7 @@ class AdsSolarStrings:
     def __init__(
         self, bus: I2cBus, clock: Clock, wirings: Sequence[StringWiring], period_ns: int = 500_000_000
     ) -> None:
-        """Read all strings once in `period_ns`. Raises OutOfRange for a period or a wiring that cannot be."""
+        """Read all strings once in `period_ns`. Raises OutOfRange for an impossible period or wiring."""
         self.name = "solar strings"
         self._bus = bus
         self._clock = clock
@@ -100,10 +100,12 @@ class AdsSolarStrings:
             if self._step == len(self._channels):
                 self._step = 0
                 self._publish()
+            word = config_for(self._channels[self._step])
             for address in self._parts:
-                self._write(address, config_for(self._channels[self._step]))
+                with answering(_name(address)):
+                    self._bus.write_i2c_block_data(address, CONFIG, [word >> 8, word & 0xFF])
         except DeviceError as error:
-            # A reading is of one round of all strings: it begins again.
+            # A reading contains all strings of one round, so the round begins again.
             self._step = -1
             with self._lock:
                 self._error = str(error)
@@ -113,7 +115,7 @@ class AdsSolarStrings:
         if config != config_for(channel):
             busy = config == config_for(channel) & ~START
             cause = "the conversion does not end" if busy else f"Config reads 0x{config:04x} (brown-out?)"
-            raise Refused(f"ads1115 at 0x{address:02x}", cause)
+            raise Refused(_name(address), cause)
         word = self._read(address, CONVERSION)
         if (address, channel) in self._counts:
             self._counts[address, channel] = word - 0x10000 if word & 0x8000 else word
@@ -132,19 +134,10 @@ class AdsSolarStrings:
             self._error = ""
 
     def _read(self, address: int, register: int) -> int:
-        try:
+        with answering(_name(address)):
             high, low = self._bus.read_i2c_block_data(address, register, 2)
-        except OSError as error:
-            raise _silent(address, error) from error
         return high << 8 | low
 
-    def _write(self, address: int, word: int) -> None:
-        try:
-            self._bus.write_i2c_block_data(address, CONFIG, [word >> 8, word & 0xFF])
-        except OSError as error:
-            raise _silent(address, error) from error
 
-
-def _silent(address: int, error: OSError) -> NotResponding:
-    cause = f"{error.strerror}; check its power, wiring and address"
-    return NotResponding(f"ads1115 at 0x{address:02x}", cause)
+def _name(address: int) -> str:
+    return f"ads1115 at 0x{address:02x}"

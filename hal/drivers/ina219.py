@@ -13,7 +13,7 @@ import threading
 from collections import deque
 
 from hal.interfaces.devices import PowerReading
-from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused, answering
 from hal.interfaces.wires import Clock, I2cBus
 
 CONFIG, SHUNT, BUS, POWER = 0x00, 0x01, 0x02, 0x03
@@ -155,7 +155,9 @@ class Ina219:
         return (bus >> 3) * BUS_STEP_V, current, clipped
 
     def _set_up(self) -> None:
-        self._write(CONFIG, self._config)
+        with answering(self.name):
+            word = [self._config >> 8, self._config & 0xFF]
+            self._bus.write_i2c_block_data(self._address, CONFIG, word)
         found = self._read(CONFIG)
         if found != self._config:
             raise Refused(
@@ -169,17 +171,6 @@ class Ina219:
             raise NotResponding(self.name, "had lost its set-up (brown-out?); set up again")
 
     def _read(self, register: int) -> int:
-        try:
+        with answering(self.name):
             high, low = self._bus.read_i2c_block_data(self._address, register, 2)
-        except OSError as error:
-            raise self._silent(error) from error
         return high << 8 | low
-
-    def _write(self, register: int, word: int) -> None:
-        try:
-            self._bus.write_i2c_block_data(self._address, register, [word >> 8, word & 0xFF])
-        except OSError as error:
-            raise self._silent(error) from error
-
-    def _silent(self, error: OSError) -> DeviceError:
-        return NotResponding(self.name, f"{error.strerror}; check its power, wiring and address")

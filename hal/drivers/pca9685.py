@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused, answering
 
 if TYPE_CHECKING:  # at run time the Protocols would import numpy, with the readings' types
     from hal.interfaces.wires import Clock, I2cBus
@@ -27,9 +27,9 @@ TOTEM_POLE = 0x04
 FULL = 0x10  # bit 4 of an ON_H or OFF_H register: the whole period
 
 GENERAL_CALL = 0x00
-"""The address of all parts on a bus."""
+"""Address of all chips on a bus."""
 SOFTWARE_RESET = 0x06
-"""The byte that, sent to the general call, returns a part to its power-on state (NXP data sheet, 7.6)."""
+"""Byte to the general call that returns all chips to their power-on state (NXP data sheet, 7.6)."""
 
 CHANNELS = 16
 COUNTS = 4096
@@ -84,15 +84,16 @@ class Pca9685:
     def configure(self) -> None:
         """Set the chip up with every output off, and read the set-up back.
 
-        All outputs go off first: a chip that a dead process left running must not drive a coil meanwhile. A
-        chip that an upset has given an outer clock is reset, and with it each part of the bus that obeys the
-        general call: PWM chips rest then, an ADS1115 loses its conversion. Raises NotResponding, or Refused
-        when a register does not keep its value.
+        All outputs go off first, in case a dead process left the chip running. A chip that an upset has
+        switched to an external clock is reset, and with it each chip of the bus that obeys the general call:
+        an ADS1115 loses its conversion. Raises NotResponding, or Refused if a register does not keep its
+        value.
         """
         self.all_off()
         mode = self._read(MODE1)
         if mode & EXTERNAL_CLOCK:
-            self._reset_all()
+            with answering(self.name):
+                self._bus.write_byte(GENERAL_CALL, SOFTWARE_RESET)
             mode = self._read(MODE1)
         asleep = mode & ~RESTART | SLEEP
         self._write(MODE1, asleep)
@@ -115,11 +116,8 @@ class Pca9685:
     def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
         """Return whether up to 8 neighbouring channels hold these counts. Raises NotResponding."""
         wanted = _values(counts)
-        try:
-            held = self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted))
-        except OSError as error:
-            raise self._silent(error) from error
-        return held == wanted
+        with answering(self.name):
+            return self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted)) == wanted
 
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
         """Write up to 8 neighbouring channels in one block; their outputs change together, at its end.
@@ -132,10 +130,8 @@ class Pca9685:
             if on == off or not (0 <= on <= COUNTS and 0 <= off <= COUNTS):
                 quantity = f"OFF count with ON count {on} (never equal)"
                 raise OutOfRange(self.name, quantity, off, 0, COUNTS, "counts")
-        try:
+        with answering(self.name):
             self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
-        except OSError as error:
-            raise self._silent(error) from error
 
     def all_off(self) -> None:
         """Switch every output off. Raises NotResponding."""
@@ -150,25 +146,12 @@ class Pca9685:
         ]
 
     def _read(self, register: int) -> int:
-        try:
+        with answering(self.name):
             return self._bus.read_byte_data(self._address, register)
-        except OSError as error:
-            raise self._silent(error) from error
 
     def _write(self, register: int, value: int) -> None:
-        try:
+        with answering(self.name):
             self._bus.write_byte_data(self._address, register, value)
-        except OSError as error:
-            raise self._silent(error) from error
-
-    def _reset_all(self) -> None:
-        try:
-            self._bus.write_byte(GENERAL_CALL, SOFTWARE_RESET)
-        except OSError as error:
-            raise self._silent(error) from error
-
-    def _silent(self, error: OSError) -> DeviceError:
-        return NotResponding(self.name, f"{error.strerror}; check its power, wiring and address")
 
 
 def _values(counts: Sequence[PwmCounts]) -> list[int]:

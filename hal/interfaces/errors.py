@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 
 class DeviceError(Exception):
@@ -16,6 +17,15 @@ class DeviceError(Exception):
 
 class NotResponding(DeviceError):
     """No answer: no acknowledge, no bytes, a closed port, a bus that hangs."""
+
+
+@contextmanager
+def answering(device: str) -> Iterator[None]:
+    """Raise NotResponding of a device for an OSError of its bus."""
+    try:
+        yield
+    except OSError as error:
+        raise NotResponding(device, f"{error.strerror}; check its power, wiring and address") from error
 
 
 class CorruptData(DeviceError):
