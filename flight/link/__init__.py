@@ -1,1 +1,1 @@
-"""What space and ground say to each other: packets, commands, logs."""
+"""Communication between satellite and ground: packets, commands, frames, files and logs."""

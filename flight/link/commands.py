@@ -381,8 +381,8 @@ def unpack(data: bytes) -> Command:
 def command_of_words(text: str) -> Command:
     """Return the command of a line such as `slew 0.2`, `mode hold`, `safe end of pass` or `point sun`.
 
-    A line is the name of the command, then each field in order, in the units of the table; labels stand for
-    states. Missing numbers at the end are NaN, and a text field takes the rest of the line. Raises
+    A line has the name of the command, then its fields in order, in the units of the table. States are given
+    by their labels. Missing numbers at the end are NaN, and a text field takes the rest of the line. Raises
     CommandError, also for a number outside the range of its field.
     """
     name, *words = text.split() or [""]
@@ -469,7 +469,7 @@ class Channel(Protocol):
         """Return the received datagrams, oldest first. Never waits, never raises."""
 
     def news(self) -> str:
-        """Return what happened to the channel since the last call, empty when nothing did."""
+        """Return a description of events since the last call, or an empty text."""
 
     def answer(self, data: bytes, sender: Any) -> None:
         """Answer a sender that has an address and listens. Never waits, never raises."""
@@ -515,7 +515,7 @@ class DatagramChannel:
         return found
 
     def news(self) -> str:
-        """Return what happened to the channel since the last call, empty when nothing did."""
+        """Return a description of events since the last call, or an empty text."""
         news, self._news = self._news, ""
         return news
 

@@ -15,7 +15,7 @@ class Severity(IntEnum):
 
 
 class Reaction(IntEnum):
-    """The reaction to an event, beside recording it."""
+    """Reaction to an event in addition to its record."""
 
     NOTE = 0
     COILS_OFF = 1

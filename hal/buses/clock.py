@@ -15,9 +15,9 @@ class ContainedJob:
     """Runs a job; keeps an exception that escapes instead of raising it.
 
     Attributes:
-        name: of the job.
-        error: the exception of the last run as text, empty when it completed.
-        served_ns: when a run last completed, or when this object was made.
+        name: name of the job.
+        error: exception of the last run as text, empty if the run completed.
+        served_ns: time at which a run last completed, initially the time of creation.
     """
 
     def __init__(self, name: str, job: Callable[[], None], now_ns: Callable[[], int]) -> None:
@@ -42,7 +42,7 @@ class SystemClock:
     """CLOCK_MONOTONIC of the machine.
 
     Attributes:
-        tickers: the running ones, in the order in which they were made.
+        tickers: running tickers in the order of their creation.
     """
 
     def __init__(self) -> None:

@@ -67,7 +67,7 @@ def lock_memory() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Obtained:
-    """What was obtained, and the reasons of the refusals."""
+    """Obtained priority and locked memory, and the reasons of refusals."""
 
     priority: int
     locked: bool

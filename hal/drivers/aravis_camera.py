@@ -49,7 +49,7 @@ class AravisSettings:
 
     Attributes:
         name: as `arv-tool-0.8` lists it, such as "FLIR-1E10015B2E2F" or "Fake_1".
-        columns, rows: of the region that is read, in the middle of the sensor.
+        columns, rows: size of the region that is read, in the middle of the sensor.
         pixel_format: a key of PIXEL_KINDS.
         exposure_ns: the usual exposure.
         gain: in the camera's own unit (usually dB), None to leave it unchanged.

@@ -1,4 +1,4 @@
-"""Serves a camera beside the control loop: a `FrameSource` over a device whose calls may take long.
+"""A `FrameSource` for a camera whose calls may take long, served in parallel to the control loop.
 
 Triggering, fetching, setting controls and reopening a camera may each take milliseconds to seconds (an
 unanswered USB control transfer: five). A job of the clock does all of it; `trigger` and `poll`, which the
@@ -45,7 +45,7 @@ class CameraCounts:
 class CameraDevice(Protocol):
     """A camera's driver; calls come from one thread at a time, except `check`.
 
-    `check` must be safe beside the other calls.
+    `check` may be called at the same time as another method.
     """
 
     name: str
@@ -71,8 +71,8 @@ class ServedCamera:
     """Implements `hal.interfaces.devices.FrameSource`; reopens a lost camera.
 
     Attributes:
-        name: of the device.
-        counts: of its frames.
+        name: name of the device.
+        counts: counts of its frames by outcome.
     """
 
     def __init__(
@@ -211,8 +211,7 @@ class ServedCamera:
 class FrameNumbers:
     """Continues the camera's frame numbers where they wrap around or restart.
 
-    A repeated number stays repeated, and one that goes back a little stays back, so that a frozen camera can
-    be detected.
+    Repeated numbers and small steps back are preserved, so that a frozen camera can be detected.
     """
 
     def __init__(self, modulus: int) -> None:

@@ -266,7 +266,7 @@ class CoilOutputs:
     Attributes:
         written: signed counts of the coils that the chip acknowledged last.
         braked: the bridges that are braked.
-        written_ns: host time since when those are on the wire, -1 before the first.
+        written_ns: host time since which these counts are written, -1 before the first write.
         failing: the last exchange failed; the chip's state is not known.
         faults: failed transactions since start.
         error: the text of the last failure while it lasts.
@@ -315,12 +315,12 @@ class CoilOutputs:
         return kept
 
     def keeps_written(self) -> bool:
-        """Return whether the outputs hold what was last written to them. Raises NotResponding."""
+        """Return whether the outputs hold the last written counts. Raises NotResponding."""
         blocks = self._channel_blocks(self.written, self.braked)
         return all(self._pca.holds(first, block) for first, block in blocks)
 
     def not_kept(self) -> DeviceError:
-        """Return the error of a chip whose outputs differ from what was written."""
+        """Return the error of a chip whose outputs differ from the written counts."""
         return Refused(self._pca.name, "does not keep what is written to its outputs")
 
     def write(self, counts: Counts, braked: Axes) -> None:
@@ -493,7 +493,7 @@ class PwmTorqueCoils:
                 self._wire.release()
 
     def state(self) -> CoilState:
-        """Return what is on the wire; after a failure, what was last acknowledged."""
+        """Return the written state; after a failure, the last acknowledged state."""
         mailbox, outputs = self._mailbox, self._outputs
         with mailbox.lock:
             return _state_of(

@@ -2,8 +2,8 @@
 
 The current is shunt voltage over shunt resistance; the chip's Calibration register, which a brown-out clears,
 is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms PWM periods, so it
-may be 18 % off; the mean of five may be 7 % off (a test computes both). A current beyond the range is given
-as the range's end and marked: it is at least that.
+may be 18 % off; the mean of five may be 7 % off (a test computes both). A current beyond the range is
+reported as the end of the range and marked as clipped.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ OVERFLOW = 0b01
 _SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # in the order of the PG bits
 _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
-"""Conversions in a row after which the ready flag was still set: once, a new conversion may be ready."""
+"""Number of reads in a row after which a ready flag that stays set counts as stuck."""
 _REACH_NS = 300_000_000
-"""A conversion of shunt and bus takes 136 ms +10 %, and may be as old again when it is read."""
+"""Largest age (ns) of the beginning of a conversion: 136 ms + 10 %, and as long again until it is read."""
 
 
 def range_for(maximum_current: float, shunt_ohm: float) -> int:
@@ -65,7 +65,7 @@ class Ina219:
     ) -> None:
         """Start reading every `period_ns`; a reading is the mean of the last `averaged` conversions.
 
-        Raises OutOfRange for a shunt or a current that the chip cannot measure.
+        Raises OutOfRange for a shunt or a current outside the range of the chip.
         """
         for quantity, value, unit in (("shunt", shunt_ohm, "ohm"), ("maximum current", maximum_current, "A")):
             if not 0.0 < value < math.inf:
@@ -85,7 +85,7 @@ class Ina219:
         self._error = ""
         self._set_up_before = False
         self._flag_stays = 0
-        self._heard_ns = clock.now_ns()
+        self._conversion_ns = clock.now_ns()
         self._ticker = clock.ticker("ina219", period_ns, self._serve)
 
     def latest(self) -> PowerReading | None:
@@ -123,8 +123,7 @@ class Ina219:
             self._latest = PowerReading(
                 now_ns, voltage, current, voltage * current, newest, since_ns, any(clipped)
             )
-            # A failure is reported until the mean is complete again: a reader once per second must not miss
-            # it.
+            # A failure is reported until the mean is complete again, for readers that read once per second.
             if count == self._conversions.maxlen:
                 self._error = ""
 
@@ -136,7 +135,7 @@ class Ina219:
         self._set_up_before = True
         bus = self._read(BUS)
         if not bus & CONVERSION_READY:
-            silence = self._clock.now_ns() - self._heard_ns
+            silence = self._clock.now_ns() - self._conversion_ns
             if silence > _SILENCE_NS:
                 raise NotResponding(self.name, f"no conversion for {silence * 1e-9:.1f} s; check its supply")
             return None
@@ -145,7 +144,7 @@ class Ina219:
         self._flag_stays = self._flag_stays + 1 if self._read(BUS) & CONVERSION_READY else 0
         if self._flag_stays >= _SURE_STUCK:
             raise NotResponding(self.name, "its registers are stuck: a conversion that was read stays new")
-        self._heard_ns = self._clock.now_ns()
+        self._conversion_ns = self._clock.now_ns()
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]
         current, clipped = signed * SHUNT_STEP_V / self._ohm, abs(signed) >= round(full_scale / SHUNT_STEP_V)
@@ -165,7 +164,7 @@ class Ina219:
                 f"Config reads 0x{found:04x} after 0x{self._config:04x} was written: is another part at this"
                 " address?",
             )
-        self._heard_ns = self._clock.now_ns()
+        self._conversion_ns = self._clock.now_ns()
         lost, self._set_up_before = self._set_up_before, True
         if lost:
             raise NotResponding(self.name, "had lost its set-up (brown-out?); set up again")

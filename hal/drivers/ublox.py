@@ -32,11 +32,11 @@ OVERHEAD = 8
 PVT_LENGTH = 92
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHHIihH")
 THREE_DIMENSIONS = 3
-"""NAV-PVT's fixType of a full fix."""
+"""Value of fixType in NAV-PVT for a position in three dimensions."""
 DATE_AND_TIME = 0b011
-"""Of NAV-PVT's `valid`."""
+"""Bits of `valid` in NAV-PVT for a valid date and time."""
 FIX_OK = 0b1
-"""Of NAV-PVT's `flags`."""
+"""Bit of `flags` in NAV-PVT for a valid fix."""
 
 Kind = tuple[int, int]
 
@@ -46,12 +46,12 @@ class Pvt:
     """NAV-PVT in the receiver's own units.
 
     Attributes:
-        date: year, month, day, hour, minute, second UTC; `nano` ns to add, of either sign.
-        valid: bits of date and time. fix: its type. flags: bits of the fix.
-        satellites: in use.
-        longitude, latitude: 1e-7 deg. height: mm above WGS 84.
-        horizontal, vertical: mm, accuracies.
-        velocity: mm/s, north, east, down. speed_accuracy: mm/s.
+        date: year, month, day, hour, minute, second UTC; `nano` is added, ns of either sign.
+        valid: validity bits of date and time; `fix` is the type of the fix, `flags` its bits.
+        satellites: number of satellites in use.
+        longitude, latitude: 1e-7 deg; `height` is above WGS 84, mm.
+        horizontal, vertical: accuracies of the position, mm.
+        velocity: mm/s, north, east, down; `speed_accuracy` in mm/s.
     """
 
     date: tuple[int, int, int, int, int, int]
@@ -140,15 +140,17 @@ def frame(kind: Kind, payload: bytes = b"") -> bytes:
 
 
 class StreamParser:
-    """Splits the line's bytes into frames; a false start costs two bytes, so good frames behind it are found.
+    """Splits received bytes into frames; after a false start the search continues two bytes later.
 
     Attributes:
-        bytes_received: all bytes fed. frames: with a valid checksum. bad_checksum: those without.
-        discarded_bytes: bytes outside valid frames.
+        bytes_received: number of bytes fed.
+        frames: number of frames with a valid checksum.
+        bad_checksum: number of frames with a wrong checksum.
+        discarded_bytes: number of bytes outside valid frames.
     """
 
     def __init__(self, longest: int = 256) -> None:
-        """Take frames of at most `longest` bytes of payload."""
+        """Accept frames with at most `longest` bytes of payload."""
         self.bytes_received = 0
         self.frames = 0
         self.bad_checksum = 0
@@ -157,7 +159,7 @@ class StreamParser:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[tuple[Kind, bytes, int]]:
-        """Return the frames that `data` completes: kind, payload, and how many bytes stand behind it."""
+        """Return the frames that `data` completes: kind, payload, and the number of bytes after the frame."""
         self.bytes_received += len(data)
         buffer, found, position = self._buffer + data, [], 0
         while True:
@@ -197,15 +199,15 @@ class UbloxReceiver:
     """The receiver on a serial port; implements `hal.interfaces.devices.GpsReceiver`."""
 
     def __init__(self, port: SerialPort, clock: Clock, period_ns: int = SECOND_NS) -> None:
-        """Ask for a fix every `period_ns`. Raises OutOfRange for a period that the receiver does not take."""
+        """Request a fix every `period_ns`. Raises OutOfRange for a period outside 0.1 to 60 s."""
         if not 0.1 <= period_ns / SECOND_NS <= 60.0:
             raise OutOfRange(DEVICE, "period", period_ns / SECOND_NS, 0.1, 60.0, "s")
         self._port = port
         self._clock = clock
         self._period_ns = period_ns
         self._parser = StreamParser()
-        self._asked_ns = -SILENCE_NS
-        self._heard_ns = clock.now_ns()
+        self._requested_ns = -SILENCE_NS
+        self._fix_arrival_ns = clock.now_ns()
         self._last_byte_ns = self._last_fix_ns = -1
         self._refused = self._out_of_range = 0
 
@@ -216,7 +218,7 @@ class UbloxReceiver:
             self._last_byte_ns = arrival_ns
             for kind, payload, behind in self._parser.feed(data):
                 sent_ns = arrival_ns - behind * _BITS * SECOND_NS // self._port.baud_rate
-                reading = self._taken(kind, payload, sent_ns)
+                reading = self._reading(kind, payload, sent_ns)
                 if reading is not None:
                     readings.append(reading)
         self._set_up()
@@ -240,11 +242,11 @@ class UbloxReceiver:
         """Release the port."""
         self._port.close()
 
-    def _taken(self, kind: Kind, payload: bytes, arrival_ns: int) -> GpsReading | None:
+    def _reading(self, kind: Kind, payload: bytes, arrival_ns: int) -> GpsReading | None:
         if kind == ACK_NAK:
             self._refused += 1
         if kind == NAV_PVT and len(payload) == PVT_LENGTH:
-            self._heard_ns = self._clock.now_ns()
+            self._fix_arrival_ns = self._clock.now_ns()
             try:
                 reading = reading_of(unpack_pvt(payload), arrival_ns, self._port.baud_rate)
             except OutOfRange:
@@ -256,12 +258,14 @@ class UbloxReceiver:
         return None
 
     def _set_up(self) -> None:
-        """Ask for NAV-PVT alone while none arrives, at most once in three seconds."""
+        """Request NAV-PVT only, at most once in three seconds, while none arrives."""
         now_ns = self._clock.now_ns()
-        never = self._parser.frames == 0 and self._asked_ns < 0
-        if (not never and now_ns - self._heard_ns < SILENCE_NS) or now_ns - self._asked_ns < SILENCE_NS:
+        never = self._parser.frames == 0 and self._requested_ns < 0
+        if (
+            not never and now_ns - self._fix_arrival_ns < SILENCE_NS
+        ) or now_ns - self._requested_ns < SILENCE_NS:
             return
-        self._asked_ns = now_ns
+        self._requested_ns = now_ns
         rate = (self._period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # GPS time
         # Port 1 is UART 1: 8N1, UBX in and out, no NMEA.
         port = (
@@ -272,7 +276,7 @@ class UbloxReceiver:
 
 
 def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
-    """Return a reading; raises OutOfRange for values that no receiver in orbit or on the ground has."""
+    """Return a reading. Raises OutOfRange for values that are impossible on the ground and in orbit."""
     limits: tuple[tuple[str, float, float, float, str], ...] = (
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
         ("longitude", pvt.longitude * 1e-7, -180.0, 180.0, "deg"),
@@ -282,7 +286,7 @@ def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
     for name, value, low, high, unit in limits:
         if not low <= value <= high:
             raise OutOfRange(DEVICE, name, value, low, high, unit)
-    position, axes = _on_the_ground(pvt)
+    position, axes = _position(pvt)
     timed = pvt.valid & DATE_AND_TIME == DATE_AND_TIME
     return GpsReading(
         time_ns=arrival_ns - (PVT_LENGTH + OVERHEAD) * _BITS * SECOND_NS // baud_rate,
@@ -300,20 +304,20 @@ def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
 def _utc_ns(pvt: Pvt) -> int:
     year, month, day, hour, minute, second = pvt.date
     try:
-        # A leap second is 60: it is the first of the next minute.
+        # Second 60 is a leap second, which counts as the first second of the next minute.
         whole = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC).timestamp()
     except ValueError as error:
         raise OutOfRange(DEVICE, "year", year, 1999, 2099, "") from error
     return round(whole) * SECOND_NS + (second > 59) * SECOND_NS + pvt.nano
 
 
-def _on_the_ground(pvt: Pvt) -> tuple[FloatArray, FloatArray]:
-    """Return the place (3,) m, ITRS, and the rows north, east and down there (3, 3)."""
+def _position(pvt: Pvt) -> tuple[FloatArray, FloatArray]:
+    """Return the position (3,) m, ITRS, and its directions north, east and down as rows (3, 3)."""
     longitude, latitude = math.radians(pvt.longitude * 1e-7), math.radians(pvt.latitude * 1e-7)
     co, so, ca, sa = math.cos(longitude), math.sin(longitude), math.cos(latitude), math.sin(latitude)
     squared = _FLATTENING * (2.0 - _FLATTENING)
     across = _SEMI_MAJOR_AXIS / math.sqrt(1.0 - squared * sa * sa)
     height = pvt.height * 1e-3
     out = (across + height) * ca
-    place = np.array([out * co, out * so, (across * (1.0 - squared) + height) * sa])
-    return place, np.array([[-sa * co, -sa * so, ca], [-so, co, 0.0], [-ca * co, -ca * so, -sa]])
+    position = np.array([out * co, out * so, (across * (1.0 - squared) + height) * sa])
+    return position, np.array([[-sa * co, -sa * so, ca], [-so, co, 0.0], [-ca * co, -ca * so, -sa]])

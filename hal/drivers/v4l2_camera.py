@@ -451,7 +451,7 @@ class V4l2Settings:
     """Settings of a V4L2 camera.
 
     Attributes:
-        path: of its device, such as /dev/knightcube-camera.
+        path: path of the device, such as /dev/knightcube-camera.
         columns, rows: of the image.
         pixel_format: a key of PIXEL_KINDS.
         exposure_ns: the usual exposure; the interval between frames is set to it.

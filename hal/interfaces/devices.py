@@ -63,11 +63,12 @@ class GpsReading:
     Attributes:
         time_ns: host clock when the receiver began to send; the epoch itself is up to 0.2 s older.
         arrival_ns: host clock when the last byte was received.
-        utc_ns: UTC of the epoch, ns since 1970; 0 where the receiver does not know the time.
-        position: (3,) m, ITRS. velocity: (3,) m/s with respect to the ground, ITRS.
-        sigma: m, of each axis, as the receiver claims. velocity_sigma: m/s.
-        satellites: in use.
-        valid: whether the receiver vouches for time and place.
+        utc_ns: UTC of the epoch, ns since 1970; 0 if the receiver does not know the time.
+        position: (3,) m, ITRS.
+        velocity: (3,) m/s with respect to the ground, ITRS.
+        sigma: reported standard deviation per axis, m; `velocity_sigma` in m/s.
+        satellites: number of satellites in use.
+        valid: whether the receiver reports time and position as valid.
     """
 
     time_ns: int
@@ -85,7 +86,7 @@ class GpsReading:
 class GpsLink:
     """Counters of the receiver's line since start; they only grow. Times are -1 before the first.
 
-    `refused` counts commands that the receiver did not take, `out_of_range` impossible epochs.
+    `refused` counts commands that the receiver rejected, `out_of_range` impossible epochs.
     """
 
     bytes_received: int

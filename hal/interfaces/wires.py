@@ -143,13 +143,13 @@ class HostFaults(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A clock, the wires, and what else depends on the kind of hardware.
+    """The clock, the wires and other values that depend on the kind of hardware.
 
     Attributes:
-        release: is called with mission time zero.
-        latency: of planner and vision in ns, in lock-step only.
-        reach: how a guardian zeroes the coils, in real time only.
-        host: faults inside this process, where a simulation asks for them.
+        release: function that is called with mission time zero.
+        latency: latencies of planner and vision, ns, in lock-step only.
+        reach: access of the guardian to the coils, in real time only.
+        host: simulated faults inside this process, if any.
     """
 
     clock: Clock

@@ -102,9 +102,9 @@ class Store:
     """Folder of one entity, which only one process may use.
 
     Attributes:
-        received: the folder of the files that came.
-        last: the last transaction number given.
-        endings: of incoming transfers, the oldest first.
+        received: folder of received files.
+        last: last assigned transaction number.
+        endings: ends of incoming transfers, oldest first.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -312,7 +312,7 @@ class Downlink:
         return self._live.flush() if late else []
 
     def _next_in_turn(self) -> list[bytes]:
-        """Return frames of a file, or of the playback: each has half of what live telemetry leaves."""
+        """Return frames of a file or of the playback, which share the rate left by live telemetry."""
         self._files_first = not self._files_first
         if self._files_first:
             return self._next_filed() or self._next_played()

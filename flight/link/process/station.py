@@ -231,7 +231,7 @@ class SerialLine:
     """Stream of marked frames on a serial port, to a radio or a modem."""
 
     def __init__(self, name: str, port: SerialPort) -> None:
-        """Take an open port, which reopens by itself."""
+        """Use an open port, which reopens automatically after a loss."""
         self.name = name
         self._port = port
         self._stream = telecommand_stream()

@@ -174,8 +174,8 @@ class Packer:
         """Return the bytes of one packet at mission time `time_ns`, all fields given by name.
 
         Texts too long for their field are cut between two characters, counters past their end wrap. NaN
-        passes: the table says where it means "none". Raises TelemetryError, and counts no packet, for a field
-        missing, unknown, of the wrong length or out of its type's range.
+        passes: the table says where it means "none". Raises TelemetryError for a missing or unknown field, a
+        wrong length, or a value out of range; such a packet is not counted.
         """
         given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]

@@ -268,7 +268,7 @@ class Recovery:
         self._dialogue = None
 
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
-        """Listen at this baud rate; begin the dialogue if it is right or nothing comes; else try another."""
+        """Listen at this baud rate; begin the dialogue if it is right or the line is silent, else change it."""
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
@@ -468,10 +468,9 @@ class ReadingConverter:
         return device_ns, values[q], values[rate], values[mag], values[accel]
 
     def _check_step(self, step_ns: int) -> None:
-        """Detect a unit that sends samples at another rate: its register differs from what was written.
+        """Detect a unit that sends samples at another rate because its divisor register was corrupted.
 
-        Lost packets leave whole periods; a divisor with one bit flipped leaves fractions of one, a tick at
-        least.
+        After lost packets a step is a whole number of periods; after a bit flip in the divisor it is not.
         """
         part_ns = step_ns % self._period_ns
         off = min(part_ns, self._period_ns - part_ns) > 500_000_000 // IMU_RATE_HZ
@@ -489,14 +488,14 @@ class ReadingConverter:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where a packet's values are: index of the time; slices of quaternion, rate, field, acceleration."""
+    """Positions of a packet's values: index of the time; slices of quaternion, rate, field, acceleration."""
 
     time: int | None
     sensors: tuple[slice, slice, slice, slice]
 
 
 def _places(layout: Layout) -> _Places | None:
-    """Return where a packet carries a reading; None when any part but the time is missing."""
+    """Return the positions of a reading in a packet; None if a part other than the time is missing."""
     sensors: list[slice] = []
     for names in _SOURCES:
         place = next((layout.places[name] for name in names if name in layout.places), None)
@@ -535,8 +534,8 @@ class Vn100:
     def configure(self) -> None:
         """Set the unit up in its volatile memory; its flash is not written.
 
-        Raises NotResponding on silence, CorruptData when the answers make no sense, Refused when the unit
-        refuses, is no VN-100, or does not keep what was written.
+        Raises NotResponding on silence, CorruptData for meaningless answers, and Refused if the unit refuses,
+        is not a VN-100, or does not keep its settings.
         """
         if not self._settings.configure:
             return
@@ -549,7 +548,7 @@ class Vn100:
                 question = dialogue.send(self._ask(question))
 
     def model(self) -> str:
-        """Return what the unit calls itself; nothing is changed in it. Raises as `configure`."""
+        """Return the model that the unit reports; nothing is changed in it. Raises as `configure`."""
         return ",".join(self._ask(Question("RRG", (1,))))
 
     def poll(self) -> list[ImuReading]:
@@ -571,7 +570,7 @@ class Vn100:
         return readings
 
     def link(self) -> ImuLink:
-        """Return the line's counters; `packets` are all packets and lines whose checksum held."""
+        """Return the line's counters; `packets` counts packets and lines with a valid checksum."""
         parser = self._parser
         return ImuLink(
             parser.bytes_received,
@@ -586,12 +585,12 @@ class Vn100:
 
     @property
     def resets(self) -> int:
-        """How often the unit restarted: its own time went backwards."""
+        """Number of restarts of the unit, detected by steps back of its own time."""
         return self._converter.resets
 
     @property
     def recoveries(self) -> int:
-        """How often a lost unit was found and set up again."""
+        """Number of times that a lost unit was found and set up again."""
         return self._recovery.completed
 
     def close(self) -> None:
