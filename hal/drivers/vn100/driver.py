@@ -268,7 +268,7 @@ class Recovery:
         self._dialogue = None
 
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
-        """Listen at this baud rate; begin the dialogue if it is right or the line is silent, else change it."""
+        """Listen at this baud rate; begin the dialogue if it is right or the line silent, else change it."""
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
