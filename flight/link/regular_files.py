@@ -1,4 +1,4 @@
-"""Bounded reading of regular files.
+"""Bounded reading, durable writing and locking of regular files.
 
 Opening a FIFO at the path of a file would block, and reading a sparse file would exhaust the memory.
 """
@@ -6,9 +6,14 @@ Opening a FIFO at the path of a file would block, and reading a sparse file woul
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from knightcube.errors import UsageError
 
 
 def read_regular(path: Path, most: int) -> bytes | None:
@@ -33,5 +38,48 @@ def read_regular(path: Path, most: int) -> bytes | None:
         while chunk := os.read(file, most + 1 - len(data)):
             data += chunk
         return data
+    finally:
+        os.close(file)
+
+
+def make_lasting(folder: Path) -> None:
+    """Sync a folder, so that the names of its files survive a loss of power. Raises OSError."""
+    names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(names)
+    finally:
+        os.close(names)
+
+
+def overwrite(path: Path, data: bytes) -> bool:
+    """Overwrite a file in place durably, and return whether this succeeded."""
+    try:
+        new = not path.exists()
+        # Without O_NONBLOCK, opening a FIFO at this path would block.
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+        try:
+            if os.pwrite(file, data, 0) != len(data):
+                return False
+            os.ftruncate(file, len(data))
+            os.fsync(file)
+        finally:
+            os.close(file)
+        if new:
+            make_lasting(path.parent)
+    except OSError:
+        return False
+    return True
+
+
+@contextmanager
+def locked(path: Path, problem: str) -> Iterator[None]:
+    """Hold the lock of a file. Raises UsageError with `problem` if another process holds it."""
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise UsageError(problem) from error
+        yield
     finally:
         os.close(file)

@@ -33,8 +33,7 @@ from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from flight.link.frames import FrameError
-from flight.link.regular_files import read_regular
-from flight.link.telemetry.log import make_lasting
+from flight.link.regular_files import locked, overwrite, read_regular
 from flight.link.telemetry.packets import crc16
 from knightcube.errors import FlightError, UsageError
 
@@ -162,17 +161,8 @@ class Vault:
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Lock the folder against a second link process. Raises UsageError if another process owns it."""
-        path = self._folder / _OWNER
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(file)
-            raise UsageError(f"{self._folder}: another link process has these counters") from error
-        try:
+        with locked(self._folder / _OWNER, f"{self._folder}: another link process has these counters"):
             yield
-        finally:
-            os.close(file)
 
     def read(self, name: int | str) -> Association | None:
         """Return the newest valid copy of an association, None if both copies are lost."""
@@ -222,26 +212,6 @@ class Vault:
             if association is not None and str(association.spi) == str(name).partition("-")[0]:
                 found.append(association)
         return found
-
-
-def overwrite(path: Path, data: bytes) -> bool:
-    """Overwrite a file in place durably, and return whether this succeeded."""
-    try:
-        new = not path.exists()
-        # Without O_NONBLOCK, opening a FIFO at this path would block.
-        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
-        try:
-            if os.pwrite(file, data, 0) != len(data):
-                return False
-            os.ftruncate(file, len(data))
-            os.fsync(file)
-        finally:
-            os.close(file)
-        if new:
-            make_lasting(path.parent)
-    except OSError:
-        return False
-    return True
 
 
 WINDOW = 65_536

@@ -46,8 +46,7 @@ from msgspec import Meta
 
 from flight.link import events
 from flight.link.events import EventKind
-from flight.link.regular_files import read_regular
-from flight.link.telemetry.log import make_lasting
+from flight.link.regular_files import make_lasting, read_regular
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock

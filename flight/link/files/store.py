@@ -5,7 +5,6 @@ A record is written to a temporary file, synced and renamed, so that a crash lea
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import shutil
@@ -18,7 +17,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.link.files.units import HIGHEST_NUMBER, Transaction
-from flight.link.regular_files import read_regular
+from flight.link.regular_files import locked, make_lasting, read_regular
 from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
@@ -122,16 +121,8 @@ class Store:
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Lock the folder against a second process. Raises UsageError if another process has locked it."""
-        file = os.open(self._folder / "owner", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            os.close(file)
-            raise UsageError(f"{self._folder}: another process transfers these files") from error
-        try:
+        with locked(self._folder / "owner", f"{self._folder}: another process transfers these files"):
             yield
-        finally:
-            os.close(file)
 
     def new_number(self, utc_ns: int) -> int:
         """Reserve a number durably, above all earlier numbers even if their record was lost."""
@@ -174,7 +165,7 @@ class Store:
         try:
             target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             os.replace(self.part(record), target)
-            _sync_folder(target.parent)
+            make_lasting(target.parent)
         except OSError as error:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
 
@@ -206,17 +197,9 @@ def write_whole(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(beside, path)
-        _sync_folder(path.parent)
+        make_lasting(path.parent)
     except OSError as error:
         raise FileError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-def _sync_folder(folder: Path) -> None:
-    file = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
 
 
 def _read(path: Path, shape: type[T]) -> T | None:

@@ -31,8 +31,8 @@ from msgspec import Meta
 from flight.link.commands import ChangeMode, Command, CommandError, Point, Slew, command_of_words
 from flight.link.modes import Mode
 from flight.link.process.directives import LONGEST_COMMAND, SCHEDULE, Deletion, Listing, Scheduled
-from flight.link.regular_files import read_regular
-from flight.link.security import COPIES, overwrite
+from flight.link.regular_files import overwrite, read_regular
+from flight.link.security import COPIES
 from flight.link.telemetry.definitions import COMMAND, HEALTH, MODE
 from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
 from hal.interfaces.wires import SECOND_NS

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flight.link.events import COMMANDED, EventKind
+from flight.link.regular_files import make_lasting
 from flight.link.telemetry.definitions import ATTITUDE, CONTROL, EVENT, HEALTH, HOUSEKEEPING, RUN, Packet
 from flight.link.telemetry.packets import Packer, TelemetryError
 from hal.interfaces.wires import Clock
@@ -50,15 +51,6 @@ class SegmentFile(Protocol):
 
     def close(self) -> None:
         """Close the file. Raises OSError."""
-
-
-def make_lasting(folder: Path) -> None:
-    """Sync a folder, so that the names of its files survive a loss of power. Raises OSError."""
-    names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(names)
-    finally:
-        os.close(names)
 
 
 def open_segment(path: Path) -> SegmentFile:

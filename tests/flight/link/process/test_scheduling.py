@@ -13,7 +13,7 @@ from flight.link.modes import Mode
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import MOST_ENTRIES, Timetable, TimetableError
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
-from flight.link.security import overwrite
+from flight.link.regular_files import overwrite
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
 
