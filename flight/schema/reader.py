@@ -11,9 +11,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from flight.schema.consistency import check_consistency
-from flight.schema.conversion import convert
 from flight.schema.devices import Camera
-from flight.schema.document import ConfigError, read_document, read_text
+from flight.schema.document import ConfigError, convert, read_document, read_text
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
