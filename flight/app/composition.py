@@ -15,17 +15,15 @@ from flight.link.commands import Channel
 from flight.link.telemetry.log import Recorder
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
-from flight.loop.body import PLANNER, BodyKind, FlightBody, Planner
-from flight.loop.commanding import CommandedTasks, CommandTask, ParameterTable, ParameterUsers
+from flight.loop.body import PLANNER, BodyKind, FlightBody
+from flight.loop.commanding import CommandTask, ParameterTable
 from flight.loop.control_cycle import LoopTasks
 from flight.loop.executive import JobRunner, Worker
 from flight.loop.facts import EventLog, Facts, Services, Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.health import (
-    HealthInputs,
     HealthWatch,
     Housekeeping,
-    HousekeepingInputs,
     PerformanceObserver,
     WorkerWatch,
 )
@@ -36,9 +34,8 @@ from flight.loop.navigation import Navigation, NavigationSettings, Positioning, 
 from flight.loop.state import Learned, StateKeeper
 from flight.loop.steering import CoilDrive, CoilDriveSettings, Steering
 from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_settings
-from flight.schema.devices import ObjectTracking as TrackingSection
 from flight.schema.document import ConfigError
-from flight.schema.sections import CONTROL_RATE_HZ, Config, Executive
+from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.gnc.tracking.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
@@ -64,29 +61,20 @@ def body_kind(config: Config) -> BodyKind:
     try:
         kind = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError("body", f"is {config.body!r}, which cannot be had: {error}") from error
+        raise ConfigError("body", f"is {config.body!r}, which cannot be loaded: {error}") from error
     if not isinstance(kind, BodyKind):
-        raise ConfigError("body", f"is {config.body!r}: that is no BodyKind of flight.loop.body")
+        raise ConfigError("body", f"is {config.body!r}: this object is not a BodyKind of flight.loop.body")
     return kind
 
 
-def navigation_settings(config: Config) -> NavigationSettings:
-    """Return the age limits of the inertial unit's readings."""
-    section = config.estimation
-    return NavigationSettings(
-        round(config.inertial_unit.max_age * SECOND_NS),
-        round(section.coast * SECOND_NS),
-        round(SECOND_NS / CONTROL_RATE_HZ),
-    )
-
-
 def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> ImagingSettings:
-    """Return the settings of imaging; `frames` is the folder of frames that are kept."""
+    """Return the settings of imaging; `frames` is the folder for frames that are kept."""
+    model, (least, most) = camera_model(camera), camera.streak_exposure or (camera.exposure, camera.exposure)
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
-        camera=camera_model(camera),
-        exposures=_exposures(camera),
-        # A trigger may come late, and the next on time.
+        camera=model,
+        exposures=Exposures(camera.exposure, least, most, model.focal_length),
+        # A trigger may come late and the next trigger on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
@@ -108,7 +96,7 @@ def imaging_settings(camera: Camera, body: FlightBody, frames: Path | None) -> I
 
 
 def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSettings:
-    """Return the times of the wide cameras, those of the most frequent one for all."""
+    """Return the times of the horizon cameras: for all cameras those of the most frequent camera."""
     fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
     period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
     return HorizonCameraSettings(
@@ -118,17 +106,6 @@ def horizon_camera_settings(cameras: Sequence[WideCamera]) -> HorizonCameraSetti
         min(2 * SECOND_NS, period_ns),
         max(round(max(camera.max_age for camera in cameras) * SECOND_NS), 2 * fine_ns),
     )
-
-
-def _exposures(camera: Camera) -> Exposures:
-    """Return the exposures of the star camera."""
-    least, most = camera.streak_exposure or (camera.exposure, camera.exposure)
-    return Exposures(camera.exposure, least, most, camera_model(camera).focal_length)
-
-
-def track_settings(section: TrackingSection) -> TrackSettings:
-    """Return how tracks of objects start, go on and end."""
-    return TrackSettings(needed=section.needed, within=section.within, coast=section.coast)
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:
@@ -179,18 +156,6 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     return made
 
 
-def worker_watches(
-    limits: Executive, planner: Planner, imaging: Imaging | None, wide: HorizonCameraTask | None
-) -> list[WorkerWatch]:
-    """Return the watch over each worker, with twice the timeout of the runner as its patience."""
-    busy = [(PLANNER, planner.busy_since_ns, limits.planner_timeout)]
-    if imaging is not None:
-        busy.append((imaging_task.WORKER, imaging.busy_since_ns, limits.vision_timeout))
-    if wide is not None:
-        busy.append((horizon_task.WORKER, wide.busy_since_ns, limits.vision_timeout))
-    return [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
-
-
 @dataclass(frozen=True, slots=True)
 class Opened:
     """The open devices, workers and logs of a flight.
@@ -218,15 +183,14 @@ def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> Flig
     services = Services(
         opened.clock, opened.jobs, opened.recorder, events, Facts(events), Streams(streams_of(config))
     )
-    keeper = supervisors.keeper
-    learned: Mapping[str, Learned] = keeper.learned if keeper else {}
+    learned: Mapping[str, Learned] = supervisors.keeper.learned if supervisors.keeper else {}
     body = body_kind(config).make(config, services, learned)
     loop: FlightLoop
 
     def stop(reason: str) -> None:
         loop.stop(reason)
 
-    tasks = _tasks(config, opened, services, body, keeper, stop)
+    tasks = _tasks(config, opened, services, body, supervisors.keeper, stop)
     loop = FlightLoop(config, body, tasks, services, supervisors)
     return loop
 
@@ -239,50 +203,53 @@ def _tasks(
     keeper: StateKeeper | None,
     stop: Callable[[str], None],
 ) -> LoopTasks:
-    devices, timeline = opened.devices, config.commands.timeline
-    navigation = Navigation(devices.unit, body.estimation, navigation_settings(config), services)
-    drive = _drive(config, devices, body, services)
-    steering = Steering(body, drive, services)
+    devices, planner = opened.devices, body.control.planner
+    ages = NavigationSettings(
+        round(config.inertial_unit.max_age * SECOND_NS),
+        round(config.estimation.coast * SECOND_NS),
+        round(SECOND_NS / CONTROL_RATE_HZ),
+    )
+    navigation = Navigation(devices.unit, body.estimation, ages, services)
     imaging = _imaging(config, opened, navigation, body, services)
-    wide = _wide(config, devices, body, services)
+    wide = None
+    if config.wide_cameras and devices.wide and body.estimation.wide is not None:
+        times = horizon_camera_settings(config.wide_cameras)
+        wide = HorizonCameraTask(devices.wide, body.estimation.wide, times, services)
+    limits = np.full(3, config.coils.current_limit)
+    coils = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
+    drive = CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, coils, services)
+    steering = Steering(body, drive, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
-    observer = PerformanceObserver(devices.coils, services)
-    watches = worker_watches(config.executive, body.control.planner, imaging, wide)
-    health = HealthWatch(
-        HealthInputs(modes, drive, devices.power, watches), config.health, opened.feed, services
+    # A worker is stalled after twice the timeout at which the runner kills it.
+    busy = [(PLANNER, planner.busy_since_ns, config.executive.planner_timeout)]
+    if imaging is not None:
+        busy.append((imaging_task.WORKER, imaging.busy_since_ns, config.executive.vision_timeout))
+    if wide is not None:
+        busy.append((horizon_task.WORKER, wide.busy_since_ns, config.executive.vision_timeout))
+    watches = [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
+    health = HealthWatch(modes, drive, devices.power, watches, config.health, opened.feed, services)
+    housekeeping = Housekeeping(
+        navigation, planner, imaging, devices.coils, devices.power, opened.log_error, services
     )
-    watched = HousekeepingInputs(
-        navigation, body.control.planner, imaging, devices.coils, devices.power, opened.log_error
-    )
-    commanded = bool(opened.channels or timeline)
-    parameters = ParameterTable(
-        config, ParameterUsers((modes.adopt, drive.adopt), health.adopt), keeper, services
-    )
-    obeying = CommandedTasks(modes, drive, parameters)
-    commanding = CommandTask(obeying, timeline, opened.channels, services) if commanded else None
-    positioning = _positioning(config, devices, body, services)
-    sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
+    commanding = None
+    if opened.channels or config.commands.timeline:
+        table = ParameterTable(config, (modes.adopt, drive.adopt), health.adopt, keeper, services)
+        commanding = CommandTask(modes, drive, table, config.commands.timeline, opened.channels, services)
     return LoopTasks(
-        navigation,
-        imaging,
-        positioning,
-        sun,
-        wide,
-        modes,
-        steering,
-        drive,
-        observer,
-        health,
-        house,
-        commanding,
+        navigation=navigation,
+        imaging=imaging,
+        positioning=_positioning(config, devices, body, services),
+        sun=_sun(config, devices, body, services),
+        wide=wide,
+        modes=modes,
+        steering=steering,
+        drive=drive,
+        observer=PerformanceObserver(devices.coils, services),
+        health=health,
+        housekeeping=housekeeping,
+        commanding=commanding,
     )
-
-
-def _drive(config: Config, devices: Devices, body: FlightBody, services: Services) -> CoilDrive:
-    limits = np.full(3, config.coils.current_limit)
-    settings = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
-    return CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, settings, services)
 
 
 def _positioning(
@@ -290,25 +257,15 @@ def _positioning(
 ) -> Positioning | None:
     if config.gps is None or devices.gps is None:
         return None
-    return Positioning(
-        devices.gps, body.estimation.accept_fix, round(config.gps.max_age * SECOND_NS), services
-    )
+    max_age_ns = round(config.gps.max_age * SECOND_NS)
+    return Positioning(devices.gps, body.estimation.accept_fix, max_age_ns, services)
 
 
 def _sun(config: Config, devices: Devices, body: FlightBody, services: Services) -> SunSensing | None:
     if config.solar_strings is None or devices.strings is None:
         return None
-    return SunSensing(
-        devices.strings, body.estimation.accept_sun, round(config.solar_strings.max_age * SECOND_NS), services
-    )
-
-
-def _wide(config: Config, devices: Devices, body: FlightBody, services: Services) -> HorizonCameraTask | None:
-    if not config.wide_cameras or not devices.wide or body.estimation.wide is None:
-        return None
-    return HorizonCameraTask(
-        devices.wide, body.estimation.wide, horizon_camera_settings(config.wide_cameras), services
-    )
+    max_age_ns = round(config.solar_strings.max_age * SECOND_NS)
+    return SunSensing(devices.strings, body.estimation.accept_sun, max_age_ns, services)
 
 
 def _imaging(
@@ -317,7 +274,9 @@ def _imaging(
     camera, source = config.camera, opened.devices.camera
     if camera is None or source is None:
         return None
+    objects, section = None, camera.objects
+    if section is not None:
+        tracks = TrackSettings(needed=section.needed, within=section.within, coast=section.coast)
+        objects = ObjectTracks(tracks, body, services)
     settings = imaging_settings(camera, body, opened.frames)
-    section = camera.objects
-    objects = None if section is None else ObjectTracks(track_settings(section), body, services)
     return Imaging(source, settings, navigation, body.view, services, objects)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import msgspec
@@ -56,23 +55,23 @@ PROVEN_NS = 60_000_000_000
 """Flight time after which a loaded table stays, however the flight ends."""
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterUsers:
-    """Who goes on with other bounds of the modes and of health."""
-
-    modes: Sequence[Callable[[Modes], None]]
-    health: Callable[[Health], None]
-
-
 class ParameterTable:
     """Owns the table of parameters that flies."""
 
     def __init__(
-        self, config: Config, adopters: ParameterUsers, keeper: StateKeeper | None, services: Services
+        self,
+        config: Config,
+        adopt_modes: Sequence[Callable[[Modes], None]],
+        adopt_health: Callable[[Health], None],
+        keeper: StateKeeper | None,
+        services: Services,
     ) -> None:
-        """Start with the configuration's values, or with a table that the `keeper` has."""
+        """Start with the configuration's values, or with a table that the `keeper` has.
+
+        `adopt_modes` and `adopt_health` replace the limits of the tasks that use them.
+        """
         self._config = config
-        self._adopters = adopters
+        self._adopt_modes, self._adopt_health = adopt_modes, adopt_health
         self._keeper = keeper
         self._recorder = services.recorder
         self._events = services.events
@@ -141,9 +140,9 @@ class ParameterTable:
         except msgspec.ValidationError as error:
             return str(error)
         self._values = values
-        for adopt in self._adopters.modes:
+        for adopt in self._adopt_modes:
             adopt(modes)
-        self._adopters.health(health)
+        self._adopt_health(health)
         return ""
 
 
@@ -161,28 +160,21 @@ def _section(section: S, name: str, values: Mapping[str, float]) -> S:
 _REMEMBERED = 64
 
 
-@dataclass(frozen=True, slots=True)
-class CommandedTasks:
-    """The tasks that obey commands."""
-
-    modes: ModeControl
-    drive: CoilDrive
-    parameters: ParameterTable
-
-
 class CommandTask:
     """The task of the commands' rate group."""
 
     def __init__(
         self,
-        obeying: CommandedTasks,
+        modes: ModeControl,
+        drive: CoilDrive,
+        parameters: ParameterTable,
         timeline: Sequence[CommandStep],
         channels: Sequence[Channel],
         services: Services,
     ) -> None:
-        self._modes = obeying.modes
-        self._drive = obeying.drive
-        self._parameters = obeying.parameters
+        self._modes = modes
+        self._drive = drive
+        self._parameters = parameters
         self._timeline = deque(sorted(timeline, key=lambda step: step.at))
         self._channels = channels
         self._facts = services.facts
@@ -210,16 +202,12 @@ class CommandTask:
                 fields, well_formed = self._execute(channel.name, data, now_ns)
                 if not well_formed:
                     continue
-                mission_ns = now_ns - self._recorder.epoch_ns
-                channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + self._asked(fields), sender)
-
-    def _asked(self, fields: Mapping[str, Any]) -> bytes:
-        """Return the packets that a command asked for."""
-        if fields["obeyed"] and fields["name"] == PING.name:
-            return self._recorder.status()
-        if fields["obeyed"] and fields["name"] == DUMP_PARAMETERS.name:
-            return self._recorder.newest(PARAMETERS)
-        return b""
+                answer = self._answers.pack(COMMAND, now_ns - self._recorder.epoch_ns, fields)
+                if fields["obeyed"] and fields["name"] == PING.name:
+                    answer += self._recorder.status()
+                elif fields["obeyed"] and fields["name"] == DUMP_PARAMETERS.name:
+                    answer += self._recorder.newest(PARAMETERS)
+                channel.answer(answer, sender)
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
         """Execute a datagram; return the fields of the answer, and whether it is a packet of a command."""

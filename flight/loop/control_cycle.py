@@ -1,4 +1,4 @@
-"""One cycle at 40 Hz: from bytes to estimate, and by mode and path to currents; recorded in the log."""
+"""One control cycle (40 Hz): from readings to an estimate, and by mode and path to coil currents."""
 
 from __future__ import annotations
 
@@ -54,17 +54,34 @@ class LoopTasks:
     commanding: CommandTask | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """The inputs of one cycle: coil command on the wire, its validity, and readings of the inertial unit."""
+@dataclass(slots=True, eq=False)
+class _CycleRecord:
+    """The inputs and results of one cycle, filled in step by step.
 
+    Attributes:
+        coils: the coil command on the wire at the start of the cycle.
+        validity: whether the coil currents are known.
+        readings: of the inertial unit since the last cycle, oldest first.
+        estimate: for now, measured or propagated by the model; None without an estimate.
+        measured: the estimate, if it may be used for steering.
+    """
+
+    cycle: Cycle
     coils: CoilState
     validity: CurrentValidity
     readings: Sequence[ImuReading]
+    estimate: Estimate | None = None
+    mode: Mode = Mode.BOOT
+    measured: Estimate | None = None
+
+    @property
+    def now_ns(self) -> int:
+        """Start of the cycle."""
+        return self.cycle.start_ns
 
 
 class ControlCycle:
-    """The task of the control rate group: sample, check, estimate, decide, steer, publish."""
+    """The task of the control rate group: sample, estimate, check, decide, steer, publish."""
 
     def __init__(self, tasks: LoopTasks, body: FlightBody, services: Services) -> None:
         self._tasks = tasks
@@ -75,27 +92,22 @@ class ControlCycle:
         self._knowledge = CoilKnowledge()
         self._ever_started = False
         self._had_estimate = False
-        self._measured = False
+        self._was_measured = False
         self._target: Target | None = None
 
     def run(self, cycle: Cycle) -> ControlOutput:
         """Run one cycle."""
-        now_ns = cycle.start_ns
-        samples = self._sample(now_ns)
-        self._check(samples, now_ns)
-        estimate = self._tasks.navigation.estimate(now_ns)
-        mode = self._decide(estimate, samples, now_ns)
-        if self._accept_results(now_ns):
-            estimate = self._tasks.navigation.estimate(now_ns)
-        measured = estimate if self._measured else None
-        steered = self._steer(mode, measured, samples.readings, now_ns)
-        output = ControlOutput(cycle, mode, estimate, self._target, steered, self._tasks.drive.state())
-        self._publish(output, measured)
-        return output
+        record = self._sample(cycle)
+        self._estimate(record)
+        self._check(record)
+        self._decide(record)
+        self._accept_results(record)
+        steered = self._steer(record)
+        return self._publish(record, steered)
 
-    def _sample(self, now_ns: int) -> _Samples:
-        """Return the coil command on the wire and the readings, and apply both to the estimate."""
-        tasks = self._tasks
+    def _sample(self, cycle: Cycle) -> _CycleRecord:
+        """Read the coil command on the wire and the inertial unit, and give both to navigation."""
+        tasks, now_ns = self._tasks, cycle.start_ns
         # The last command may have reached the wire late: the coils' thread sends it.
         coils = tasks.drive.state()
         validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
@@ -103,89 +115,83 @@ class ControlCycle:
         readings = tasks.navigation.update(now_ns)
         if not coils.error:
             self._streams.note("coils", now_ns)
-        return _Samples(coils, validity, readings)
+        return _CycleRecord(cycle, coils, validity, readings)
 
-    def _check(self, samples: _Samples, now_ns: int) -> None:
-        """Check the coils against supply current and motion, and the camera."""
-        tasks = self._tasks
-        known = samples.validity.since_last_look
-        tasks.drive.look(samples.coils, samples.readings, now_ns, known=known)
-        if tasks.imaging is not None:
-            tasks.imaging.serve(now_ns)
+    def _estimate(self, record: _CycleRecord) -> None:
+        """Propagate the estimate to now."""
+        record.estimate = self._tasks.navigation.estimate(record.now_ns)
 
-    def _decide(self, estimate: Estimate | None, samples: _Samples, now_ns: int) -> Mode:
-        """Return the mode to act in; set the target, and request a path if there is an estimate again."""
+    def _check(self, record: _CycleRecord) -> None:
+        """Check the coils against supply current and motion, and the star camera."""
+        known = record.validity.since_last_look
+        self._tasks.drive.look(record.coils, record.readings, record.now_ns, known=known)
+        if self._tasks.imaging is not None:
+            self._tasks.imaging.serve(record.now_ns)
+
+    def _decide(self, record: _CycleRecord) -> None:
+        """Set mode and target; request a path if the target is new or there is an estimate again."""
+        tasks, control, now_ns, estimate = self._tasks, self._body.control, record.now_ns, record.estimate
         overdue = None
         if estimate is not None and self._target is not None:
-            overdue = self._body.control.targets.error_when_due(estimate, self._target, now_ns)
-        rate = _newest_rate(samples.readings)
-        mode = self._tasks.modes.step(estimate, rate, overdue, not samples.coils.error, now_ns)
-        self._aim(now_ns)
-        planner, measured = self._body.control.planner, self._tasks.navigation.is_measured(now_ns)
+            overdue = control.targets.error_when_due(estimate, self._target, now_ns)
+        rate = math.hypot(*record.readings[-1].rate.tolist()) if record.readings else None
+        record.mode = tasks.modes.step(estimate, rate, overdue, not record.coils.error, now_ns)
+        target = tasks.modes.target(now_ns - self._recorder.epoch_ns)
+        if target is not self._target:
+            self._target = target
+            if target is not None:
+                self._body.view.announce(target, now_ns)
+                control.planner.aim(target, now_ns)
+        measured = tasks.navigation.is_measured(now_ns)
         if estimate is not None and not self._had_estimate:
-            planner.request(now_ns)
-        elif measured and not self._measured:
-            planner.resume(now_ns)
+            control.planner.request(now_ns)
+        elif measured and not self._was_measured:
+            control.planner.resume(now_ns)
         self._had_estimate = estimate is not None
         self._ever_started = self._ever_started or self._had_estimate
-        self._measured = measured
-        return mode
+        self._was_measured = measured
 
-    def _aim(self, now_ns: int) -> None:
-        """Set the target in force; announce a new target and request a path at once."""
-        target = self._tasks.modes.target(now_ns - self._recorder.epoch_ns)
-        if target is self._target:
-            return
-        self._target = target
-        if target is not None:
-            self._body.view.announce(target, now_ns)
-            self._body.control.planner.aim(target, now_ns)
-
-    def _accept_results(self, now_ns: int) -> bool:
-        """Accept the workers' results; return whether a frame was among them."""
-        tasks, framed = self._tasks, False
+    def _accept_results(self, record: _CycleRecord) -> None:
+        """Give the workers' results to their tasks; a result of a camera changes the estimate."""
+        tasks, now_ns = self._tasks, record.now_ns
         for result in self._jobs.collect():
             tasks.observer.job(result, now_ns)
             if result.worker == PLANNER:
                 self._body.control.planner.finish(result, now_ns)
-            elif result.worker == imaging_task.WORKER and tasks.imaging is not None:
+                continue
+            if result.worker == imaging_task.WORKER and tasks.imaging is not None:
                 tasks.imaging.finish(result, now_ns)
-                framed = True
             elif result.worker == horizon_task.WORKER and tasks.wide is not None:
                 tasks.wide.finish(result, now_ns)
-                framed = True
-        return framed
+            self._estimate(record)
+        record.measured = record.estimate if self._was_measured else None
 
-    def _steer(
-        self, mode: Mode, estimate: Estimate | None, readings: Sequence[ImuReading], now_ns: int
-    ) -> Steered:
-        """Use the coils as the mode requires; `estimate` is None unless measured."""
-        steering, modes = self._tasks.steering, self._tasks.modes
-        if mode in STEERING:
-            return steering.run(estimate, now_ns, self._ever_started)
+    def _steer(self, record: _CycleRecord) -> Steered:
+        """Use the coils as the mode requires."""
+        steering, modes, now_ns = self._tasks.steering, self._tasks.modes, record.now_ns
+        if record.mode in STEERING:
+            return steering.run(record.measured, now_ns, self._ever_started)
+        current = self._tasks.navigation.is_current(now_ns)
         if modes.detumbles:
-            return steering.detumble(readings, self._tasks.navigation.is_current(now_ns), now_ns)
+            return steering.detumble(record.readings, current, now_ns)
         if modes.acquires_sun:
-            return steering.acquire_sun(readings, self._tasks.navigation.is_current(now_ns), now_ns)
+            return steering.acquire_sun(record.readings, current, now_ns)
         return steering.rest(now_ns)
 
-    def _publish(self, output: ControlOutput, measured: Estimate | None) -> None:
-        """Submit the requested plan, and record the cycle; `measured` is the measured estimate or None."""
-        cycle = output.cycle
-        if output.mode in STEERING and output.target is not None:
-            self._body.control.planner.serve(measured, output.target, cycle.start_ns)
+    def _publish(self, record: _CycleRecord, steered: Steered) -> ControlOutput:
+        """Submit the requested plan, and record the cycle."""
+        mode, estimate, target, now_ns = record.mode, record.estimate, self._target, record.now_ns
+        output = ControlOutput(record.cycle, mode, estimate, target, steered, self._tasks.drive.state())
+        if mode in STEERING and target is not None:
+            self._body.control.planner.serve(record.measured, target, now_ns)
         self._body.view.record_cycle(output)
-        if cycle.slot % ATTITUDE_EVERY == 0:
-            self._record(output)
-
-    def _record(self, output: ControlOutput) -> None:
-        """Record the attitude packet, the same for every body."""
-        estimate, reference, target = output.estimate, output.steered.reference, output.target
-        now_ns = output.cycle.start_ns
+        if record.cycle.slot % ATTITUDE_EVERY:
+            return output
+        reference = steered.reference
         self._recorder.record(
             ATTITUDE,
             now_ns,
-            mode=int(output.mode),
+            mode=int(mode),
             quaternion=(_NAN4 if estimate is None else estimate.quaternion).tolist(),
             rate=(_NAN3 if estimate is None else estimate.rate).tolist(),
             angle_sigma=_sigmas(estimate, ATTITUDE_ERROR),
@@ -193,13 +199,9 @@ class ControlCycle:
             wanted=(_NAN4 if reference is None else reference.quaternion).tolist(),
             wanted_rate=(_NAN3 if reference is None else reference.body_rate).tolist(),
             target=(_NAN4 if target is None else target.law.quaternion(now_ns)).tolist(),
-            dipole=output.steered.dipole.tolist(),
+            dipole=steered.dipole.tolist(),
         )
-
-
-def _newest_rate(readings: Sequence[ImuReading]) -> float | None:
-    """Return the magnitude of the newest body rate of this cycle, rad/s."""
-    return math.hypot(*readings[-1].rate.tolist()) if readings else None
+        return output
 
 
 def _sigmas(estimate: Estimate | None, part: slice) -> list[float]:

@@ -357,23 +357,26 @@ class PerformanceObserver:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class HousekeepingInputs:
-    """The sources of housekeeping; `log_error` returns why the flight log fails, empty while it works."""
-
-    navigation: Navigation
-    planner: Planner
-    imaging: Imaging | None
-    coils: TorqueCoils
-    power: PowerMonitor | None
-    log_error: Callable[[], str]
-
-
 class Housekeeping:
     """Writes the housekeeping packet."""
 
-    def __init__(self, watched: HousekeepingInputs, services: Services) -> None:
-        self._watched = watched
+    def __init__(
+        self,
+        navigation: Navigation,
+        planner: Planner,
+        imaging: Imaging | None,
+        coils: TorqueCoils,
+        power: PowerMonitor | None,
+        log_error: Callable[[], str],
+        services: Services,
+    ) -> None:
+        """Record the counters of the given parts; `log_error` returns the error of the log, else empty."""
+        self._navigation = navigation
+        self._planner = planner
+        self._imaging = imaging
+        self._coils = coils
+        self._power = power
+        self._log_error = log_error
         self._recorder = services.recorder
         self._events = services.events
         self._facts = services.facts
@@ -381,20 +384,18 @@ class Housekeeping:
 
     def coils(self) -> CoilState:
         """Return the state of the coils."""
-        return self._watched.coils.state()
+        return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
         """Write the packet; `state` is that of the newest control cycle."""
-        watched, now_ns = self._watched, cycle.start_ns
-        error = watched.power.error() if watched.power else ""
-        log_error = watched.log_error()
+        now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
         self.report_lost(now_ns)
-        reading = watched.power.latest() if watched.power and not error else None
-        link = watched.navigation.link()
-        accepted, refused = watched.planner.counts()
-        frames, streak_rates = watched.imaging.counts() if watched.imaging else (0, 0)
+        reading = power.latest() if power and not power.error() else None
+        link = self._navigation.link()
+        accepted, refused = self._planner.counts()
+        frames, streak_rates = self._imaging.counts() if self._imaging else (0, 0)
         self._recorder.record(
             HOUSEKEEPING,
             now_ns,
@@ -404,7 +405,7 @@ class Housekeeping:
             imu_discarded_bytes=link.discarded_bytes,
             imu_out_of_range=link.out_of_range,
             imu_not_finite=link.not_finite,
-            coil_faults=watched.coils.state().faults,
+            coil_faults=self._coils.state().faults,
             coil_voltage=reading.voltage if reading else math.nan,
             coil_current=reading.current if reading else math.nan,
             coil_power=reading.power if reading else math.nan,
@@ -434,24 +435,24 @@ _WORKER_EVENTS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class HealthInputs:
-    """The tasks and devices that health checks, in addition to the streams."""
-
-    modes: ModeControl
-    drive: CoilDrive
-    power: PowerMonitor | None
-    workers: Sequence[WorkerWatch]
-
-
 class HealthWatch:
     """The task of the health rate group."""
 
     def __init__(
-        self, inputs: HealthInputs, limits: Health, feed: Callable[[], None], services: Services
+        self,
+        modes: ModeControl,
+        drive: CoilDrive,
+        power: PowerMonitor | None,
+        workers: Sequence[WorkerWatch],
+        limits: Health,
+        feed: Callable[[], None],
+        services: Services,
     ) -> None:
-        """Watch `inputs`; `feed` is called while every rate group and worker makes progress."""
-        self._inputs = inputs
+        """Watch the given parts; `feed` is called while every rate group and worker makes progress."""
+        self._modes = modes
+        self._drive = drive
+        self._power = power
+        self._workers = workers
         self._monitor = ResourceMonitor(limits)
         self._clock_watch = ClockWatch(services.clock)
         self._clock = services.clock
@@ -471,7 +472,7 @@ class HealthWatch:
     def watch(self, groups: Sequence[RateGroup]) -> None:
         """Watch the rate groups of the flight, control first."""
         self._control = groups[0]
-        self._progress = GroupsAndWorkers(list(groups), list(self._inputs.workers))
+        self._progress = GroupsAndWorkers(list(groups), list(self._workers))
         self._counted = (self._control.cycles, self._control.completed)
 
     def read_resources(self, read: ResourceReader, period_ns: int) -> None:
@@ -499,9 +500,11 @@ class HealthWatch:
     def run(self, cycle: Cycle) -> None:
         """Run all checks once."""
         now_ns = cycle.start_ns
-        self._look_at_streams(now_ns)
-        self._look_at_progress(now_ns)
-        self._look_at_services(now_ns)
+        self._check_streams(now_ns)
+        self._check_progress(now_ns)
+        failures = failing(self._clock.tickers, now_ns)
+        text = "; ".join(failures) or "all jobs run"
+        self._facts.update(facts.SERVICE_FAILING, bool(failures), now_ns, text)
         for news in self._jobs.news():
             text = f"{news.worker}: {news.text}"
             self._worker_events.report(_WORKER_EVENTS[news.change], now_ns, text)
@@ -515,18 +518,17 @@ class HealthWatch:
         if cycle.slot % RUNS_PER_PACKET == 0:
             self._record(now_ns)
 
-    def _look_at_streams(self, now_ns: int) -> None:
-        inputs = self._inputs
-        error = inputs.power.error() if inputs.power is not None else ""
+    def _check_streams(self, now_ns: int) -> None:
+        error = self._power.error() if self._power is not None else ""
         self._facts.update(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
-        reading = inputs.power.latest() if inputs.power is not None else None
+        reading = self._power.latest() if self._power is not None else None
         if reading is not None and reading.time_ns != self._power_ns:
             self._power_ns = reading.time_ns
             self._streams.note("power", reading.time_ns, reading.current)
         for stream, poor, text in self._streams.look(now_ns):
             self._facts.update(stream.poor, poor, now_ns, text)
 
-    def _look_at_progress(self, now_ns: int) -> None:
+    def _check_progress(self, now_ns: int) -> None:
         """Feed the watchdog if nothing is stalled; update the fact that the control task keeps failing."""
         before = self._counted
         if self._control.completed != before[1]:
@@ -540,27 +542,21 @@ class HealthWatch:
             self._feed()
             self._fed += 1
 
-    def _look_at_services(self, now_ns: int) -> None:
-        """Update the fact that a job outside the loop fails or is stalled."""
-        poor = failing(self._clock.tickers, now_ns)
-        text = "; ".join(poor) if poor else "all jobs run"
-        self._facts.update(facts.SERVICE_FAILING, bool(poor), now_ns, text)
-
     def _record(self, now_ns: int) -> None:
-        inputs, state = self._inputs, self._monitor.state
-        sample, streams = state.sample, self._streams
+        state, streams = self._monitor.state, self._streams
+        sample = state.sample
         self._recorder.record(
             HEALTH,
             now_ns,
-            mode=int(inputs.modes.mode),
-            mode_age=(now_ns - inputs.modes.since_ns) * 1e-9,
+            mode=int(self._modes.mode),
+            mode_age=(now_ns - self._modes.since_ns) * 1e-9,
             imu=int(streams.state("imu", now_ns)),
             field=int(streams.state("field", now_ns)),
             coils=int(streams.state("coils", now_ns)),
             power=int(streams.state("power", now_ns)),
             camera=int(streams.state("camera", now_ns)),
             facts=sum(self._facts.holds(fact) << bit for bit, fact in enumerate(FACTS)),
-            coils_in_use=sum(int(used) << axis for axis, used in enumerate(inputs.drive.available)),
+            coils_in_use=sum(int(used) << axis for axis, used in enumerate(self._drive.available)),
             fed=self._fed,
             slips=self._control.slips,
             clock_steps=self._clock_watch.steps,

@@ -33,7 +33,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarg
 
 
 class Trigger(Enum):
-    """What may change the mode: the end of the boot, a command, a reaction, or an achievement."""
+    """An occurrence that may change the mode: end of the boot, command, reaction, or achievement."""
 
     START_SAFE = "start in safe"
     START_DETUMBLE = "start in detumble"
@@ -93,113 +93,54 @@ class TriggerAnswer(Enum):
 Row = Mapping[Trigger, Mode | TriggerAnswer]
 Table = Mapping[Mode, Row]
 
-_COMMANDED: Row = {trigger: mode for mode, trigger in COMMANDS.items()}
-_STARTED: Row = dict.fromkeys(STARTS.values(), TriggerAnswer.STAY)
-_ACQUIRED: Row = dict.fromkeys((*KNOWN.values(), Trigger.LOST), TriggerAnswer.STAY)
-_POINTING: Row = {  # a new target is approached from the present attitude
-    **_STARTED,
-    **_COMMANDED,
-    **_ACQUIRED,
-    Trigger.LOST: Mode.ACQUIRE,
+_USUAL: Row = {
+    **dict.fromkeys(Trigger, TriggerAnswer.STAY),
+    **{trigger: mode for mode, trigger in COMMANDS.items()},
     Trigger.REACT_SAFE: Mode.SAFE,
     Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-    Trigger.REACT_HOLD: TriggerAnswer.STAY,
-    Trigger.DETUMBLED: TriggerAnswer.STAY,
-    Trigger.SLOWED: TriggerAnswer.STAY,
-    Trigger.ARRIVED: TriggerAnswer.STAY,
 }
+"""The answers of a mode that steers the body, before its exceptions."""
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
+        **_USUAL,
         **{trigger: mode for mode, trigger in STARTS.items()},
         **dict.fromkeys(COMMANDS.values(), TriggerAnswer.REFUSE),
-        **_ACQUIRED,
         Trigger.COMMAND_SAFE: Mode.SAFE,
-        Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
     Mode.SAFE: {  # left by command only; the way to pointing leads through the acquisition
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
+        **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
         Trigger.COMMAND_SAFE: TriggerAnswer.STAY,
         Trigger.REACT_SAFE: TriggerAnswer.STAY,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
-    Mode.DETUMBLE: {  # commanded to point it does so once its rate is low and its attitude known
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
+    Mode.DETUMBLE: {  # a command to point takes effect once the rate is low and the attitude known
+        **_USUAL,
         Trigger.COMMAND_SUN: TriggerAnswer.STAY,
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,
         Trigger.COMMAND_DETUMBLE: TriggerAnswer.STAY,
-        Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
         Trigger.DETUMBLED: Mode.HOLD,
         Trigger.SLOWED: Mode.ACQUIRE,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
-    Mode.HOLD: {  # commanded again it keeps the attitude of that moment
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
-        Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
-    },
-    Mode.SLEW: {  # commanded again it goes to the new target
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
-        Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: Mode.HOLD,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: Mode.HOLD,
-    },
-    Mode.TESTBED_DEMO: {  # without a plan it holds the attitude, and continues with the next plan
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
-        Trigger.COMMAND_DEMO: TriggerAnswer.STAY,
-        Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
-    },
+    Mode.HOLD: _USUAL,  # a second command keeps the attitude of that moment
+    Mode.SLEW: {**_USUAL, Trigger.REACT_HOLD: Mode.HOLD, Trigger.ARRIVED: Mode.HOLD},
+    # Without a plan the demonstration holds the attitude, and continues with the next plan.
+    Mode.TESTBED_DEMO: {**_USUAL, Trigger.COMMAND_DEMO: TriggerAnswer.STAY},
     Mode.ACQUIRE: {
-        **_STARTED,
-        **_COMMANDED,
-        **_ACQUIRED,
+        **_USUAL,
         **{trigger: mode for mode, trigger in KNOWN.items()},
         Trigger.COMMAND_SUN: TriggerAnswer.STAY,
         Trigger.COMMAND_POINT: TriggerAnswer.STAY,
-        Trigger.REACT_SAFE: Mode.SAFE,
-        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
-        Trigger.REACT_HOLD: TriggerAnswer.STAY,
-        Trigger.DETUMBLED: TriggerAnswer.STAY,
-        Trigger.SLOWED: TriggerAnswer.STAY,
-        Trigger.ARRIVED: TriggerAnswer.STAY,
     },
-    Mode.SUN: {**_POINTING, Trigger.COMMAND_SUN: TriggerAnswer.STAY},
-    Mode.POINT: _POINTING,
+    Mode.SUN: {**_USUAL, Trigger.LOST: Mode.ACQUIRE, Trigger.COMMAND_SUN: TriggerAnswer.STAY},
+    Mode.POINT: {
+        **_USUAL,
+        Trigger.LOST: Mode.ACQUIRE,
+    },  # a new target is approached from the present attitude
 }
 
 
@@ -221,20 +162,13 @@ def check(table: Table) -> None:
             raise FlightError(f"mode table: {mode.label} is a dead end")
         if mode is not Mode.BOOT and Mode.BOOT in row.values():
             raise FlightError(f"mode table: {mode.label} leads back to boot, which is for the start only")
-    lost = set(Mode) - _reachable(table, Mode.BOOT)
-    if lost:
-        raise FlightError(f"mode table: {min(lost).label} cannot be reached from boot")
-
-
-def _reachable(table: Table, start: Mode) -> set[Mode]:
-    """Return the modes that some sequence of triggers leads to."""
-    found, ahead = {start}, [start]
+    reached, ahead = {Mode.BOOT}, [Mode.BOOT]
     while ahead:
-        for to in table[ahead.pop()].values():
-            if isinstance(to, Mode) and to not in found:
-                found.add(to)
-                ahead.append(to)
-    return found
+        found = {to for to in table[ahead.pop()].values() if isinstance(to, Mode)} - reached
+        reached |= found
+        ahead += found
+    if lost := set(Mode) - reached:
+        raise FlightError(f"mode table: {min(lost).label} cannot be reached from boot")
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,7 +181,7 @@ class ModeChange:
 
 
 class ModeMachine:
-    """Holds the mode and follows the table; without side effects. `since_ns`: when the mode was entered."""
+    """The mode and the transition table, without side effects. `since_ns` is when the mode was entered."""
 
     def __init__(self, time_ns: int = 0, table: Table = TRANSITIONS) -> None:
         """Begin in BOOT. Raises FlightError for an invalid table."""
@@ -257,7 +191,7 @@ class ModeMachine:
         self.since_ns = time_ns
 
     def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
-        """Return what `trigger` would do now."""
+        """Return the mode to which `trigger` would lead now, or why the mode would stay."""
         return self._table[self.mode][trigger]
 
     def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:
@@ -278,11 +212,11 @@ class HoldTimer:
         self._since_ns: int | None = None
 
     def require(self, seconds: float) -> None:
-        """Ask for another time from now on."""
+        """Change the required time (s)."""
         self._needed_ns = round(seconds * 1e9)
 
     def update(self, holds: bool, now_ns: int) -> bool:
-        """Update whether the condition holds now; return whether the condition has held for long enough."""
+        """Update whether the condition holds now; return whether it has held for the required time."""
         if not holds:
             self._since_ns = None
             return False
@@ -291,21 +225,21 @@ class HoldTimer:
         return now_ns - self._since_ns >= self._needed_ns
 
     def reset(self) -> None:
-        """Start from zero."""
+        """Restart the measurement of the time."""
         self._since_ns = None
 
 
 class AttitudeWatch:
-    """Finds the triggers between acquisition and pointing, and when SAFE has to brake the body.
+    """Finds the triggers between acquisition and pointing, and decides when SAFE detumbles the body.
 
     Attributes:
-        follows: the mode that follows the acquisition; None where the body rests.
+        follows: the mode that follows the acquisition; None if the body stays in ACQUIRE.
         detumbles: whether a body in SAFE is detumbled.
         acquires_sun: whether a body in SAFE turns to the Sun.
     """
 
     def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
-        """`low_rate` rad/s for `low_for` s ends the braking."""
+        """Set the end of detumbling: a rate below `low_rate` (rad/s) for `low_for` (s)."""
         self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
         self.detumbles = self.acquires_sun = False
         self._fast, self._low = settings.tumble_rate, low_rate
@@ -315,20 +249,20 @@ class AttitudeWatch:
         self._slow = HoldTimer(low_for)
 
     def adopt(self, settings: Modes) -> None:
-        """Go on with other bounds."""
+        """Replace the limits by those of a new table of parameters."""
         self._fast = settings.tumble_rate
         self._lost.require(settings.lost_for)
         for timer in (self._known, self._spins):
             timer.require(settings.known_for)
 
     def reset(self) -> None:
-        """Begin again: another mode is entered."""
+        """Restart all timers because another mode is entered."""
         self.detumbles = self.acquires_sun = False
         for timer in (self._known, self._lost, self._spins, self._slow):
             timer.reset()
 
     def trigger(self, mode: Mode, known: bool, now_ns: int) -> Trigger | None:
-        """Return the trigger that is due; `known`: whether there is an attitude to steer by."""
+        """Return the trigger that is due; `known` is whether the attitude permits steering."""
         if mode is Mode.ACQUIRE and self.follows is not None and self._known.update(known, now_ns):
             return KNOWN[self.follows]
         if mode in POINTING and self._lost.update(not known, now_ns):
@@ -345,7 +279,7 @@ class AttitudeWatch:
     ) -> None:
         """Detumble a body in SAFE that turns fast until it is slow; otherwise turn it to the Sun.
 
-        Neither while `barred` by a latched fault. `detumble` and `acquire_sun` are called when either begins.
+        Both are off while `barred` by a latched fault. `detumble` or `acquire_sun` is called when it begins.
         """
         if self.detumbles:
             self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
@@ -369,12 +303,12 @@ class PointingWatch:
         self._off = HoldTimer(settings.hold_patience)
 
     def adopt(self, settings: Modes) -> None:
-        """Go on with other bounds."""
+        """Replace the limits by those of a new table of parameters."""
         self._settings = settings
         self._off.require(settings.hold_patience)
 
     def reset(self) -> None:
-        """Restart the timer of the pointing error: another mode is entered."""
+        """Restart the timer of the pointing error because another mode is entered."""
         self._off.reset()
 
     def watch_rate(self, rate: float, now_ns: int) -> None:
@@ -383,9 +317,9 @@ class PointingWatch:
         self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """Update both facts from the pointing error `off`, rad; return the error, 0 where `off` is None.
+        """Update both facts from the pointing error `off` (rad); return the error.
 
-        `off` is None while there is no attitude to be reached yet.
+        While no attitude is due yet, `off` is None and the error 0.
         """
         settings = self._settings
         self.watch_rate(self._targets.speed(estimate), now_ns)
@@ -433,14 +367,14 @@ class ModeControl:
     Longer than 200 lines because commands, reactions and achievements all act on the one mode and its target.
 
     Attributes:
-        restart: why the process should be restarted; empty when it should not.
+        restart: why the process must be restarted; empty if it need not.
         wanted: the target of a hold, a slew, the Sun, or a command to point; None in other modes.
     """
 
     def __init__(
         self, settings: ModeSettings, body: FlightBody, steering: Steering, services: Services
     ) -> None:
-        """Take the tasks that modes act on.
+        """Connect the state machine with the body, the steering and the event log.
 
         Raises FlightError for a fact whose reaction has no effect, ConfigError for an initial mode that the
         body does not have.
@@ -460,7 +394,8 @@ class ModeControl:
         self._modes = body.control.modes
         self._initial = Mode.named(settings.modes.initial)
         if self._initial not in body.control.modes:
-            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {_starts(body)}")
+            starts = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))
+            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {starts}")
         self._crashed, self._too_many_crashes = 0, False
         self._commands = 0
         self._measured_ns = 0
@@ -480,7 +415,7 @@ class ModeControl:
 
     @property
     def since_ns(self) -> int:
-        """When it was entered."""
+        """Time at which the mode was entered."""
         return self._machine.since_ns
 
     @property
@@ -491,12 +426,12 @@ class ModeControl:
 
     @property
     def detumbles(self) -> bool:
-        """Whether the body is to be braked: in DETUMBLE, and in SAFE while it spins."""
+        """Whether the body is detumbled: in DETUMBLE, and in SAFE while it spins."""
         return self.mode is Mode.DETUMBLE or self._attitude.detumbles
 
     @property
     def acquires_sun(self) -> bool:
-        """Whether the body is to turn to the Sun without an attitude: in SAFE, once it is slow."""
+        """Whether the body turns to the Sun without an attitude: in SAFE, once it is slow."""
         return self._attitude.acquires_sun
 
     def target(self, mission_time_ns: int) -> Target | None:
@@ -505,14 +440,14 @@ class ModeControl:
         return self._targets.configured(mission_time_ns) if configured else self.wanted
 
     def adopt(self, modes: Modes) -> None:
-        """Go on with other bounds."""
+        """Replace the limits by those of a new table of parameters."""
         self._settings = modes
         self._arrived.require(modes.arrived_for)
         self._pointing.adopt(modes)
         self._attitude.adopt(modes)
 
     def begin(self, now_ns: int, unclean_recent: int) -> None:
-        """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
+        """Enter BOOT. `unclean_recent` is the number of recent unclean shutdowns."""
         self._machine.since_ns = self._measured_ns = now_ns
         self._crashed = unclean_recent
         self._too_many_crashes = unclean_recent >= self._settings.crash_limit
@@ -526,11 +461,14 @@ class ModeControl:
         coils_answer: bool,
         now_ns: int,
     ) -> Mode:
-        """Check the conditions of the present mode; return the mode to act in.
+        """Check the conditions of the present mode; return the mode for this cycle.
 
-        `rate` rad/s is the magnitude of the newest body rate measured in this cycle, None without one;
-        `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
-        the body is on its way.
+        Args:
+            estimate: of this cycle; None if the attitude is not known.
+            rate: magnitude (rad/s) of the newest body rate measured in this cycle; None without a reading.
+            overdue: angle (rad) to the attitude that is due; None while no attitude is due.
+            coils_answer: whether the PWM chip takes commands.
+            now_ns: time of the cycle.
         """
         # A body that acquires its attitude needs no estimate: a measured rate is enough.
         measured = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
@@ -558,9 +496,9 @@ class ModeControl:
         return self.mode
 
     def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
-        """Execute a command; return why it is refused, empty when done.
+        """Execute a command; return why it is refused, empty if it is executed.
 
-        SLEW needs `wanted`, its argument; POINT without one returns to the configured targets.
+        `wanted` is the target of SLEW and POINT; POINT without a target returns to the configured targets.
         """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:
@@ -589,7 +527,7 @@ class ModeControl:
         return ""
 
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Carry out the reaction of an event: the reactor of the event log."""
+        """Carry out the reaction of an event. The event log calls this method."""
         reaction = kind.reaction
         if reaction is Reaction.COILS_OFF:
             self._steering.zero()
@@ -615,7 +553,7 @@ class ModeControl:
 
     def _brake(self, estimate: Estimate | None, rate: float, now_ns: int) -> None:
         """Check whether detumbling is over."""
-        # Where the coils have no authority no hold is possible: wait until the body has turned further.
+        # A hold needs an attitude at which the coils have authority: wait until the body has turned further.
         holds = Mode.HOLD in self._modes
         within = not holds or (estimate is not None and self._targets.can_hold(estimate))
         if self._slow.update(rate < self._low_rate and within, now_ns):
@@ -676,13 +614,8 @@ class ModeControl:
 
 
 def _barred(known: Facts) -> str:
-    """Return why SAFE may not be left: latched facts that are not cleared; empty when it may."""
+    """Return which latched facts keep the body in SAFE; empty if none does."""
     held = [
         fact.begins.name for fact in known.held() if fact.latching and fact.begins.reaction is Reaction.SAFE
     ]
     return f"not before it is cleared: {', '.join(held)}" if held else ""
-
-
-def _starts(body: FlightBody) -> str:
-    """Return the modes in which this body can start, as text."""
-    return ", ".join(sorted(mode.label for mode in STARTS.keys() & body.control.modes))
