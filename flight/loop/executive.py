@@ -62,7 +62,7 @@ class JobResult:
 
 
 class WorkerChange(Enum):
-    """What happened to a worker: its process ended, runs again, or died too often and rests."""
+    """A change of a worker: its process ended, runs again, or died too often and rests."""
 
     DIED = "died"
     READY = "ready"
@@ -71,7 +71,7 @@ class WorkerChange(Enum):
 
 @dataclass(frozen=True, slots=True)
 class WorkerNews:
-    """A change in a worker's life, and its circumstances."""
+    """A change of a worker, and its circumstances."""
 
     worker: str
     change: WorkerChange
@@ -88,7 +88,7 @@ class JobRunner(Protocol):
         """Return the results that have arrived. Never waits."""
 
     def news(self) -> list[WorkerNews]:
-        """Return the changes in the workers' lives since the last call. Never waits."""
+        """Return the changes of the workers since the last call. Never waits."""
 
     @property
     def borrowed_ns(self) -> int:
@@ -143,7 +143,7 @@ class LockStepRunner:
         return ready
 
     def news(self) -> list[WorkerNews]:
-        """Return nothing: there are no processes that could die."""
+        """Return an empty list, because there are no processes that could die."""
         return []
 
     def close(self) -> None:
@@ -166,7 +166,7 @@ Task = Callable[[Cycle], None]
 class RateGroup:
     """A task, its period, and their statistics."""
 
-    def __init__(self, name: str, period_ns: int, task: Task, offset_ns: int = 0) -> None:
+    def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
             raise FlightError(f"rate group {name}: a period of {period_ns} ns is not positive")
         self.name = name
@@ -178,27 +178,26 @@ class RateGroup:
         self.overruns = 0
         self.total_execution_ns = 0
         self.max_execution_ns = 0
-        self._offset_ns = offset_ns
         self._slot = 0
         self._epoch_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
-        """Start the grid: slot 0 is due at the epoch plus this group's offset."""
-        self._epoch_ns = epoch_ns + self._offset_ns
+        """Start the grid, whose slot 0 is due at the epoch."""
+        self._epoch_ns = epoch_ns
         self._slot = 0
 
     @property
     def due_ns(self) -> int:
-        """When the next slot is due."""
+        """Time (ns) at which the next slot is due."""
         return self._epoch_ns + self._slot * self.period_ns
 
     @property
     def mean_execution_ns(self) -> float:
-        """Mean time spent in the task."""
+        """Mean execution time (ns) of the task."""
         return self.total_execution_ns / self.cycles if self.cycles else 0.0
 
     def claim(self, now_ns: int) -> tuple[Cycle | None, int]:
-        """Return the cycle to run now (None: none is due), and the slots slipped since the last call."""
+        """Return the cycle to run now, None if no slot is due, and the number of newly skipped slots."""
         late_ns = now_ns - self.due_ns
         if late_ns < 0:
             return None, 0
@@ -225,7 +224,7 @@ class RateGroup:
 
 
 class Observer(Protocol):
-    """Receives the executive's reports; must be quick and must not raise."""
+    """Receives the executive's reports; its methods must be quick and must not raise."""
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
         """Report a cycle that ended."""
@@ -238,7 +237,7 @@ class Observer(Protocol):
 
 
 class CyclicExecutive:
-    """The loop. `stopwatch` measures execution times, for telemetry only."""
+    """Runs rate groups; `stopwatch` measures their execution times, for telemetry only."""
 
     def __init__(
         self,

@@ -56,20 +56,17 @@ class EventLog:
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Write an event, or count it if one of its kind was written less than a throttle ago; then react."""
-        self._write(kind, time_ns, text)
-        if self._react is not None and kind.reaction is not Reaction.NOTE:
-            self._react(kind, time_ns, text)
-
-    def _write(self, kind: EventKind, time_ns: int, text: str) -> None:
+        """Write an event, or only count it if the throttle holds it back; then carry out its reaction."""
         self.count += 1
         self.counts[kind] += 1
         last_ns = self._last_written.get(kind.code)
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
             self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
-            return
-        self._last_written[kind.code] = time_ns
-        self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
+        else:
+            self._last_written[kind.code] = time_ns
+            self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
+        if self._react is not None and kind.reaction is not Reaction.NOTE:
+            self._react(kind, time_ns, text)
 
     def flush(self, time_ns: int) -> None:
         """Write the events that are still held back, at the end."""
@@ -335,6 +332,20 @@ class StreamWatch:
             return StreamState.SLOW
         return StreamState.GOOD
 
+    def poor(self, now_ns: int) -> tuple[bool | None, str]:
+        """Return whether the stream is poor, None if unknown or covered elsewhere, and why."""
+        stream, state = self.stream, self.state(now_ns)
+        if state is StreamState.GOOD:
+            return False, f"{stream.name}: good again"
+        if state is StreamState.NEVER or (state is StreamState.STALE and stream.has_silence_alarm):
+            return None, ""
+        reason = {
+            StreamState.STALE: f"{self.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",
+            StreamState.SLOW: f"{self.rate(now_ns):.1f} Hz, {stream.rate_hz:g} Hz nominal",
+            StreamState.INVALID: f"outside {stream.low:.3g} .. {stream.high:.3g}",
+        }[state]
+        return True, f"{stream.name}: {state.name.lower()}, {reason}"
+
 
 class Streams:
     """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
@@ -359,22 +370,8 @@ class Streams:
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
     def look(self, now_ns: int) -> list[tuple[StreamLimits, bool | None, str]]:
-        """Return for each stream whether it is poor, None when unknown or covered elsewhere, and why."""
-        return [(watch.stream, *_poor(watch, now_ns)) for watch in self._watches.values()]
-
-
-def _poor(watch: StreamWatch, now_ns: int) -> tuple[bool | None, str]:
-    stream, state = watch.stream, watch.state(now_ns)
-    if state is StreamState.GOOD:
-        return False, f"{stream.name}: good again"
-    if state is StreamState.NEVER or (state is StreamState.STALE and stream.has_silence_alarm):
-        return None, ""
-    reason = {
-        StreamState.STALE: f"{watch.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",
-        StreamState.SLOW: f"{watch.rate(now_ns):.1f} Hz, {stream.rate_hz:g} Hz nominal",
-        StreamState.INVALID: f"outside {stream.low:.3g} .. {stream.high:.3g}",
-    }[state]
-    return True, f"{stream.name}: {state.name.lower()}, {reason}"
+        """Return for each stream the result of `StreamWatch.poor`."""
+        return [(watch.stream, *watch.poor(now_ns)) for watch in self._watches.values()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,17 +18,16 @@ from flight.link.telemetry.log import Recorder
 from flight.loop.body import ControlOutput, FlightBody, SteeringState
 from flight.loop.control_cycle import ControlCycle, LoopTasks
 from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
-from flight.loop.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Facts, Services
+from flight.loop.facts import COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN, Services
 from flight.loop.health import CONTROL, ResourceReader
 from flight.loop.state import StateKeeper
 from flight.schema.sections import CONTROL_RATE_HZ, Config
-from hal.interfaces.devices import CoilState
 from hal.interfaces.wires import SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
 class RunLabel:
-    """The properties of a run."""
+    """The properties of a run that its first packet records."""
 
     config_text: str
     seed: int
@@ -77,18 +76,18 @@ _BROKEN = {"x": COIL_X_BROKEN, "y": COIL_Y_BROKEN, "z": COIL_Z_BROKEN}
 
 @dataclass(frozen=True, slots=True)
 class FlightEnding:
-    """How a flight stood when its loop ended.
+    """The state of a flight when its loop ended.
 
     Attributes:
         mission_time: s.
         cycles: control cycles that were run to their end.
-        mode: its label.
+        mode: label of the mode.
         alarms: names of the facts that held.
-        faults: how often each event of severity fault came, those included that the log's throttle held back.
-        warnings: the same of severity warning.
-        coils_left_out: axes of coils that are not used any more.
+        faults: number of each event of severity fault, including events that the throttle held back.
+        warnings: the same for severity warning.
+        coils_left_out: axes of excluded coils.
         coils_at_zero: whether the driver's last write, acknowledged by the chip, was zero.
-        coil_error: why the last write failed, empty when it did not.
+        coil_error: why the last write failed; empty if it succeeded.
     """
 
     mission_time: float = 0.0
@@ -102,47 +101,21 @@ class FlightEnding:
     coil_error: str = "the flight did not begin"
 
 
-def ending(
-    mission_time: float,
-    cycles: int,
-    mode: str,
-    facts: Facts,
-    counts: Mapping[EventKind, int],
-    coils: CoilState,
-) -> FlightEnding:
-    """Return the ending of a loop; `counts` are those of its events."""
-
-    def of(severity: Severity) -> dict[str, int]:
-        return {kind.name: count for kind, count in counts.items() if kind.severity is severity}
-
-    return FlightEnding(
-        mission_time,
-        cycles,
-        mode,
-        tuple(fact.name for fact in facts.held()),
-        of(Severity.FAULT),
-        of(Severity.WARNING),
-        tuple(axis for axis, fact in _BROKEN.items() if facts.holds(fact)),
-        not coils.error and not coils.current.any(),
-        coils.error,
-    )
-
-
 HEALTH_PERIOD_NS = SECOND_NS // 4
 COMMAND_PERIOD_NS = SECOND_NS // 10
 
 
 def nothing() -> None:
-    """No-op: lock-step simulation has no watchdog."""
+    """Do nothing, because lock-step simulation has no watchdog."""
 
 
 @dataclass(frozen=True, slots=True)
 class Supervisors:
-    """The parts around the loop in real time.
+    """The parts around the loop.
 
     Attributes:
         beat: the guardian's heartbeat, called after each control cycle without an error.
-        keeper: stores the state that outlives the process; None where none is stored.
+        keeper: stores the state that outlives the process; None if no state is stored.
         board: reads processor, memory, disk and temperature; None in lock-step.
     """
 
@@ -188,7 +161,7 @@ class FlightLoop:
 
     @property
     def restart(self) -> str:
-        """Why the process should be restarted after this flight; empty when it should not."""
+        """Why the process must be restarted after this flight; empty if it need not."""
         return self._tasks.modes.restart
 
     def stop(self, reason: str) -> None:
@@ -223,10 +196,22 @@ class FlightLoop:
         return reason
 
     def ending(self) -> FlightEnding:
-        """Return how the flight stands; once `run` has returned, how it ended."""
-        tasks, requests, services = self._tasks, self._requests, self._services
-        cycles, coils, mode = self._groups[0].completed, tasks.housekeeping.coils(), tasks.modes.mode.label
-        return ending(requests.ended_ns * 1e-9, cycles, mode, services.facts, services.events.counts, coils)
+        """Return the state of the flight; after `run` it is the state at the end."""
+        facts, coils = self._services.facts, self._tasks.housekeeping.coils()
+        counts: dict[Severity, dict[str, int]] = {Severity.FAULT: {}, Severity.WARNING: {}}
+        for kind, count in self._services.events.counts.items():
+            counts.setdefault(kind.severity, {})[kind.name] = count
+        return FlightEnding(
+            mission_time=self._requests.ended_ns * 1e-9,
+            cycles=self._groups[0].completed,
+            mode=self._tasks.modes.mode.label,
+            alarms=tuple(fact.name for fact in facts.held()),
+            faults=counts[Severity.FAULT],
+            warnings=counts[Severity.WARNING],
+            coils_left_out=tuple(axis for axis, fact in _BROKEN.items() if facts.holds(fact)),
+            coils_at_zero=not coils.error and not coils.current.any(),
+            coil_error=coils.error,
+        )
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
         """Start every task at mission time zero, and record the run."""
@@ -299,7 +284,7 @@ class FlightLoop:
         )
 
     def _keep_state(self, now_ns: int) -> None:
-        """Pass the state that outlives the process to its keeper, and report its events; no disk access."""
+        """Give the state that outlives the process to its keeper, and report its events; no disk access."""
         keeper = self._supervisors.keeper
         if keeper is None:
             return

@@ -22,19 +22,19 @@ from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 WORKER = "wide"
 _SPARSE = 8
-"""Every eighth pixel each way is compared with the last picture's, which by noise are never all the same."""
+"""Spacing (px) of the pixels that are compared with the last image; noise makes intact images differ."""
 _NONE = [float("nan")] * 3
 
 
 @dataclass(frozen=True, slots=True)
 class HorizonCameraSettings:
-    """Times, ns.
+    """Times of the horizon cameras (ns).
 
     Attributes:
-        exposures_ns: of each camera.
-        period_ns, fine_period_ns: between triggers, while frames are needed and else.
-        late_ns: after a trigger, until frames that are still missing are not waited for.
-        max_age_ns: without frames of a camera, after which it is lost.
+        exposures_ns: exposure time of each camera.
+        period_ns, fine_period_ns: time between triggers, while frames are needed and otherwise.
+        late_ns: longest wait for the frames of a trigger.
+        max_age_ns: time without a frame after which a camera is lost.
     """
 
     exposures_ns: Sequence[int]
@@ -45,7 +45,7 @@ class HorizonCameraSettings:
 
 
 class HorizonCameraTask:
-    """Owns the frames of one round of the cameras, and monitors these."""
+    """Triggers the horizon cameras, monitors them, and owns the frames of one round."""
 
     def __init__(
         self,
@@ -66,20 +66,20 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        self._job: tuple[int, int, int] | None = None  # time, frames and submission of that in process
+        self._job: tuple[int, int, int] | None = None  # mid-exposure (ns), camera bits and submission (ns)
 
     def begin(self, time_ns: int) -> None:
-        """Measure ages from `time_ns` on; the first round is due then."""
+        """Measure the ages of frames from `time_ns` on, when the first round is due."""
         self._begun_ns = time_ns
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 
     def busy_since_ns(self) -> int | None:
-        """Return since when frames have been in process, None when none are."""
+        """Return when the processing of the present frames began (ns); None without frames in process."""
         return None if self._job is None else self._job[2]
 
     def run(self, now_ns: int) -> None:
-        """Collect the frames of a round, pass them on, and begin the next when it is due."""
+        """Collect the frames of a round, submit them, and trigger the next round when it is due."""
         if self._waits:
             self._collect(now_ns)
         period_ns = self._settings.period_ns if self._sight.needed else self._settings.fine_period_ns
@@ -97,7 +97,13 @@ class HorizonCameraTask:
             self._services.events.report(events.VISION_FAILED, now_ns, text)
             return
         found: HorizonCameraResult = result.value
-        self._judge(found, now_ns)
+        if found.false is not None:
+            # The attitude is fine, and shows whether each camera's image is plausible.
+            text = "all pictures are of what they must be"
+            if found.false:
+                names = ", ".join(str(number + 1) for number in found.false)
+                text = f"pictures of camera {names} are false: {next(iter(found.false.values()))}"
+            self._services.facts.update(facts.WIDE_FALSE, bool(found.false), now_ns, text)
         used = self._sight.accept(job[0], found)
         self._record(now_ns, job, found, used)
 
@@ -120,7 +126,7 @@ class HorizonCameraTask:
                 self._errors[number] = str(error)
                 continue
             if frame is None or frame.sequence <= self._sequences[number]:
-                continue  # a frame that comes again does not reset the age
+                continue  # a repeated frame does not reset the age
             self._sequences[number] = frame.sequence
             before = self._pictures[number]
             self._pictures[number] = frame.pixels[::_SPARSE, ::_SPARSE].tobytes()
@@ -128,7 +134,7 @@ class HorizonCameraTask:
                 self._errors[number] = "its picture is the last one again"
                 continue
             if frame.exposure_start_ns < self._triggered_ns:
-                continue  # of an earlier round
+                continue  # the frame belongs to an earlier round
             self._frames[number], self._seen_ns[number], self._errors[number] = frame, now_ns, ""
         if len(self._frames) == len(self._cameras) or now_ns - self._triggered_ns >= self._settings.late_ns:
             self._waits = False
@@ -145,7 +151,7 @@ class HorizonCameraTask:
             self._services.events.report(events.VISION_FAILED, now_ns, text)
 
     def _watch(self, now_ns: int) -> None:
-        """Report cameras that give no frames for too long."""
+        """Report cameras without a frame for longer than the limit."""
         limit_ns = self._settings.max_age_ns
         old = [number for number, seen in enumerate(self._seen_ns) if now_ns - seen > limit_ns]
         text = "frames come again"
@@ -155,16 +161,6 @@ class HorizonCameraTask:
             text = f"no frame of camera {names} for {(now_ns - self._seen_ns[old[0]]) * 1e-9:.0f} s"
             text = f"{text}: {error}" if error else text
         self._services.facts.update(facts.WIDE_LOST, bool(old), now_ns, text)
-
-    def _judge(self, found: HorizonCameraResult, now_ns: int) -> None:
-        """Report cameras whose pictures contradict a fine attitude."""
-        if found.false is None:
-            return
-        text = "all pictures are of what they must be"
-        if found.false:
-            names = ", ".join(str(number + 1) for number in found.false)
-            text = f"pictures of camera {names} are false: {next(iter(found.false.values()))}"
-        self._services.facts.update(facts.WIDE_FALSE, bool(found.false), now_ns, text)
 
     def _record(
         self, now_ns: int, job: tuple[int, int, int], found: HorizonCameraResult, used: tuple[bool, bool]

@@ -46,31 +46,31 @@ from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 
-# rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
-# Instants of an exposure at which the rate is taken.
+"""Uncertainty (rad) of the mounting between the star camera and the inertial unit."""
 _COURSE_NODES = 17
+"""Number of times in an exposure at which the rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class ImagingSettings:
-    """Properties and time limits of the camera, and the settings of vision.
+    """Properties and time limits of the star camera, and the settings of vision.
 
     Attributes:
-        exposures: how long to expose at a rate.
+        exposures: exposure time as a function of the rate.
         fine_rest_ns: minimum time between exposures while the attitude is fine and no object is searched for.
         seeks: returns whether an object is searched for.
-        calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
+        calm: returns the first time, from a time on, at which an exposure of a length meets no coil step.
         late_ns: age after the exposure from which a frame is late.
-        max_rate: rad/s of the body, beyond which no exposure is begun.
+        max_rate: body rate (rad/s) above which there is no exposure.
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
             acceleration at a time.
-        objects: how objects are sighted; None: they are not.
-        kept: where frames are kept; None: they are not.
-        velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
+        objects: settings of the search for objects; None without a search.
+        kept: storage of frames; None if frames are not kept.
+        velocity: returns the velocity (3,) m/s about the Sun at a time; None: the velocity in `tracker`.
         knowledge: returns how well the attitude is known now.
     """
 
@@ -102,76 +102,69 @@ class FrameMeasurer:
         self._body_to_camera = attitude_matrix(settings.mounting)
 
     def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
-        """Return the worker's job; `last_checksum` is that of the previous frame, to detect a repetition.
+        """Return the worker's job for a frame.
 
-        `spare`: whether there is time to look for objects.
+        `last_checksum` is the checksum of the previous frame, to detect a repetition. `spare` is whether
+        there is time to search for objects.
         """
         past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
+        tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
+        if tracker is not None and velocity is not None:
+            tracker = replace(tracker, solve=replace(tracker.solve, velocity=velocity))
+        estimator = self._settings.estimator
+        if past is None and isinstance(estimator, LikelihoodSettings):
+            # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
+            estimator = replace(estimator, rate_model="accelerating")
         return FrameJob(
             frame.pixels,
             self._settings.camera,
             frame.exposure_ns * 1e-9,
-            self._estimator(past),
-            self._tracker(frame),
-            self._rate_prior(frame, past) if past is not None else None,
-            self._attitude_prior(past) if past is not None else None,
+            estimator,
+            tracker,
+            *self._priors(frame, past),
             last_checksum,
             objects=self._settings.objects if spare else None,
             kept=None if kept is None else replace(kept, name=f"frame-{frame.sequence:08d}"),
         )
 
     def exposure_ns(self, now_ns: int) -> int:
-        """Return how long to expose from now on: by the estimated rate across the boresight."""
+        """Return the exposure time (ns) from now on, by the estimated rate across the boresight."""
         exposures, estimate = self._settings.exposures, self._navigation.estimate(now_ns)
         if estimate is None:
             return round(exposures.usual * SECOND_NS)
         x, y, _ = (self._body_to_camera @ estimate.rate).tolist()
         return round(exposures.at(math.hypot(x, y)) * SECOND_NS)
 
-    def _tracker(self, frame: Frame) -> TrackerSettings | None:
-        tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
-        if tracker is None or velocity is None:
-            return tracker
-        return replace(tracker, solve=replace(tracker.solve, velocity=velocity))
-
-    def _estimator(self, past: Estimate | None) -> LikelihoodSettings | StreakEstimator:
-        estimator = self._settings.estimator
-        if past is None and isinstance(estimator, LikelihoodSettings):
-            # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
-            return replace(estimator, rate_model="accelerating")
-        return estimator
-
-    def _rate_prior(self, frame: Frame, past: Estimate) -> RatePrior:
-        widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
-        rate, sigma = self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0))
-        return RatePrior(rate, sigma, self._course(frame, sigma))
-
-    def _course(self, frame: Frame, sigma: float) -> Course | None:
-        """Return how the camera turned, its rate known to `sigma` rad/s; None beyond the history."""
-        spanning = self._navigation.rates(
-            frame.exposure_start_ns, frame.exposure_start_ns + frame.exposure_ns
+    def _priors(self, frame: Frame, past: Estimate | None) -> tuple[RatePrior | None, AttitudePrior | None]:
+        """Return the priors of rate and attitude, camera axes, from the estimate `past` at mid-exposure."""
+        if past is None:
+            return None, None
+        rate_sigma = math.sqrt(max(float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1]), 0.0))
+        course, spanning = (
+            None,
+            self._navigation.rates(frame.exposure_start_ns, frame.exposure_start_ns + frame.exposure_ns),
         )
-        if spanning is None:
-            return None
-        times, rates = spanning
-        at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (frame.exposure_start_ns - times[0])
-        even = np.stack([np.interp(at, times - times[0], rate) for rate in rates.T], axis=1)
-        return Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, sigma)
-
-    def _attitude_prior(self, past: Estimate) -> AttitudePrior:
+        if spanning is not None:
+            times, rates = spanning
+            at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (frame.exposure_start_ns - times[0])
+            even = np.stack([np.interp(at, times - times[0], rate) for rate in rates.T], axis=1)
+            course = Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, rate_sigma)
         widest = float(np.linalg.eigvalsh(past.covariance[ATTITUDE, ATTITUDE])[-1])
-        sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
-        return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
+        attitude = AttitudePrior(
+            multiply(self._settings.mounting, past.quaternion),
+            math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2),
+        )
+        return RatePrior(self._body_to_camera @ past.rate, rate_sigma, course), attitude
 
     def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
-        """Return the mean body rate over the exposure, None without a rate or without an estimate then."""
+        """Return the mean body rate over the exposure; None without a rate or an estimate at its start."""
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
             return None
         return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
 
     def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
-        """Return the attitude at mid-exposure, None without a fix."""
+        """Return the attitude at mid-exposure; None without a star fix."""
         fix = found.solution.fix if found.solution is not None else None
         if fix is None:
             return None
@@ -181,7 +174,7 @@ class FrameMeasurer:
         return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
 
     def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
-        """Return rate and covariance in body axes; NaN when there is none."""
+        """Return rate and covariance in body axes; NaN without a rate."""
         if found is None or found.rate is None or found.covariance is None:
             return _NAN
         turn = self._body_to_camera.T
@@ -214,7 +207,7 @@ _NAMED_ELSEWHERE = {
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""States of a frame without motion, or with an event of their own."""
+"""States of a frame without motion, or with a separate event."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
@@ -239,7 +232,7 @@ class FrameReport:
         self.record(frame, motion.status.value, motion, now_ns, accepted)
 
     def unused(self, frame: Frame, found: FrameFound, now_ns: int) -> None:
-        """Report a frame of a body in motion that gave no rate and no attitude."""
+        """Report a frame of a moving body that gave neither rate nor attitude."""
         if found.motion.status in _NAMED_ELSEWHERE:
             return
         stars = f", stars {found.solution.status.value}" if found.solution is not None else ""
@@ -314,21 +307,21 @@ def _packed(c: FloatArray) -> list[float]:
 
 _ROWS = 32
 _FRAMES = 4
-"""The number of a driver's buffers."""
+"""Number of a driver's frame buffers."""
 _LEAST_CHANGES = 0.125
-"""A row has noise when at least this fraction of neighbouring pixels differ."""
+"""Fraction of neighbouring pixels that differ in a row with noise."""
 
 
 class RepeatedRows:
-    """Keeps checksums of some rows of the last frames."""
+    """Detects rows of earlier frames by checksums of some rows of the last frames."""
 
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def look(self, pixels: Image) -> int:
-        """Check a frame (rows, columns); return how many sampled rows are copies of an earlier frame's.
+        """Return how many sampled rows of a frame (rows, columns) are copies from an earlier frame.
 
-        0 for an intact frame, and for a frame of copied rows only.
+        The number is 0 for an intact frame, and for a frame whose rows are all copies.
         """
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         here = {row: zlib.crc32(pixels[row].tobytes()) for row in rows if _has_noise(pixels[row])}
@@ -345,7 +338,7 @@ _UNKNOWN = [math.nan] * 3
 
 
 class ObjectTracks:
-    """Owns the tracks of objects."""
+    """Tracks objects from frame to frame, and reports and records their tracks."""
 
     def __init__(self, settings: TrackSettings, body: FlightBody, services: Services) -> None:
         self._body = body
@@ -354,8 +347,18 @@ class ObjectTracks:
         self._events = services.events
 
     def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
-        """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
-        self._record_sightings(sequence, middle_ns, sighted, now_ns)
+        """Accept the sightings of frame number `sequence` with mid-exposure at `middle_ns`."""
+        x, y = np.reshape(sighted.points, (-1, 2)).T
+        self._recorder.record(
+            SIGHTINGS,
+            now_ns,
+            sequence=sequence,
+            middle_ns=middle_ns - self._recorder.epoch_ns,
+            found=len(x),
+            x=_padded(x),
+            y=_padded(y),
+            magnitude=_padded(sighted.magnitudes),
+        )
         orbit = self._body.estimation.orbit(middle_ns)
         frame = FrameSightings(
             middle_ns,
@@ -377,19 +380,6 @@ class ObjectTracks:
         for track in self._tracker.objects:
             self._record_track(track, now_ns)
         self._body.control.accept_tracks(self._tracker.objects, now_ns)
-
-    def _record_sightings(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
-        x, y = np.reshape(sighted.points, (-1, 2)).T
-        self._recorder.record(
-            SIGHTINGS,
-            now_ns,
-            sequence=sequence,
-            middle_ns=middle_ns - self._recorder.epoch_ns,
-            found=len(x),
-            x=_padded(x),
-            y=_padded(y),
-            magnitude=_padded(sighted.magnitudes),
-        )
 
     def _record_track(self, track: Track, now_ns: int) -> None:
         line = track.line
@@ -418,7 +408,7 @@ class ObjectTracks:
 
 
 def _padded(values: FloatArray) -> list[float]:
-    """Return the first values, and NaN for those that are missing."""
+    """Return the first MOST_SIGHTINGS values, padded with NaN."""
     first = [float(value) for value in values[:MOST_SIGHTINGS]]
     return first + [math.nan] * (MOST_SIGHTINGS - len(first))
 
@@ -427,7 +417,7 @@ WORKER = "vision"
 
 
 class Imaging:
-    """Owns the frame in process, and monitors the camera."""
+    """Triggers the star camera, monitors it, and owns the frame in process."""
 
     def __init__(
         self,
@@ -453,19 +443,19 @@ class Imaging:
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
         self._ordered: tuple[int, int] | None = None  # the begin and the length, ns, of an exposure to come
-        self._due_ns: int | None = None  # when the frame of the oldest open trigger is due
+        self._due_ns: int | None = None  # time at which the frame of the oldest open trigger is due
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
         self._objects = objects
-        self._spare = True  # the last frame left time to look for objects
+        self._spare = True  # whether the last frame left time to search for objects
 
     def counts(self) -> tuple[int, int]:
-        """Return the number of frames, and of rates from streaks that entered the estimate."""
+        """Return the numbers of frames, and of rates from streaks that the estimate used."""
         return self._frames, self._report.accepted
 
     def busy_since_ns(self) -> int | None:
-        """Return since when a frame has been in process, None when none is."""
+        """Return when the processing of the present frame began (ns); None without a frame in process."""
         return None if self._frame is None else self._busy_since_ns
 
     def begin(self, time_ns: int) -> None:
@@ -475,12 +465,13 @@ class Imaging:
     def trigger(self, cycle: Cycle) -> None:
         """Order an exposure: the task of the camera's rate group.
 
-        Not while the body turns too fast for one, and seldom while the attitude is fine. It begins where no
-        step of the coils falls within: a rate is one rate then.
+        There is no exposure while the body turns too fast, and seldom one while the attitude is fine. The
+        exposure begins at a time for which the coil currents do not change within it, so that the rate is
+        nearly constant.
         """
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
-            self._streams.note("camera", cycle.start_ns)  # it rests on purpose
+            self._streams.note("camera", cycle.start_ns)  # the camera pauses intentionally
             return
         rested_ns = cycle.start_ns - self._triggered_ns
         fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
@@ -492,7 +483,7 @@ class Imaging:
         self._expose(now_ns)
 
     def _expose(self, now_ns: int) -> None:
-        """Start the exposure that is ordered, when its time has come."""
+        """Start the ordered exposure once its time has come."""
         if self._ordered is None or now_ns < self._ordered[0]:
             return
         (_, exposure_ns), self._ordered = self._ordered, None
@@ -507,8 +498,14 @@ class Imaging:
 
     def serve(self, now_ns: int) -> None:
         """Start a due exposure; check the camera; pass a new frame to the worker."""
-        self._look_at_worker(now_ns)
-        frame = self._poll(now_ns)
+        if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
+            self._judge_speed(now_ns)
+        self._expose(now_ns)
+        frame = None
+        try:
+            frame = self._camera.poll()
+        except DeviceError as error:
+            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
         age_ns = now_ns - self._last_frame_ns
         if frame is None:
             if self._due_ns is not None and now_ns > self._due_ns:
@@ -559,10 +556,15 @@ class Imaging:
         found: FrameFound = result.value
         motion = found.motion
         self._last_checksum = motion.checksum
-        self._look_at_light(frame, motion.status, now_ns)
+        if motion.status is StreakStatus.FROZEN:
+            text = f"frame {frame.sequence} has the pixels of the last"
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
+        elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
+            text = f"frame {frame.sequence} is {motion.status.value}"
+            self._events.report(events.CAMERA_BLACK, now_ns, text)
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
-            rate = None  # its pixels are invalid
+            rate = None  # the pixels are invalid
         if found.objects is not None and self._objects is not None:
             self._objects.ingest(frame.sequence, middle_ns(frame), found.objects, now_ns)
         if rate is None and attitude is None:
@@ -584,30 +586,8 @@ class Imaging:
         else:
             report([])
 
-    def _look_at_light(self, frame: Frame, status: StreakStatus, now_ns: int) -> None:
-        """Report a frame with the pixels of the last one, or without stars for lack or excess of light."""
-        if status is StreakStatus.FROZEN:
-            text = f"frame {frame.sequence} has the pixels of the last"
-            self._events.report(events.CAMERA_FROZEN, now_ns, text)
-        elif status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
-            self._events.report(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {status.value}")
-
-    def _look_at_worker(self, now_ns: int) -> None:
-        """Report a slow worker while the frame is still in process."""
-        if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
-            self._judge_speed(now_ns)
-
     def _judge_speed(self, now_ns: int) -> None:
         taken_ns = now_ns - self._busy_since_ns
         self._spare = taken_ns <= self._settings.slow_ns
         text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
         self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
-
-    def _poll(self, now_ns: int) -> Frame | None:
-        """Start an exposure that is due; return a frame that has come."""
-        self._expose(now_ns)
-        try:
-            return self._camera.poll()
-        except DeviceError as error:
-            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
-            return None

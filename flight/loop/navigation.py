@@ -33,7 +33,7 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
-"""Measurements applied again per cycle: takes a few ms, so that a second of them takes a few cycles."""
+"""Number of measurements that a cycle applies again, in a few ms; a second of them takes a few cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +42,8 @@ class NavigationSettings:
 
     Attributes:
         max_age_ns: age limit of a reading by which the coils are driven.
-        coast_ns: for how long the estimate is propagated without a measurement, for telemetry only.
-        period_ns: of the control cycle: a commanded current flows at least until the next cycle.
+        coast_ns: longest propagation of the estimate without a measurement, for telemetry only.
+        period_ns: period of the control cycle, for which a commanded current flows at least.
     """
 
     max_age_ns: int
@@ -71,21 +71,21 @@ class Navigation:
         self._link = unit.link()
         self._bytes_since_ns = 0
         self.speed = 0.0
-        """rad/s, of the newest reading, the gyro's bias included."""
+        """Body rate (rad/s) of the newest reading, including the gyro's bias."""
 
     def begin(self, time_ns: int) -> None:
-        """Use samples from `time_ns` on only: the body is released then."""
+        """Ignore readings before the release of the body at `time_ns`."""
         self._since_ns = time_ns
         self._received_ns = self._agreed_ns = time_ns
         self._bytes_since_ns = time_ns
         self._link = self._unit.link()
 
     def link(self) -> ImuLink:
-        """Return the unit's counters."""
+        """Return the counters of the inertial unit's line."""
         return self._link
 
     def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
-        """Give the filter the coil currents, as far as they are known."""
+        """Give the coil currents to the filter, and which of them are known."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
@@ -143,13 +143,13 @@ class Navigation:
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """Offer an attitude of the stars while there is no estimate; return whether it began one."""
+        """Offer an attitude from the stars to a filter without an estimate; return whether it started."""
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
         """Apply measurements of a frame at their times, over the next cycles.
 
-        `report` is called, later or at once, with whether each of them passed the gate.
+        `report` is called, at once or in a later cycle, with whether each measurement passed the gate.
         """
         if self._filter.started:
             self._filter.measure_late(late, report)
@@ -202,11 +202,11 @@ class Navigation:
 
 
 CLOCK_OFF_NS = SECOND_NS
-"""By which the wall clock may differ from the receiver's time."""
+"""Largest difference (ns) of the wall clock from the receiver's time."""
 
 
 class Positioning:
-    """Owns the receiver."""
+    """Reads the GPS receiver and passes its fixes to the body."""
 
     def __init__(
         self,
@@ -215,7 +215,7 @@ class Positioning:
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` returns whether the body uses a fix; without one for `max_age_ns` the receiver is lost."""
+        """`accept` returns whether the body uses a fix; `max_age_ns` without a fix means a lost receiver."""
         self._receiver = receiver
         self._accept = accept
         self._max_age_ns = max_age_ns
@@ -251,7 +251,7 @@ class Positioning:
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
 
     def _compare_clock(self, reading: GpsReading, now_ns: int) -> None:
-        """Report a wall clock that is wrong: before the first fix the place was found by it."""
+        """Report a wrong wall clock, because the position before the first fix depends on it."""
         clock = self._clock
         off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
         text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
@@ -259,7 +259,7 @@ class Positioning:
 
 
 class SunSensing:
-    """Owns the strings."""
+    """Reads the solar cells and passes their currents to the body."""
 
     def __init__(
         self,

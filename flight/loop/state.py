@@ -12,8 +12,8 @@ A copy is one line of JSON and a line with the CRC-32 of the first. Both copies 
 after the other, so that one copy survives a crash or damage to the other. A file is replaced atomically: a
 crash at any moment leaves either the old or the new content. The order is that of Pillai et al., "All File
 Systems Are Not Created Equal" (OSDI 2014), section 2: write a temporary file, sync it, rename it over the old
-one, sync the folder. Each call goes through `Files`, so that a test can simulate a power loss before any of
-them.
+one, sync the folder. Each call goes through `LinuxFiles`, so that a test can simulate a power loss before any
+of them.
 
 The number of each boot is also noted in the state's folder and in the folder of its run. Intact copies may
 still be old, after the repair of a file system or from a backup: a state that counts fewer boots than a note
@@ -26,7 +26,6 @@ hanging disk delays only the ticker.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 import os
@@ -38,7 +37,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -67,7 +66,7 @@ LONGEST_LABEL = 32
 Label = Annotated[str, Meta(max_length=LONGEST_LABEL)]
 
 REMEMBERED = 32
-"""How many unclean shutdowns are kept, the newest."""
+"""Number of newest unclean shutdowns that are kept."""
 
 
 class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -192,11 +191,15 @@ class Noted:
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
     """Return the state of the next boot: running, and with a crash of the last boot recorded.
 
-    Parameters learned of other `devices` are discarded, and a loaded table that a crash left unproven.
+    Parameters learned of other `devices` are discarded. After a crash, an unproven table is replaced by the
+    table that flew before it.
     """
     unclean = state.unclean
     if state.running:
         unclean = (*unclean, UncleanShutdown(state.boot_count, state.operated, state.utc))[-REMEMBERED:]
+    table = state.table
+    if state.running and not table.proven:
+        table = msgspec.structs.replace(table, values=table.before, before={}, proven=True)
     return msgspec.structs.replace(
         state,
         boot_count=state.boot_count + 1,
@@ -205,15 +208,8 @@ def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
         utc=utc,
         learned=state.learned if state.devices == devices else {},
         devices=devices,
-        table=_trusted(state.table) if state.running else state.table,
+        table=table,
     )
-
-
-def _trusted(table: KeptTable) -> KeptTable:
-    """Return the table to fly after an unclean shutdown: the previous table if this one is not proven."""
-    if table.proven:
-        return table
-    return msgspec.structs.replace(table, values=table.before, before={}, proven=True)
 
 
 def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
@@ -229,7 +225,7 @@ def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> S
 
 
 def end_cleanly(state: StoredState) -> StoredState:
-    """Return the state after a clean end_cleanly."""
+    """Return the state after a clean end."""
     return msgspec.structs.replace(state, running=False)
 
 
@@ -246,8 +242,8 @@ def boot_record(begun: StoredState, window: float) -> BootRecord:
 
 GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
 
-_BELIEVED = 4.0
-"""Sigmas of the configured prior: learned values further from the prior are rejected."""
+_PLAUSIBLE_SIGMAS = 4.0
+"""Largest deviation of a learned value from the configured prior, in sigmas."""
 
 
 def learned_of(estimate: Estimate) -> dict[str, Learned]:
@@ -286,11 +282,19 @@ def start_from(
         if name not in learned:
             return values, covariance
         found, spread = learned[name].arrays()
-        problem = _problem(found, values, covariance)
+        variance = np.diag(covariance)
+        sigma, problem = np.sqrt(variance), ""
+        if found.shape != values.shape:
+            problem = f"{len(values)} values are wanted"
+        elif np.any((sigma > 0.0) & (np.abs(found - values) > _PLAUSIBLE_SIGMAS * sigma)):
+            problem = f"not within {_PLAUSIBLE_SIGMAS:g} sigma of {values.tolist()} +- {sigma.tolist()}"
         if problem:
             problems.append(f"{name} {found.tolist()}: {problem}")
             return values, covariance
-        return _widened(found, spread, values, covariance, changed)
+        # Values that the configuration does not estimate stay as configured.
+        estimated = variance > 0.0
+        wide = np.where(np.outer(estimated, estimated), spread, 0.0) + np.diag(changed**2 * variance)
+        return np.where(estimated, found, values), wide
 
     bias, bias_covariance = accept(GYRO_BIAS, configured.bias, configured.bias_covariance)
     plant, plant_covariance = accept(PLANT, np.array(configured.parameters), configured.parameters_covariance)
@@ -310,71 +314,25 @@ def start_from(
     return prior, problems
 
 
-def _problem(found: FloatArray, values: FloatArray, covariance: FloatArray) -> str:
-    """Return why a learned value is implausible; empty when plausible."""
-    if found.shape != values.shape:
-        return f"{len(values)} values are wanted"
-    sigma = np.sqrt(np.diag(covariance))
-    if np.any((sigma > 0.0) & (np.abs(found - values) > _BELIEVED * sigma)):
-        return f"not within {_BELIEVED:g} sigma of {values.tolist()} +- {sigma.tolist()}"
-    return ""
-
-
-def _widened(
-    found: FloatArray, spread: FloatArray, values: FloatArray, covariance: FloatArray, changed: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return learned values with the increased covariance; values not estimated stay as configured."""
-    variance = np.diag(covariance)
-    estimated = variance > 0.0
-    both = np.outer(estimated, estimated)
-    wide = np.where(both, spread, 0.0) + np.diag(changed**2 * variance)
-    return np.where(estimated, found, values), wide
-
-
 LARGEST_FILE = 1 << 20
-"""Bytes of the largest file that is read."""
-
-
-class Files(Protocol):
-    """The file system calls that are used; each raises OSError."""
-
-    def read(self, path: Path) -> bytes | None:
-        """Return a file's content, None when there is no such file."""
-
-    def create(self, path: Path) -> int:
-        """Open an empty file for writing, replacing an old one; return its descriptor."""
-
-    def write(self, file: int, data: bytes) -> int:
-        """Write at most all of `data`; return how many bytes were written."""
-
-    def sync(self, file: int) -> None:
-        """Make the file's content durable."""
-
-    def close(self, file: int) -> None:
-        """Close a descriptor."""
-
-    def rename(self, old: Path, new: Path) -> None:
-        """Rename a file atomically, replacing a file of the new name."""
-
-    def sync_folder(self, folder: Path) -> None:
-        """Make the names in a folder durable."""
+"""Size (bytes) of the largest file that is read."""
 
 
 class LinuxFiles:
-    """The calls of the operating system."""
+    """The file system calls in use; each raises OSError. Tests replace them to simulate a power loss."""
 
     def read(self, path: Path) -> bytes | None:
-        """Return the content of a regular file of at most `LARGEST_FILE`, None when there is no such file."""
+        """Return the content of a regular file of at most `LARGEST_FILE` bytes; None if it does not exist."""
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
-        """Open an empty file for writing, replacing an old one, also one that is not a regular file."""
-        with contextlib.suppress(FileNotFoundError):
+        """Return the descriptor of an empty file for writing, which replaces whatever has its name."""
+        with suppress(FileNotFoundError):
             os.unlink(path)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
 
     def write(self, file: int, data: bytes) -> int:
-        """Write at most all of `data`."""
+        """Write at most all of `data`; return the number of bytes written."""
         return os.write(file, data)
 
     def sync(self, file: int) -> None:
@@ -386,7 +344,7 @@ class LinuxFiles:
         os.close(file)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Rename a file atomically."""
+        """Rename a file atomically, replacing a file of the new name."""
         os.rename(old, new)
 
     def sync_folder(self, folder: Path) -> None:
@@ -394,7 +352,7 @@ class LinuxFiles:
         make_lasting(folder)
 
 
-def replace_file(files: Files, path: Path, data: bytes) -> None:
+def replace_file(files: LinuxFiles, path: Path, data: bytes) -> None:
     """Replace the file's content, durably. Raises OSError; the old content then remains."""
     temporary = path.with_suffix(".tmp")
     file = files.create(temporary)
@@ -404,7 +362,7 @@ def replace_file(files: Files, path: Path, data: bytes) -> None:
             written += files.write(file, data[written:])
         files.sync(file)
     except OSError:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             files.close(file)
         raise
     files.close(file)
@@ -458,7 +416,7 @@ class _ReadCopy:
 class StateStore:
     """Stores a StoredState in a folder. Not for two processes at once."""
 
-    def __init__(self, folder: Path, report: Report, files: Files | None = None) -> None:
+    def __init__(self, folder: Path, report: Report, files: LinuxFiles | None = None) -> None:
         self._folder = folder
         self._report = report
         self._files = files or LinuxFiles()

@@ -45,10 +45,10 @@ class CoilDriveSettings:
 
 
 class CoilDrive:
-    """Commands the coils and watches their response.
+    """Commands the coils and monitors their response.
 
     Attributes:
-        command: (3,) A, asked of the driver in this cycle.
+        command: (3,) A, sent to the driver in this cycle.
         available: (3,) bool, the axes in use.
     """
 
@@ -80,20 +80,20 @@ class CoilDrive:
         self._coils.off()
 
     def fault(self) -> str:
-        """Return why the PWM chip does not take commands; empty while it does."""
+        """Return why the PWM chip takes no commands; empty if it takes them."""
         return self._coils.state().error
 
     @property
     def is_suspect(self) -> bool:
-        """Whether a coil may carry another current than its command, no verdict being given yet."""
+        """Whether a coil without a verdict may carry another current than its command."""
         return self._watch.doubts_currents
 
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
     ) -> None:
-        """Compare the command on the wire with the monitor and the motion, once a cycle.
+        """Compare the command on the wire with the supply current and the motion, once a cycle.
 
-        Unless the currents since the last cycle are `known`, the evidence until now is discarded.
+        If the currents since the last cycle are not `known`, the evidence so far is discarded.
         """
         watch = self._watch
         if in_force.written_ns >= 0:
@@ -143,13 +143,13 @@ class CoilDrive:
         self._coils.command(self.command)
 
     def _brake(self, axes: Axes) -> None:
-        """Brake bridges: a bridge with a leg stuck high drives its coil even at zero command."""
+        """Brake bridges, because a bridge with a leg stuck high drives its coil even at zero command."""
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes
 
     def _reallocated(self, currents: FloatArray, field: FloatArray | None, usable: BoolArray) -> FloatArray:
-        """Return currents of the `usable` axes (3,) that make the torque of `currents`."""
+        """Return currents (3,) A of the `usable` axes that make the torque of `currents`."""
         if field is None:
             return np.where(usable, currents, 0.0)
         dipole, limits = self._settings.dipole_per_ampere, self._settings.limits
@@ -166,13 +166,13 @@ _NO_DIPOLE: FloatArray = np.zeros(3)
 
 
 class Steering:
-    """Steers the body along its path, brakes it, or rests.
+    """Steers the body along its path, detumbles it, or keeps the coils at zero.
 
-    Control is lost when no reading within its age limit agrees with the estimate, or, while braking, when
-    there is no such reading. The model carries the estimate on over a silence, so that control returns
-    smoothly, but no current flows meanwhile: it is zero within a tenth of a second of the last reading.
+    Control is lost when no reading within its age limit agrees with the estimate, or, while detumbling, when
+    there is no reading within its age limit. The model propagates the estimate over a silence, so that
+    control returns smoothly, but the currents are zero within a tenth of a second of the last reading.
     Without a planner the body is steered along its last path and held at its end (event `holding`). Without a
-    path no current flows.
+    path the currents are zero.
     """
 
     def __init__(self, body: FlightBody, drive: CoilDrive, services: Services) -> None:
@@ -183,7 +183,7 @@ class Steering:
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
         """Follow or hold in this cycle; `estimate` is None unless measured.
 
-        `ever_started`: there was an estimate before, so that None is a loss of control.
+        `ever_started` is whether there was an estimate before, so that None means a loss of control.
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
@@ -209,37 +209,35 @@ class Steering:
         self._body.control.brake.begin(now_ns)
 
     def begin_sun_acquisition(self, now_ns: int) -> None:
-        """Begin the windows of turning to the Sun, if the body can."""
+        """Begin the windows of Sun acquisition, if the body has it."""
         if (acquisition := self._body.control.sun_acquisition) is not None:
             acquisition.begin(now_ns)
 
     def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Detumble in this cycle; `current`: the newest reading is fresh enough."""
-        return self._drive_by(self._body.control.brake, readings, current, now_ns)
+        """Detumble in this cycle; `current` is whether the newest reading is within its age limit."""
+        return self._run_law(self._body.control.brake, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Turn to the Sun in this cycle, without an attitude; rest if the body cannot."""
+        """Turn to the Sun in this cycle, without an attitude; rest if the body has no Sun acquisition."""
         acquisition = self._body.control.sun_acquisition
-        return (
-            self.rest(now_ns)
-            if acquisition is None
-            else self._drive_by(acquisition, readings, current, now_ns)
-        )
+        if acquisition is None:
+            return self.rest(now_ns)
+        return self._run_law(acquisition, readings, current, now_ns)
 
-    def _drive_by(
-        self, brake: WindowedLaw, readings: Sequence[ImuReading], current: bool, now_ns: int
+    def _run_law(
+        self, law: WindowedLaw, readings: Sequence[ImuReading], current: bool, now_ns: int
     ) -> Steered:
         """Command the coils by a law that needs no estimate."""
         for reading in readings:
-            brake.sample(reading.time_ns, reading.field, reading.rate)
+            law.sample(reading.time_ns, reading.field, reading.rate)
         text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
         self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)
         if not current:
             return self.rest(now_ns)
         self._body.control.tracker.reset()
-        wanted = brake.command(now_ns)
-        self._drive.send(wanted.currents, lambda: brake.field(now_ns))
-        brake.sent(self._drive.command)
+        wanted = law.command(now_ns)
+        self._drive.send(wanted.currents, lambda: law.field(now_ns))
+        law.sent(self._drive.command)
         return self._steered(SteeringState.BRAKING, now_ns, None, wanted.dipole)
 
     def rest(self, now_ns: int) -> Steered:

@@ -7,7 +7,7 @@ The satellite detumbles by magnetometer and gyro, acquires its attitude with its
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,7 +56,6 @@ from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
-from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.gnc.tracking.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
 
@@ -171,7 +170,7 @@ class SatelliteEstimation(BodyEstimation):
         self.feed = OrbitFeed(self.orbit_filter)
         self.coil_monitor = _coil_monitor(config)
         self._sun = _sun(config, self.orbit_filter, self.environment)
-        self.sun_acquisition = _seeker(config, services)
+        self.sun_acquisition = _sun_acquisition(config, services)
         if config.wide_cameras:
             self.wide = horizon_camera_feed(
                 config.wide_cameras, self.orbit_filter, self.environment, self._sun
@@ -210,7 +209,7 @@ class SatelliteEstimation(BodyEstimation):
         """Pass a reading of the solar cells to the estimate, and to the Sun acquisition of SAFE."""
         if self._sun is None or self.sun_acquisition is None:
             return None
-        self.sun_acquisition.see(reading)
+        self.sun_acquisition.update_sun(reading)
         return self._sun.accept(reading)
 
 
@@ -223,15 +222,20 @@ class SatelliteControl(BodyControl):
         self._objects = ObjectAim(_sensor(config), limit, services.events)
         self._pauses = _pauses(config)
         paths = PointingPaths(limit, fastest_rate(config))
-        disturbed = _disturbed(filter_)
+        timed = [(step.at, step.target()) for step in config.targets]
         self.modes = frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
         self.dipole_per_ampere = config.craft.dipole_per_ampere
         self.free_axis = None
         self.paths = paths
         self.planner = PointingPlanner(
-            _planned(config), paths, environment, disturbed, self._objects, services
+            _planned(config),
+            paths,
+            environment,
+            lambda: (filter_.torque_sizes, filter_.residual_dipole),
+            self._objects,
+            services,
         )
-        self.targets = PointingTargets(_timed(config), paths, config.looks_for_objects())
+        self.targets = PointingTargets(timed, paths, config.looks_for_objects())
         self.tracker = _tracker(config, filter_, environment)
         detumbler = _detumbler(config, filter_, environment)
         self.brake = self.field_detumbling = FieldDetumblingLaw(detumbler, self.dipole_per_ampere)
@@ -260,11 +264,6 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 ORBIT = BodyKind(pointing_job.run, make)
-
-
-def _disturbed(filter_: OrbitFilter) -> Callable[[], tuple[FloatArray, FloatArray]]:
-    """Return a function that gives the estimated torque sizes (9,) N m and the residual dipole (3,) A m^2."""
-    return lambda: (filter_.torque_sizes, filter_.residual_dipole)
 
 
 def _limit(config: OrbitConfig) -> float:
@@ -302,7 +301,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
 
 
 def _slew(config: OrbitConfig) -> SlewRequest:
-    """Return how slews are wanted; without a star camera the pointing axis keeps the cones."""
+    """Return the request of slews; without a star camera the keep-out cones refer to the pointing axis."""
     section, camera = config.pointing, config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
@@ -310,7 +309,7 @@ def _slew(config: OrbitConfig) -> SlewRequest:
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
-    """Return boresight and field of the star camera, None without one that looks for objects."""
+    """Return boresight and field of the star camera; None if it does not search for objects."""
     camera = config.camera
     if camera is None or not config.looks_for_objects():
         return None
@@ -320,17 +319,13 @@ def _sensor(config: OrbitConfig) -> Sensor | None:
 
 
 def fastest_rate(config: OrbitConfig) -> float:
-    """Return the rate, rad/s, beyond which the body is braked again or the star camera rests."""
+    """Return the rate (rad/s) above which the body is detumbled again or the star camera pauses."""
     camera = config.camera.max_rate if config.camera is not None else None
     return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
 
-def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
-    return [(step.at, step.target()) for step in config.targets]
-
-
 _FIELD_ERROR = 5.0e-8
-"""Error of the magnetic field model, per axis, T."""
+"""Error of the magnetic field model (T) per axis."""
 
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
@@ -346,7 +341,7 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
 
 
 def _utc(services: Services) -> float:
-    """Return the host's UTC, s, from which the age of learned states follows."""
+    """Return the host's UTC (s), for the age of learned states."""
     return services.clock.utc_ns() / SECOND_NS
 
 
@@ -383,15 +378,15 @@ def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironmen
     return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, environment)
 
 
-def _seeker(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
-    """Return the brake that turns the pointing axis to the Sun in SAFE; None without solar cells."""
+def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
+    """Return the law that turns the pointing axis to the Sun in SAFE; None without solar cells."""
     section, craft = config.solar_strings, config.craft
     if section is None:
         return None
     axis = np.array(config.pointing.axis)
-    seeking = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
-    seeker = SunAcquisition(_pauses(config), seeking)
-    return SunAcquisitionLaw(seeker, _strings(section), craft.dipole_per_ampere, services.events)
+    settings = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
+    law = SunAcquisition(_pauses(config), settings)
+    return SunAcquisitionLaw(law, _strings(section), craft.dipole_per_ampere, services.events)
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:

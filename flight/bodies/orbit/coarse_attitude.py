@@ -4,8 +4,8 @@ They start the filter without a star, and update it while it is not fine.
 
 An attitude by field and solar cells has a covariance that covers every turn that is possible while any one
 cell fails (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for minutes: a
-measurement of theirs is used only if it is more accurate than the filter, so that repetition never reduces
-the filter's covariance. Two directions that contradict an estimate which no stars made fine, several times in
+measurement is used only if it is more accurate than the filter, so that repetition never reduces the
+filter's covariance. Two directions that contradict an estimate which no stars made fine, several times in
 a row, start the filter again.
 """
 
@@ -42,37 +42,37 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
-from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult, MeasuredDirection
+from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Interval (ns) between readings that are judged: their errors are correlated over shorter times."""
+"""Interval (ns) between judged readings, whose errors are correlated over shorter times."""
 OVERHEAD_ALBEDO = 0.2
-"""Light of an Earth lit from overhead, relative to the Sun's, for an albedo of 0.3."""
+"""Light of an Earth lit from overhead, relative to sunlight, for an albedo of 0.3."""
 CLOUDS = 0.5
-"""Relative variation of the Earth's light."""
+"""Relative variation of the Earth's light by clouds."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Identical readings in a row that show a fault: noise makes intact readings differ."""
+"""Number of identical readings in a row that indicate a fault; noise makes intact readings differ."""
 SUNLIT = 0.99
-"""Visible fraction of the Sun's disc from which the cells are expected to measure it."""
+"""Visible fraction of the solar disc above which the solar cells must measure the Sun."""
 CONTRADICTED = 3
-"""Attitudes or rounds in a row that contradict an estimate that is not fine: the filter starts again."""
+"""Number of contradicting attitudes or rounds in a row after which a filter that is not fine restarts."""
 GATE = 30.7
-"""Chi-square of three axes (1e-6) from which an attitude contradicts the estimate."""
+"""Chi-square threshold of three axes (1e-6) for an attitude that contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
 """Largest standard deviation (rad) of the rotation about the field with which the filter starts."""
 STRENGTH_SIGMA = 5.0
-"""Sigmas by which the field's strength may differ from its model."""
+"""Largest deviation of the field's strength from its model, in sigmas."""
 
 
 class CoarseSunFeed:
-    """Gives the filter the attitude by field and strings."""
+    """Gives the filter an attitude from the magnetic field and the solar cells."""
 
     def __init__(
         self, strings: SolarStringModel, period_ns: int, filter_: OrbitFilter, environment: OrbitEnvironment
     ) -> None:
-        """`period_ns`: of a round of readings, which are not of one instant."""
+        """`period_ns` is the duration of a round of readings, which are not simultaneous."""
         self.strings = strings
         self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
@@ -85,7 +85,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Accept a reading; return the fault that it shows, empty for none, None if it was not judged."""
+        """Accept a reading; return its fault, else an empty text; None if the reading was not judged."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
@@ -101,7 +101,12 @@ class CoarseSunFeed:
         turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
         if measured_field is None or turned is None:
             return None
-        self._carry_on(time_ns)
+        since_ns, self._judged_ns = self._judged_ns, time_ns
+        rotation = self._filter.turned(since_ns, time_ns)
+        if rotation is None:
+            self._turns.forget()
+        else:
+            self._turns.turn(rotation, (time_ns - since_ns) / SECOND_NS)
         (field, gyro), sky = measured_field, _sky(around, sun)
         seen = attitude_matrix(turned) @ field.field
         sigma = float(np.sqrt(field.covariance[0, 0]))
@@ -109,24 +114,15 @@ class CoarseSunFeed:
         if abs(excess) > STRENGTH_SIGMA * sigma:
             self._turns.forget()
             return f"the field is {excess * 1e6:+.1f} uT off its model: no attitude by it"
-        # A round is as long as a period: its readings are of a turning body.
+        # The body rotates during a round of readings.
         blur = float(np.linalg.norm(gyro)) * self._period_ns / SECOND_NS / np.sqrt(12.0)
         fix = self._turns.accept(reading.currents, seen, sigma, sky, blur)
         if fix is not None and self._filter.knowledge is not Knowledge.FINE:
             self._use(time_ns, fix, sun)
         return self._turns.wrong
 
-    def _carry_on(self, time_ns: int) -> None:
-        """Carry the possible turns on to the time of a reading."""
-        since_ns, self._judged_ns = self._judged_ns, time_ns
-        turned = self._filter.turned(since_ns, time_ns)
-        if turned is None:
-            self._turns.forget()
-        else:
-            self._turns.turn(turned, (time_ns - since_ns) / SECOND_NS)
-
     def _use(self, time_ns: int, fix: StringFix, sun: FloatArray) -> None:
-        """Start the filter from an attitude, or feed it the turn about the field."""
+        """Start the filter from an attitude, or give it the direction of the Sun."""
         if not self._filter.runs or self._against >= CONTRADICTED:
             doubted, self._against = self._against >= CONTRADICTED, 0
             if fix.about <= START_SIGMA:
@@ -134,7 +130,7 @@ class CoarseSunFeed:
                 self._filter.begin(attitude, doubted=doubted)
             return
         then = self._filter.past(time_ns)
-        if then is None:  # the filter began after this reading
+        if then is None:  # the filter started after this reading
             return
         claim = then.covariance[ATTITUDE, ATTITUDE]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))
@@ -147,7 +143,7 @@ class CoarseSunFeed:
 
 
 def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
-    """Return the directions and the light of the Earth below, with clouds that are not known."""
+    """Return field, Sun and nadir, and the light of an Earth with unknown clouds."""
     up = around.position / np.linalg.norm(around.position)
     light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
     return KnownDirections(around.field, sun, -up, light, CLOUDS * light)
@@ -178,9 +174,9 @@ class HorizonCameraFeed:
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
-        """`lens_error` rad of an axis remains after calibration; `sun` has the newest reading of the cells.
+        """`lens_error` (rad) of an axis remains after calibration; `sun` has the newest reading of the cells.
 
-        `response` of all cameras to light; None: linear.
+        `response` is the response of all cameras to light; None for a linear response.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -192,7 +188,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether the cameras are to be read often; in the shadow only while the attitude is lost."""
+        """Whether frames are needed often; in the Earth's shadow only while the attitude is lost."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -200,7 +196,7 @@ class HorizonCameraFeed:
         return not dark or self._filter.knowledge is Knowledge.LOST
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
-        """Return the worker's job for frames of one instant, with the prior knowledge at that time."""
+        """Return the worker's job for simultaneous frames, with the prior knowledge at their time."""
         times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
         time_ns = sum(times) // len(times)
         pixels = {number: frame.pixels for number, frame in frames.items()}
@@ -209,7 +205,7 @@ class HorizonCameraFeed:
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Start the filter from Sun, nadir and field, or feed it; return whether Sun and nadir were used."""
+        """Start or update the filter from Sun, nadir and field; return whether Sun and nadir were used."""
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return False, False
@@ -224,26 +220,24 @@ class HorizonCameraFeed:
         then = self._filter.past(time_ns)
         if then is None:
             return False, False
-        # The strings' own Sun reaches the filter with the field (`coarse_sun`).
-        mine = [None if _is_of_strings(found.sun) else seen[0], seen[1]]
+        # A Sun of the solar cells alone reaches the filter through `CoarseSunFeed`.
+        of_cells = found.sun is not None and not found.sun.cameras
+        mine = [None if of_cells else seen[0], seen[1]]
         claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
         refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
-        self._judge(mine, refused)
+        # Count the rounds in a row that contradict an estimate that no stars made fine.
+        if self._filter.knowledge is Knowledge.FINE:
+            self._against = 0
+        elif any(one is not None for one in mine):
+            self._against = self._against + 1 if any(refused) else 0
         sun_used, nadir_used = (
             one is not None and not against and _says_more(one, claim) and self._use(time_ns, one)
             for one, against in zip(mine, refused, strict=True)
         )
         return sun_used, nadir_used
 
-    def _judge(self, seen: Sequence[VectorObservation | None], refused: Sequence[bool]) -> None:
-        """Count the rounds in a row that contradict an estimate that no stars made fine."""
-        if self._filter.knowledge is Knowledge.FINE:
-            self._against = 0
-        elif any(one is not None for one in seen):
-            self._against = self._against + 1 if any(refused) else 0
-
     def _begin(self, time_ns: int, seen: list[VectorObservation]) -> bool:
-        """Start the filter from the attitude of all directions, where they fix one and agree."""
+        """Start the filter from all directions, if they determine an attitude and agree; return whether."""
         field = self._field_sight(time_ns)
         sights = seen if field is None else [*seen, field]
         if not seen or len(sights) < 2:
@@ -267,7 +261,7 @@ class HorizonCameraFeed:
         return any(taken)
 
     def _field_sight(self, time_ns: int) -> VectorObservation | None:
-        """Return the direction of the magnetic field at a time, None without a recent one."""
+        """Return the direction of the magnetic field at a time; None without a recent measurement."""
         measured_field = self._filter.newest_field()
         turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
         around = self._environment.at(time_ns)
@@ -308,17 +302,13 @@ def horizon_camera_feed(
     environment: OrbitEnvironment,
     sun: CoarseSunFeed | None,
 ) -> HorizonCameraFeed:
-    """Return the feed of configured cameras."""
+    """Return the feed of the configured horizon cameras."""
     cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
     error = math.radians(max(one.lens_error_deg for one in sections))
     first, response = sections[0], None
     if first.response == "logarithmic":
         response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
     return HorizonCameraFeed(cameras, error, filter_, environment, sun, response)
-
-
-def _is_of_strings(sun: MeasuredDirection | None) -> bool:
-    return sun is not None and not sun.cameras
 
 
 def _spread(

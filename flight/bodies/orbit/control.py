@@ -34,47 +34,56 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 
 
-class FieldDetumblingLaw:
-    """Commands the detumbler's dipole; implements `flight.loop.body.WindowedLaw`."""
+class _MagneticLaw:
+    """A law that drives the coils by magnetometer and gyro; implements `flight.loop.body.WindowedLaw`."""
 
-    def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
-        """Take n A of each coil, m^2."""
-        self.detumbler = detumbler
+    def __init__(self, law: FieldDetumbler | SunAcquisition, dipole_per_ampere: float) -> None:
+        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        self._law = law
         self._dipole_per_ampere = dipole_per_ampere
         self._field_check = StuckFieldCheck()
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
-        self.detumbler.begin(now_ns)
+        self._law.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a field (3,) T and the gyro's rate (3,) rad/s at `time_ns`; a stuck field is ignored."""
         if self._field_check.accept(field):
-            self.detumbler.sample(time_ns, field, rate)
+            self._law.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now: zero if the magnetometer is stuck."""
-        dipole = self.detumbler.dipole(now_ns)
+        """Return the command now, which is zero if the magnetometer is stuck."""
+        dipole = self._law.dipole(now_ns)
         if self._field_check.stuck:
             dipole = np.zeros(3)
-            self.detumbler.acts(dipole)
+            self._law.acts(dipole)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:
-        """Propagate the rate with the currents (3,) A that flow: an excluded coil makes no torque."""
-        self.detumbler.acts(currents * self._dipole_per_ampere)
+        """Propagate the rate with the currents (3,) A that flow; an excluded coil makes no torque."""
+        self._law.acts(currents * self._dipole_per_ampere)
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes at the last command; None before it is known."""
-        return self.detumbler.field
+        return self._law.field
+
+
+class FieldDetumblingLaw(_MagneticLaw):
+    """Detumbles the body; `detumbler` holds the estimated rate and field."""
+
+    def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
+        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        super().__init__(detumbler, dipole_per_ampere)
+        self.detumbler = detumbler
 
 
 def expected_field(
     filter_: OrbitFilter, environment: OrbitEnvironment, instants: FloatArray
 ) -> Callable[[int], FloatArray | None]:
-    """Return a function of time that gives the field (n, 3) T at `instants` (n,) s later, body axes of then.
+    """Return a function that predicts the field (n, 3) T at `instants` (n,) s after a time.
 
-    It gives None while attitude or orbit are not known.
+    The field is in body axes at that time. The function returns None while attitude or orbit are unknown.
     """
     field = FieldAhead()
 
@@ -88,65 +97,43 @@ def expected_field(
     return expected
 
 
-class SunAcquisitionLaw:
-    """Turns the body to the Sun, and reports whether a Sun is measured; implements `Brake` of the loop."""
+class SunAcquisitionLaw(_MagneticLaw):
+    """Turns the body to the Sun, and reports whether the solar cells measure the Sun."""
 
     def __init__(
-        self, seeker: SunAcquisition, strings: SolarStringModel, dipole_per_ampere: float, log: EventLog
+        self, law: SunAcquisition, strings: SolarStringModel, dipole_per_ampere: float, log: EventLog
     ) -> None:
-        """Take n A of each coil, m^2."""
-        self._seeker, self._strings = seeker, strings
-        self._dipole_per_ampere = dipole_per_ampere
-        self._field_check = StuckFieldCheck()
+        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        super().__init__(law, dipole_per_ampere)
+        self._acquisition, self._strings = law, strings
         self._events = log
         self._found: bool | None = None
         self._reason = "the strings give no readings"
 
-    def begin(self, now_ns: int) -> None:
-        """Begin with no knowledge of the field."""
-        self._seeker.begin(now_ns)
-
-    def see(self, reading: StringReading) -> None:
+    def update_sun(self, reading: StringReading) -> None:
         """Accept a reading of the solar cells, in any mode."""
         found = coarse_sun(reading.currents, self._strings)
         self._reason = found.reason
         if found.direction is not None:
-            self._seeker.update_sun(reading.time_ns, found.direction)
-
-    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s at `time_ns`; a stuck field is ignored."""
-        if self._field_check.accept(field):
-            self._seeker.sample(time_ns, field, rate)
+            self._acquisition.update_sun(reading.time_ns, found.direction)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now: without a Sun only against the rotation; zero with a stuck field."""
-        found = self._seeker.sun is not None
+        """Return the command now. Without a Sun it only damps the rotation."""
+        found = self._acquisition.sun is not None
         if found is not self._found:
             self._found = found
             if found:
                 self._events.report(events.SUN_FOUND, now_ns, "by the solar strings")
             else:
                 self._events.report(events.SUN_MISSED, now_ns, self._reason)
-        dipole = self._seeker.dipole(now_ns)
-        if self._field_check.stuck:
-            dipole = np.zeros(3)
-            self._seeker.acts(dipole)
-        return CoilCommand(dipole, dipole / self._dipole_per_ampere)
-
-    def sent(self, currents: FloatArray) -> None:
-        """Accept the currents (3,) A that were sent to the coils."""
-        self._seeker.acts(currents * self._dipole_per_ampere)
-
-    def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes at the last reading; None before it is known."""
-        return self._seeker.field
+        return super().command(now_ns)
 
 
 _NOTHING: FloatArray = np.zeros(3)
 
 
 class PointingTracker:
-    """Implements `flight.loop.body.Tracker`."""
+    """Tracks a path by the pointing law; implements `flight.loop.body.Tracker`."""
 
     def __init__(
         self,
@@ -157,7 +144,7 @@ class PointingTracker:
         dipole_per_ampere: float,
         inertia: FloatArray,
     ) -> None:
-        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil; `inertia` (3,) kg m^2 of the body axes."""
+        """`limit` is in A m^2, `dipole_per_ampere` in m^2, of each coil; `inertia` (3,) in kg m^2."""
         self._inertia = inertia
         self._filter, self._environment = filter_, environment
         self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
@@ -165,7 +152,7 @@ class PointingTracker:
         self._window: tuple[int, object] | None = None
 
     def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
-        """Return the command of the present window: zero in its pause."""
+        """Return the command of the present window, which is zero in its pause."""
         pauses, now_ns = self._pauses, reference.time_ns
         if now_ns % pauses.period_ns < pauses.settle_ns + pauses.measure_ns:
             return CoilCommand(_NOTHING, _NOTHING)
@@ -175,7 +162,7 @@ class PointingTracker:
         return self._held
 
     def reset(self) -> None:
-        """Forget the command that is held."""
+        """Discard the command of the present window."""
         self._window = None
 
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:

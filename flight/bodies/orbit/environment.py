@@ -25,11 +25,11 @@ from knightcube.gnc.estimation.free_filter import FilterEnvironment
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """Span (s) of the short prediction, after and before the time for which it is made."""
 GPS_DELAY_NS = 100_000_000
-"""From an epoch of the receiver to the first byte of its report; 0.2 s at most."""
+"""Delay (ns) from an epoch of the receiver to the first byte of its report; at most 0.2 s."""
 GATE, LEAST_GATE = 5.0, 5e3
 """Sigmas by which a fix may differ from the known orbit, and difference (m) that is always allowed."""
 CONTRADICTED = 30
-"""Fixes in a row that contradict the last accepted fix, after which that fix counts as wrong."""
+"""Number of contradicting fixes in a row after which the last accepted fix counts as wrong."""
 TIME_GATE_NS = SECOND_NS // 2
 """Largest step (ns) of the receiver's time relative to the clock; the craft flies 4 km in this time."""
 _UNIX_EPOCH = 2_440_587.5
@@ -37,10 +37,10 @@ _SHORTEST = 1.0
 
 
 class OrbitEnvironment:
-    """Owns the knowledge of the orbit. `refused` counts the fixes that contradict it."""
+    """Knowledge of the orbit. `refused` counts the GPS fixes that contradict it."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
-        """`elements` are known before the flight; with None, the orbit is unknown until the first fix."""
+        """`elements` are the two-line elements; with None the orbit is unknown until the first fix."""
         self._elements = elements
         self._clock = clock
         self._fix: GpsFix | None = None
@@ -52,11 +52,11 @@ class OrbitEnvironment:
 
     @property
     def known(self) -> bool:
-        """Whether the orbit was known when it was last asked for."""
+        """Whether the last request found a known orbit."""
         return self._near is not None
 
     def julian_date(self, now_ns: int) -> float:
-        """Return the Julian date UTC, by the receiver's time, before the first fix by the host's clock."""
+        """Return the Julian date UTC by the receiver's time; before the first fix by the host's clock."""
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
@@ -83,11 +83,11 @@ class OrbitEnvironment:
         return True
 
     def state(self, now_ns: int) -> OrbitState | None:
-        """Return place and velocity, ICRS; None while no orbit is known."""
+        """Return position and velocity, ICRS; None while the orbit is unknown."""
         return self._state(self.julian_date(now_ns))
 
     def at(self, now_ns: int) -> FilterEnvironment | None:
-        """Return field, place, torques' shapes and sunlight; None while no orbit is known."""
+        """Return field, position, pressures and sunlight; None while the orbit is unknown."""
         near, times = self._prediction(now_ns)
         if near is None:
             return None
@@ -100,12 +100,12 @@ class OrbitEnvironment:
         )
 
     def sun(self, now_ns: int) -> FloatArray | None:
-        """Return the Sun's direction (3,), ICRS, without aberration (21"); None while no orbit is known."""
+        """Return the Sun's direction (3,), ICRS (no aberration, 21"); None while the orbit is unknown."""
         near, times = self._prediction(now_ns)
         return None if near is None else np.asarray(near.sun_at(times)[0])
 
     def velocity(self, now_ns: int) -> FloatArray | None:
-        """Return the velocity (3,) m/s about the Sun, ICRS, for aberration; None while no orbit is known."""
+        """Return the velocity (3,) m/s about the Sun, ICRS; None while the orbit is unknown."""
         near, times = self._prediction(now_ns)
         if near is None:
             return None
@@ -126,7 +126,7 @@ class OrbitEnvironment:
         return None
 
     def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
-        """Return the short prediction and the time (1,) s in it, made again near its end."""
+        """Return the short prediction, renewed near its end, and the time (1,) s in it."""
         near = self._near
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
@@ -136,7 +136,7 @@ class OrbitEnvironment:
         return near, np.array([seconds])
 
     def _is_out_of_time(self, offset_ns: int) -> bool:
-        """Return whether the receiver's time stands or jumps; a lasting jump is accepted after a while."""
+        """Return whether the receiver's time stops or jumps; a lasting jump is accepted after a while."""
         last_offset_ns, self._newest_offset_ns = self._newest_offset_ns, offset_ns
         if last_offset_ns is not None and abs(offset_ns - last_offset_ns) > TIME_GATE_NS:
             return True

@@ -63,7 +63,7 @@ _NOTHING: Floats = (0.0, 0.0, 0.0)
 
 
 class DipoleHistory:
-    """The dipoles on the wire in order of time, and since when they are known."""
+    """The dipoles on the wire in order of time."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns
@@ -74,7 +74,7 @@ class DipoleHistory:
         """Time (ns) until which dipoles were not known; -1 if they always were."""
 
     def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
-        """Record the dipole A m^2 in force from `time_ns` on; in order of time."""
+        """Record the dipole (A m^2) in force from `time_ns` on; calls are in order of time."""
         if not known:
             self.unknown_ns = max(self.unknown_ns, time_ns)
         if self._dipoles and dipole == self._dipoles[-1]:
@@ -88,7 +88,7 @@ class DipoleHistory:
             del self._times[:oldest], self._dipoles[:oldest], self._sums[:oldest]
 
     def total(self, time_ns: int) -> FloatArray:
-        """Return the integral (3,) A m^2 s of the dipole until a time; only differences have a meaning."""
+        """Return the integral (3,) A m^2 s of the dipole until a time, from an arbitrary origin."""
         return np.array(self._sum(time_ns)) / SECOND_NS
 
     def mean(self, from_ns: int, to_ns: int) -> FloatArray:
@@ -98,7 +98,7 @@ class DipoleHistory:
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
 
     def at_rest_since(self) -> int | None:
-        """Return since when the dipole is zero; None while it is not."""
+        """Return the time since which the dipole is zero (ns); None if it is not zero."""
         if not self._dipoles:
             return 0
         return self._times[-1] if self._dipoles[-1] == _NOTHING else None
@@ -114,15 +114,16 @@ class DipoleHistory:
 
 @dataclass(slots=True, eq=False)
 class FilterStep:
-    """What was commanded and measured between two times.
+    """The commands and measurements between two times.
 
     Attributes:
-        dipole: (3,) A m^2, the mean on the wire; `doubt` A m^2 by which an axis may differ where not known.
-        gyro: (3,) rad/s, the mean of `samples` readings, whose mean time is `gyro_ns`.
-        impulse: (3,) A m^2 s, of the dipole after a sample, in the mean of the samples.
-        field: (3,) T, the mean of `fields` readings about `field_ns`; None without one.
-        late: the measurements of times within the step, in their order.
-        before: the estimate at its beginning; None before there was one.
+        dipole: (3,) A m^2, mean on the wire.
+        doubt: A m^2, largest deviation of an axis from `dipole`; 0 for known dipoles.
+        gyro: (3,) rad/s, mean of `samples` readings, whose mean time is `gyro_ns`.
+        impulse: (3,) A m^2 s, impulse of the dipole after a sample, as the mean over the samples.
+        field: (3,) T, mean of `fields` readings around `field_ns`; None without a reading.
+        late: measurements with a time in the step, oldest first.
+        before: the estimate at the beginning; None without an estimate.
     """
 
     begin_ns: int
@@ -142,15 +143,15 @@ class FilterStep:
 
     @property
     def seconds(self) -> float:
-        """Its length, s."""
+        """Length of the step (s)."""
         return (self.end_ns - self.begin_ns) / SECOND_NS
 
 
 class OpenStep:
-    """Gathers the readings of the step under way."""
+    """Collects the readings of the present step."""
 
     def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Begin at a time, with coils that act or rest."""
+        """Begin at a time; `acts` is whether the coils carry a current."""
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
@@ -159,7 +160,7 @@ class OpenStep:
         self._rates_ns = self._fields_ns = 0
 
     def add(self, reading: ImuReading, total: FloatArray, listens: bool) -> None:
-        """Add a reading and the dipole's `total` (3,) then; `listens`: the coils do not disturb its field."""
+        """Add a reading and the dipole's integral `total` (3,); `listens` is whether its field is valid."""
         since = reading.time_ns - self.begin_ns
         self.end_ns = reading.time_ns
         self._rates.append(reading.rate)
@@ -170,11 +171,11 @@ class OpenStep:
             self._fields_ns += since
 
     def is_over(self, acts: bool, longest_ns: int) -> bool:
-        """Return whether it has lasted long enough, or the coils have begun or ceased to act."""
+        """Return whether the step has its full length, or the coils have begun or ceased to act."""
         return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
 
     def close(self, dipole: FloatArray, doubt: float, around: FilterEnvironment) -> FilterStep:
-        """Return the step from its beginning to the newest reading."""
+        """Return the finished step."""
         samples, fields = len(self._rates), len(self._fields)
         return FilterStep(
             self.begin_ns,
@@ -193,7 +194,7 @@ class OpenStep:
 
 
 FORGOTTEN_NS = 10_000_000_000
-"""Time (ns) without a contradicting gyro, after which the commanded dipoles are trusted again."""
+"""Time (ns) without a contradicting gyro after which the commanded dipoles are trusted again."""
 _LONGEST = 2.0
 _EYE: FloatArray = np.eye(3)
 
@@ -230,10 +231,10 @@ class StepReplay:
 
     Attributes:
         free: the estimate at the end of the newest step.
-        refused_gyros: how many steps in a row had a gyro that contradicts the motion.
-        contradicted: how many steps with a dipole, in a row, had a gyro that contradicts it; forgotten after
-            `FORGOTTEN_NS`, as coils that rest on it would never show the contrary.
-        refused_fields: how many fields in a row contradicted the estimate.
+        refused_gyros: number of steps in a row whose gyro contradicts the motion.
+        contradicted: number of steps with a dipole in a row whose gyro contradicts it; reset after
+            `FORGOTTEN_NS`, because coils at rest give no evidence.
+        refused_fields: number of fields in a row that contradict the estimate.
     """
 
     def __init__(self, settings: OrbitFilterSettings) -> None:
@@ -263,7 +264,7 @@ class StepReplay:
         if refused:
             self.contradicted, self._refused_ns = self.contradicted + 1, now_ns
         elif steps[-1].dipole.any() or now_ns - self._refused_ns >= FORGOTTEN_NS:
-            self.contradicted = 0  # a pause between two commands says nothing of them
+            self.contradicted = 0  # a pause between two commands gives no evidence
         if refused and not steps[-1].doubt:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):
@@ -279,9 +280,9 @@ class StepReplay:
         return self.take_again(first)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Doubt the dipoles since then for a refused attitude, if it is used then; return what is used.
+        """Treat the dipoles since then as unknown if this admits a refused attitude; return the used ones.
 
-        Coils that depart from their commands by less than the gyro shows would lead the attitude astray.
+        Deviations of the dipoles that the gyro cannot detect accumulate in the attitude.
         """
         doubts = [step.doubt for step in self.steps]
         used = self.doubt_since(min(since_ns, refused.time_ns))
@@ -292,9 +293,9 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in step number `place`; the estimates before it are forgotten.
+        """Start from an attitude in step number `place`, and discard the estimates before it.
 
-        `doubted`: they were contradicted.
+        `doubted` is whether these estimates were contradicted.
         """
         first = self.steps[place]
         self.free.start(attitude.quaternion, attitude.covariance, first.gyro, doubted=doubted)
@@ -313,9 +314,9 @@ class StepReplay:
         return None
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate (3,) rad/s of its step; None without one.
+        """Return the newest field and the gyro's rate (3,) rad/s of its step; None without a field.
 
-        Its covariance is for the start of an estimate: the field's bias enters again with the next.
+        The covariance is for the start of an estimate, because it includes the magnetometer's bias.
         """
         step = next((step for step in reversed(self.steps) if step.field is not None), None)
         if step is None or step.field is None:
@@ -404,11 +405,11 @@ class StepReplay:
 
 
 STUCK, CONTRADICTED = 20, 4
-"""Readings in a row with the same field, whose noise never repeats; fields that contradict the estimate."""
+"""Numbers in a row of equal fields, which noise excludes, and of fields that contradict the estimate."""
 
 
 class StuckFieldCheck:
-    """Counts readings with the same field."""
+    """Detects a magnetometer that repeats the same field."""
 
     def __init__(self) -> None:
         self._last: list[float] = []
@@ -420,13 +421,13 @@ class StuckFieldCheck:
         return self._same >= STUCK
 
     def accept(self, field: FloatArray) -> bool:
-        """Take the field (3,) of a reading; return whether it may be used: it is not stuck."""
+        """Accept the field (3,) of a reading; return whether it may be used because it is not stuck."""
         values = field.tolist()
         self._same, self._last = (self._same + 1 if values == self._last else 0), values
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer is rejected, empty while it is used; `refused` fields in a row were."""
+        """Return why the magnetometer is rejected, else ""; `refused` counts rejections in a row."""
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
         return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""
@@ -442,7 +443,7 @@ _NONE: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beginning:
-    """An estimate at the end of a step, and the terms that all its propagations share.
+    """An estimate at the end of a step, with the terms that all its propagations share.
 
     Attributes:
         spread: (19, 19) the covariance in the loop's order.
@@ -462,7 +463,7 @@ class _Beginning:
 
 
 class EstimatePropagation:
-    """Propagates estimates of a filter; 0.03 ms each."""
+    """Propagates the estimates of a filter, in 0.03 ms each."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free
@@ -530,16 +531,16 @@ class EstimatePropagation:
 
 
 REFUSALS_TO_RESTART = 3
-"""Attitudes in a row that contradict the estimate: the estimate is wrong."""
+"""Number of attitudes in a row that contradict the estimate, after which the filter restarts."""
 
 
 class OrbitFilter:
-    """Implements `flight.loop.body.Filter`; `begin` starts it.
+    """The satellite's filter; implements `flight.loop.body.Filter`.
 
-    More than 200 lines: one short method for each thing that loop, feeds and telemetry ask of a filter.
+    Longer than 200 lines because loop, feeds and telemetry each use several short methods.
 
     Attributes:
-        restarts: how often an estimate was discarded for a new one.
+        restarts: number of estimates that were discarded.
     """
 
     def __init__(
@@ -654,10 +655,9 @@ class OrbitFilter:
         return self.started and not self.doubts_commands
 
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
-        """Start from an attitude; return False where no step was taken at its time.
+        """Start from an attitude; return False for a non-finite attitude, or if no step holds its time.
 
-        `doubted`: the estimate was contradicted, so its learned states are less accurate than stated.
-        A non-finite attitude starts nothing.
+        `doubted` is whether the estimate was contradicted, so that its learned states are less accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
@@ -681,7 +681,11 @@ class OrbitFilter:
                     self._steps[k].late = sorted([*self._steps[k].late, m], key=lambda other: other.time_ns)
             used = self._replay.take_again(min(inside))
             for m in late:
-                if isinstance(m, AttitudeMeasurement) and id(m) in known - used and self._should_yield(m):
+                if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
+                    continue
+                # A refused attitude that is more accurate than a fine estimate casts doubt on the dipoles.
+                sigma = math.sqrt(float(m.covariance.diagonal().max()))
+                if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
                     used = self._replay.make_room(m, self._placed_ns)
             taken = [id(m) in used for m in late]
         applied(taken)
@@ -690,7 +694,7 @@ class OrbitFilter:
                 self._judge(m, was)
 
     def catch_up(self, most: int | None = None) -> None:
-        """Do nothing: late measurements are applied at once, a few steps in a millisecond or two."""
+        """Do nothing, because late measurements are applied at once, in a millisecond or two."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself does not change."""
@@ -726,7 +730,7 @@ class OrbitFilter:
         return np.array([*times, last.time_ns], dtype=np.int64), np.array([*rates, last.rate])
 
     def acceleration_psd(self, time_ns: int) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then."""
+        """Return the density (3, 3) rad^2/s^3 of the acceleration noise at a time."""
         place = self._replay.place(time_ns) if self._free.started else None
         if place is None:
             return self._settings.unknown_psd * np.eye(3)
@@ -751,13 +755,8 @@ class OrbitFilter:
         self._replay.add(step)
         self._replay.follow_gyro()
 
-    def _should_yield(self, refused: AttitudeMeasurement) -> bool:
-        """Return whether a refused attitude is better known than a fine estimate."""
-        known = math.sqrt(float(refused.covariance.diagonal().max()))
-        return self.knowledge is Knowledge.FINE and known < self._free.worst_sigma
-
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
-        """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""
+        """Restart after too many contradicting attitudes; a coarse estimate restarts after the first."""
         self._refused_attitudes = 0 if used else self._refused_attitudes + 1
         if used:
             self._placed_ns = attitude.time_ns
@@ -787,7 +786,7 @@ UNKNOWN_AGE = 86_400.0
 
 
 def _places(*parts: slice) -> IntArray:
-    """Return where parts of the filter's state stand among the slow states."""
+    """Return the indices of parts of the filter's state among the slow states."""
     return np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start
 
 
@@ -805,7 +804,7 @@ def start_from(
 ) -> tuple[SlowStates, list[str]]:
     """Return the filter's prior at a time (UTC, s), and why learned states were rejected.
 
-    Since then a state may have changed by the part `changed` of its deviation at the start.
+    Since the last boot a state may have changed by the fraction `changed` of its initial deviation.
     """
     start, walks = settings.of_slow(0), settings.of_slow(1)
     prior = SlowStates(np.zeros(len(start)), np.diag(start**2))

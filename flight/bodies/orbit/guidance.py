@@ -62,15 +62,15 @@ class PathPoint:
 
 
 class PointingPaths:
-    """Implements `flight.loop.body.FlownPaths`.
+    """The path being flown; implements `flight.loop.body.FlownPaths`.
 
     Attributes:
-        off: rad, how far the body was off the path at the last command; zero for a new path.
-        astray: whether it is held still because of that.
+        off: angle (rad) between body and path at the last command; zero for a new path.
+        astray: the recovery of a body far off its path.
     """
 
     def __init__(self, limit: float, fastest: float) -> None:
-        """`limit` A m^2 of each coil, mean over a window; `fastest` rad/s, of no path to be reached."""
+        """`limit` (A m^2) is a coil's mean dipole over a window; every path stays below `fastest` (rad/s)."""
         self._limit, self._fastest = limit, fastest
         self._law: PointingLaw | None = None
         self._target: PointingTarget | None = None
@@ -80,7 +80,7 @@ class PointingPaths:
         self.astray = PathRecovery()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
-        """Fly a table, or its part that is slow enough; return why it is refused, empty when it is flown."""
+        """Fly a table, or its part that is slow enough; return why it is refused, empty if it is flown."""
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
@@ -96,7 +96,7 @@ class PointingPaths:
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
-        """Take the turn (3,) off the path and the rate (3,); return whether it is flown: not while astray."""
+        """Accept rotation (3,) off the path and rate (3,); return whether the path is flown."""
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
         return self.astray.since is None
@@ -106,7 +106,7 @@ class PointingPaths:
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def has_arrived(self, now_ns: int) -> bool:
-        """Return whether a slew is over: once for each."""
+        """Return whether a slew has ended since the last call."""
         over = self._arrival_ns is not None and now_ns >= self._arrival_ns
         if over:
             self._arrival_ns = None
@@ -127,11 +127,11 @@ class PointingPaths:
         return point.law.wanted(point.seconds).quaternion
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether there is a path: all of it is followed."""
+        """Return whether there is a path, which is followed to its end."""
         return self.sample(now_ns) is not None
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return False: the coils rest after the end of a path."""
+        """Return False, because the coils are at zero after the end of a path."""
         return False
 
     def release(self) -> None:
@@ -171,7 +171,7 @@ class PointingTargets:
     def __init__(
         self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
     ) -> None:
-        """Take the configured targets, each with its mission time in s, in order; the first is at 0."""
+        """Take the configured targets with their mission times (s) in order; the first time is 0."""
         self._looks_for_objects = looks_for_objects
         self._paths = paths
         self._times = [round(at * 1e9) for at, _ in timed]
@@ -195,7 +195,7 @@ class PointingTargets:
         return Target(KEPT, PointingTargetLaw(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return True: every attitude can be held in the mean over a revolution."""
+        """Return True, because every attitude can be held in the mean over a revolution."""
         return True
 
     def speed(self, estimate: Estimate) -> float:
@@ -208,7 +208,7 @@ class PointingTargets:
         return 0.0 if np.isnan(wanted[0]) else float(angle_between(estimate.quaternion, wanted))
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return None: coils alone reach a target when the field allows."""
+        """Return None, because the arrival depends on the magnetic field."""
         return None
 
 
@@ -225,7 +225,7 @@ young track are not accurate enough."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensor:
-    """The star camera: its boresight (3,), body axes, and rad from there to the nearest edge."""
+    """The star camera: boresight (3,), body axes, and angle (rad) from it to the nearest edge."""
 
     boresight: FloatArray
     half_field: float
@@ -235,12 +235,12 @@ class ObjectAim:
     """Directs the planner's jobs while the target is an object.
 
     Attributes:
-        seeks: whether it is.
-        moved: whether there is news for the planner.
+        seeks: whether the target is an object.
+        moved: whether the track changed since the last plan.
     """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """`sensor` None: none looks for objects; `limit` A m^2 of each coil."""
+        """`sensor` is None without a search for objects; `limit` (A m^2) is of each coil."""
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -258,7 +258,7 @@ class ObjectAim:
         self.seeks = target.goal is Goal.OBJECT and self._sensor is not None
 
     def accept(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Accept the confirmed tracks after a frame, and choose the one to follow."""
+        """Accept the confirmed tracks after a frame, and choose a track to follow."""
         self._tracks = tuple(tracks)
         if not self.seeks:
             return
@@ -270,13 +270,12 @@ class ObjectAim:
                 text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
-                self._place = (
-                    None  # the search starts again at the body's attitude, or at the commanded direction
-                )
+                # The search starts again at the body's attitude, or at the commanded direction.
+                self._place = None
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job for the body's target; for an object, pointing to the search or the track."""
+        """Return a job for the body's target; for an object it points to the search or to the track."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -286,7 +285,7 @@ class ObjectAim:
         track = self._track()
         if track is None:
             place = self._searched(job.quaternion)
-            # Another axis would make it cheap to turn the boresight away.
+            # With another axis a rotation of the boresight would have a low cost.
             weights = replace(job.weights, roll=ROLL, axis=boresight)
             return replace(
                 job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
@@ -298,7 +297,7 @@ class ObjectAim:
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
-        """Report an object that the path of a table does not keep in the field."""
+        """Report an object that leaves the field of view on the path of a table."""
         sensor, sight = self._sensor, job.sight
         if sensor is None or sight is None or not sight.velocity.any():
             return
@@ -325,11 +324,11 @@ class ObjectAim:
         self._escapes = bool(len(outside))
 
     def _track(self) -> Track | None:
-        """Return the track that is followed, None when it has ended or none is."""
+        """Return the followed track; None if it has ended or no track is followed."""
         return next((track for track in self._tracks if track.number == self._followed > 0), None)
 
     def _searched(self, quaternion: FloatArray) -> FloatArray:
-        """Return the direction (3,) of the search: the ordered one, or that of the camera when it began."""
+        """Return the direction (3,) of the search: as commanded, or that of the camera at its beginning."""
         if self._place is None:
             assert self._target is not None
             assert self._sensor is not None
@@ -344,15 +343,15 @@ class ObjectAim:
 
 
 AGAIN_NS = 10_000_000_000
-"""Time (ns) until the next request after a failed plan, or while no orbit is known."""
+"""Time (ns) until the next request after a failed plan, or while the orbit is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
     """The planner's model of the craft.
 
-    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action;
-    `slew` is how slews are wanted.
+    `inertia` (3, 3) is in kg m^2, body axes. `limit` (A m^2) is the mean dipole of a coil over a window of
+    pause and action. `slew` is the request of slews.
     """
 
     inertia: FloatArray
@@ -384,7 +383,7 @@ class PointingPlanner:
         self._count = self._accepted = self._refused = 0
 
     def busy_since_ns(self) -> int | None:
-        """Return since when the worker has been planning, None while idle."""
+        """Return when the worker began its plan (ns); None while it is idle."""
         return None if self._job is None else self._job.origin_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
@@ -396,7 +395,7 @@ class PointingPlanner:
         self._wanted = True
 
     def resume(self, now_ns: int) -> None:
-        """Do nothing: the path goes on while there is no control."""
+        """Do nothing, because the path goes on while there is no control."""
 
     def replan(self, cycle: Cycle) -> None:
         """Request the periodic plan: the task of the replanning rate group."""
@@ -407,11 +406,14 @@ class PointingPlanner:
         goal, astray = target_of(target), self._paths.astray
         self._objects.aim(goal)
         if astray.since is not None:
-            self._hold_still(now_ns)
+            if not self._held:
+                text = f"{math.degrees(self._paths.off):.0f} deg off its path: held still, then planned for"
+                self._events.report(events.ASTRAY, now_ns, text)
+            self._held = True
             if not astray.ready:
                 return
         elif self._paths.is_slewing(now_ns, goal):
-            return  # the rest of a slew planned again costs many times its heat
+            return  # a new plan for the rest of a slew would dissipate many times the heat
         if self._paths.has_arrived(now_ns):
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
@@ -444,19 +446,12 @@ class PointingPlanner:
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
     def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
-        """Return how a slew to a goal is wanted; None for a body on a path to it.
+        """Return the request of a slew to a goal; None for a body on a path to it.
 
-        A path leaves its goal for a time when it meets torques along the field; this requires no slew.
+        Torques along the field make a path leave its goal for a time; this requires no slew.
         """
         on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
         return None if on_path else replace(self._craft.slew, residual=residual)
-
-    def _hold_still(self, now_ns: int) -> None:
-        """Report once that the body is held still."""
-        if not self._held:
-            text = f"{math.degrees(self._paths.off):.0f} deg off its path: held still, then planned for"
-            self._events.report(events.ASTRAY, now_ns, text)
-        self._held = True
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""
@@ -466,7 +461,7 @@ class PointingPlanner:
         if result.outcome != "done":
             self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
-            self._wanted = True  # planned before the body went astray: another one once it is slow
+            self._wanted = True  # the plan is from before; a new plan follows once the body is slow
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
@@ -482,7 +477,7 @@ class PointingPlanner:
         return self._accepted, self._refused
 
     def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
-        """Report a plan that is not flown, and ask for another one after `wait_ns`: none for an object."""
+        """Report a plan that is not flown, and request another plan after `wait_ns`."""
         self._refused += 1
         self._wanted, self._after_ns = True, now_ns + wait_ns
         self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -26,7 +26,6 @@ from flight.bodies.testbed.guidance import (
     ThreadReader,
     ThreadTargets,
     TimedStep,
-    angular_acceleration_psd_of,
     law_of,
     plant_of,
 )
@@ -88,7 +87,7 @@ class UnitFeed:
         if not self._filter.started:
             self._filter.start(attitude, rate)
             return ReadingAgreement(True)
-        # Gated separately: a correct gyro keeps the rate while the attitude is rejected.
+        # Attitude and rate have separate gates: a correct gyro keeps the rate while the attitude is rejected.
         turned = self._filter.measure(attitude)
         moved = self._filter.started and self._filter.measure(rate)
         if turned and moved:
@@ -97,12 +96,12 @@ class UnitFeed:
         return ReadingAgreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Return False: the unit's own attitude starts the filter."""
+        """Return False, because the inertial unit's attitude starts the filter."""
         return False
 
 
 class ThreadView:
-    """Implements `flight.loop.body.BodyView`."""
+    """The packets and texts of the testbed; implements `flight.loop.body.BodyView`."""
 
     def __init__(self, reader: ThreadReader, planning: Planning, services: Services) -> None:
         self._read = reader.read
@@ -180,7 +179,8 @@ class TestbedEstimation(BodyEstimation):
         self._reader = reader or thread_reader(plant)
         self._cage = cage
         self._field = surrounding_field(config)
-        self._density = angular_acceleration_psd_of(config, plant) * np.eye(3)
+        noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
+        self._density = noise**2 / CONTROL_RATE_HZ * np.eye(3)
         filter_, self.learned_problems = attitude_filter(config, plant, learned, cage)
         self.filter = filter_
         self.feed = UnitFeed(filter_, config.inertial_unit)
@@ -229,14 +229,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
-    """Return the reader of the turn about the thread, with the thread of `plant`."""
+    """Return the reader of the rotation about the thread of `plant`."""
     return ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
 
 
 def _tracker(
     config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
 ) -> Tracker:
-    """Return the tracker: of the coil on body x, in a cage of those on x and z."""
+    """Return the tracker for the coil on body x, or in a cage for the coils on x and z."""
     period, dipole = 1.0 / CONTROL_RATE_HZ, dipole_per_ampere(config)
     controller = controller_of(config.control, plant, period, config.identification)
     tracker = ThreadTracker(controller, reader, dipole)
@@ -307,7 +307,7 @@ def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
 
 
 def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
-    """Return the watch over the coils' circuit."""
+    """Return the monitor of the coils' circuit."""
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     response = ResponseSettings(
         np.eye(3) * plant.inertia,

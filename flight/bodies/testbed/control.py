@@ -42,10 +42,10 @@ from knightcube.reference.control import AdaptiveController, AdaptiveSettings, P
 
 
 class BdotLaw:
-    """Commands the detumbler's currents; implements `flight.loop.body.WindowedLaw`."""
+    """B-dot detumbling; implements `flight.loop.body.WindowedLaw`."""
 
     def __init__(self, detumbler: Detumbler, dipole_per_ampere: float) -> None:
-        """Take n A of each coil, m^2."""
+        """`dipole_per_ampere` is n A of each coil (m^2)."""
         self._detumbler = detumbler
         self._dipole_per_ampere = dipole_per_ampere
 
@@ -63,7 +63,7 @@ class BdotLaw:
         return CoilCommand(currents * self._dipole_per_ampere, currents)
 
     def sent(self, currents: FloatArray) -> None:
-        """Do nothing: B-dot needs no model of the motion."""
+        """Do nothing, because B-dot needs no model of the motion."""
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes now; None before it is known."""
@@ -76,7 +76,7 @@ def controller_of(
     period: float,
     identification: Identification,
 ) -> AngleController:
-    """Return the controller of `plant` that `section` chooses, called every `period` s."""
+    """Return the controller of `plant` that `section` selects, for a period (s)."""
     if section.tracker == "excitation":
         move = identification
         return ExcitationController(
@@ -99,7 +99,7 @@ def controller_of(
 
 
 class ThreadTracker:
-    """Implements `flight.loop.body.Tracker` with the coil on body x (Sease 5.4)."""
+    """Tracks a path with the coil on body x (Sease 5.4); implements `flight.loop.body.Tracker`."""
 
     def __init__(self, controller: AngleController, reader: ThreadReader, dipole_per_ampere: float) -> None:
         self._controller = controller
@@ -114,24 +114,24 @@ class ThreadTracker:
         return CoilCommand(self._dipole * currents, currents, wanted.saturated)
 
     def reset(self) -> None:
-        """Forget integrated errors."""
+        """Discard integrated errors."""
         self._controller.reset()
 
 
 AHEAD = 20.0
-"""s, predicted at once, in a millisecond or two."""
+"""Span (s) of one prediction, which takes a millisecond or two."""
 _UNIX_EPOCH = 2_440_587.5
 _ROUND = 6_000.0, 60.0
-"""s: about a revolution of a low orbit, and the pace at which the weakest field is looked for."""
+"""Span (s) of about one revolution, and step (s), of the search for the weakest field."""
 _ACROSS: FloatArray = np.array([1.0, 0.0, 1.0])
-"""The components that the cage renders."""
+"""Mask of the field components that the cage renders."""
 
 
 class CageField:
-    """Owns the prediction of the cage's field by the clock."""
+    """Predicts the cage's field at any time of the clock."""
 
     def __init__(self, section: Cage, weakest: float, clock: Clock) -> None:
-        """Predict for `section`. Raises ConfigError for no elements, and a field below `weakest` T."""
+        """Raise ConfigError for malformed elements, or a field that falls below `weakest` (T)."""
         try:
             self._elements = TwoLineElements(*section.elements)
         except UsageError as error:
@@ -152,7 +152,7 @@ class CageField:
         near = self._near
         seconds = math.inf if near is None else (self._date(now_ns) - near.julian_date) * DAY
         if near is None or not 0.0 <= seconds <= AHEAD:
-            # A little before: late measurements ask for the past.
+            # The prediction begins a second earlier, for late measurements.
             state = self._elements.at(self._date(now_ns) - 1.0 / DAY)
             near = self._near = predict(state, AHEAD)
             self._local = np.array(
@@ -173,7 +173,7 @@ class CageField:
         return self._date_zero + now_ns / (DAY * SECOND_NS)
 
     def _weakest(self, now_ns: int) -> float:
-        """Return the least strength of the rendered field over a revolution from now on, T."""
+        """Return the minimum strength (T) of the rendered field over a revolution from now on."""
         least = math.inf
         for seconds in np.arange(0.0, *_ROUND):
             date = self._date(now_ns) + float(seconds) / DAY
@@ -195,24 +195,24 @@ def local_frame(position: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 class CageFilter(AttitudeFilter):
-    """The testbed's filter, which uses the cage's field of each command's time."""
+    """The testbed's filter, which uses the cage's field at the time of each command."""
 
     def __init__(
         self, cage: CageField, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None
     ) -> None:
-        """Filter for `body` in the field of `cage`."""
+        """Start the filter of `body` in the field of `cage`."""
         super().__init__(body, settings, prior)
         self._cage = cage
 
     def command(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None = None, known: bool = True
     ) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on, in the cage's field of that time."""
+        """Record the coil currents (3,) A in force from `time_ns` on, with the cage's field at that time."""
         super().command(time_ns, currents, self._cage.at(time_ns) if field is None else field, known)
 
 
 class CageTracker:
-    """Makes the torque that another tracker wants of coil x with the coils x and z in the cage's field."""
+    """Makes the torque of another tracker for coil x with the coils x and z in the cage's field."""
 
     def __init__(
         self,
@@ -230,7 +230,7 @@ class CageTracker:
         self._dipole = dipole
 
     def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
-        """Return the command that makes the torque, of the least current."""
+        """Return the command that makes the torque with the least current."""
         wanted = self._inner.command(estimate, reference)
         angle = self._read(estimate).angle
         torque = self._plant.torque_constant * float(wanted.currents[0]) * math.cos(angle)
@@ -244,5 +244,5 @@ class CageTracker:
         return CoilCommand(self._dipole * currents, currents, wanted.saturated or excess > 1.0)
 
     def reset(self) -> None:
-        """Forget integrated errors."""
+        """Discard integrated errors."""
         self._inner.reset()

@@ -22,7 +22,6 @@ from flight.link.telemetry.definitions import MAX_NODES, PLAN
 from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
 from flight.loop.executive import Cycle, JobResult
 from flight.loop.facts import Services
-from flight.schema.sections import CONTROL_RATE_HZ
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
@@ -51,14 +50,8 @@ def plant_of(config: TestbedConfig) -> SingleAxisPlant:
     )
 
 
-def angular_acceleration_psd_of(config: TestbedConfig, plant: SingleAxisPlant) -> float:
-    """Return the power spectral density of the angular acceleration due to current noise, rad^2/s^3."""
-    noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
-    return noise**2 / CONTROL_RATE_HZ
-
-
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
-"""Limits of the estimated coil gain: beyond them the filter has not converged."""
+"""Limits of the estimated coil gain, beyond which the filter has not converged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +75,7 @@ class ThreadEstimate:
 
 
 def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstimate:
-    """Return the turn about the thread; exact for a suspended body.
+    """Return the rotation about the thread, which is exact for a suspended body.
 
     The disturbance is the acceleration that a plant with the parameters of `model` does not explain, scaled
     so that the holding current of that plant is the holding current of the body.
@@ -107,14 +100,14 @@ def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstim
 
 
 class ThreadReader:
-    """Computes the turn about the thread from an estimate, once for each estimate."""
+    """Computes the rotation about the thread from an estimate, once for each estimate."""
 
     def __init__(self, model: Parameters) -> None:
         self._model = model
         self._last: tuple[Estimate, ThreadEstimate] | None = None
 
     def read(self, estimate: Estimate) -> ThreadEstimate:
-        """Return the turn about the thread."""
+        """Return the rotation about the thread."""
         if self._last is None or self._last[0] is not estimate:
             self._last = estimate, about_thread(estimate, self._model)
         return self._last[1]
@@ -129,7 +122,7 @@ class ThreadLaw:
 
     @property
     def text(self) -> str:
-        """The law in words, for events."""
+        """The law as text, for events."""
         return f"q2 {self.q2:+.3f}"
 
     def quaternion(self, now_ns: int) -> FloatArray:
@@ -217,7 +210,7 @@ class Planning:
         return self._accepted, self._refused
 
     def busy_since_ns(self) -> int | None:
-        """Return since when the worker has been planning, None while idle."""
+        """Return when the worker began its plan (ns); None while it is idle."""
         return None if self._job is None else self._asked_ns
 
     def aim(self, target: Target, now_ns: int) -> None:

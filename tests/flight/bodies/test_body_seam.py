@@ -57,9 +57,9 @@ def test_a_third_partys_body_is_flown_by_its_name(tmp_path: Path) -> None:
     ("name", "complaint"),
     [
         ("orbiter", "name one of testbed"),
-        ("no_such_module:BODY", "cannot be had"),
-        ("tests.flight.bodies.plain_body:MISSING", "cannot be had"),
-        ("tests.flight.bodies.plain_body:NO_BODY", "no BodyKind"),
+        ("no_such_module:BODY", "cannot be loaded"),
+        ("tests.flight.bodies.plain_body:MISSING", "cannot be loaded"),
+        ("tests.flight.bodies.plain_body:NO_BODY", "not a BodyKind"),
     ],
 )
 def test_a_body_that_is_not_there_is_one_clear_line(name: str, complaint: str) -> None:

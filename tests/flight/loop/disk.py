@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from flight.loop.state import LinuxFiles
+
 Names = dict[Path, int]
 
 
@@ -23,7 +25,7 @@ class _Inode:
     cached: bytes
 
 
-class Disk:
+class Disk(LinuxFiles):
     """A file system: content is safe after sync, names after sync_folder, everything else is open.
 
     `calls` counts the calls that change something. Before call number `stop_before` the power fails, or, when

@@ -1,4 +1,4 @@
-"""SAFE's seeker takes the strings' Sun, and says once whether there is one and why not."""
+"""Sun acquisition accepts the Sun of the solar cells, and reports once whether there is a Sun."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FIELD = np.array([2e-5, 0.0, 3e-5])
 
 
 class Seen:
-    """The seeker with the events that it reported."""
+    """The law of Sun acquisition with the events that it reported."""
 
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
@@ -27,8 +27,8 @@ class Seen:
             WindowSchedule(SECOND_NS // 10, SECOND_NS // 10, 18 * SECOND_NS // 10),
             SunAcquisitionSettings(inertia=np.full(3, 1e-3), axis=np.array([1.0, 0.0, 0.0]), limit=0.1),
         )
-        self.seeker = SunAcquisitionLaw(law, SolarStringModel(), 0.648, EventLog(self._tell))
-        self.seeker.begin(0)
+        self.law = SunAcquisitionLaw(law, SolarStringModel(), 0.648, EventLog(self._tell))
+        self.law.begin(0)
 
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:
         self.told.append((kind.name, text))
@@ -39,9 +39,9 @@ class Seen:
         for tenth in range(10 * begin + 1, 10 * end):
             now_ns = tenth * SECOND_NS // 10
             if currents is not None and tenth % 10 == 0:
-                self.seeker.see(StringReading(now_ns, currents))
-            self.seeker.sample(now_ns, FIELD + noise * (tenth % 2), np.zeros(3))
-            command = self.seeker.command(now_ns)
+                self.law.update_sun(StringReading(now_ns, currents))
+            self.law.sample(now_ns, FIELD + noise * (tenth % 2), np.zeros(3))
+            command = self.law.command(now_ns)
             acted = (acted and tenth < 10 * end - 20) or bool(command.currents.any())
             np.testing.assert_allclose(command.currents * 0.648, command.dipole)
         return acted
