@@ -1,12 +1,16 @@
-"""A partly overwritten frame is detected by its rows; a working camera's frames never are."""
+"""Frames of the star camera: rows of an earlier frame, pixels without stars, and mid-exposure."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from flight.loop.imaging import RepeatedRows
+from flight.loop.imaging import RepeatedRows, is_strange, middle_ns
+from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import Image
+from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.startracker.detection.survey import FrameKind
+from knightcube.vision.startracker.solve import FrameSolution, SolveStatus
 
 RNG = np.random.default_rng(8)
 
@@ -47,3 +51,28 @@ def test_rows_without_noise_say_nothing() -> None:
         frame[:, 40] = 255
         frame[200, 100 + number] = 60
         assert rows.look(frame) == 0
+
+
+@pytest.mark.parametrize(
+    ("status", "stars", "strange"),
+    [
+        (SolveStatus.NO_MATCH, 12, True),
+        (SolveStatus.NO_MATCH, 11, False),
+        (SolveStatus.SOLVED, 40, False),
+        (SolveStatus.AMBIGUOUS, 40, False),
+    ],
+)
+def test_only_a_frame_of_many_stars_without_a_match_is_strange(
+    status: SolveStatus, stars: int, strange: bool
+) -> None:
+    camera = Pinhole(320, 240, 400.0)
+    solution = FrameSolution(status, "", FrameKind.POINTS, camera, points=np.zeros((stars, 2)))
+    assert is_strange(solution) is strange
+    assert not is_strange(None)
+
+
+@pytest.mark.parametrize(("start_ns", "exposure_ns", "middle"), [(100, 10, 105), (100, 11, 105), (0, 0, 0)])
+def test_mid_exposure_is_half_an_exposure_after_its_start(
+    start_ns: int, exposure_ns: int, middle: int
+) -> None:
+    assert middle_ns(Frame(1, start_ns, exposure_ns, start_ns, exposed())) == middle
