@@ -49,7 +49,7 @@ class KeptConfig:
 
 
 def kept_configs(folder: Path) -> list[KeptConfig]:
-    """Return the whole configurations kept in a state folder, the newest first. Raises OSError."""
+    """Return the undamaged configurations kept in a state folder, the newest first. Raises OSError."""
     found = []
     for number, path, digest in _named(folder):
         with suppress(OSError, UnicodeDecodeError):
@@ -60,10 +60,10 @@ def kept_configs(folder: Path) -> list[KeptConfig]:
 
 
 class FlownConfig:
-    """Keeps the configuration of a flight that has started well."""
+    """Stores the configuration of a flight that has started well."""
 
     def __init__(self, text: str, folder: Path) -> None:
-        """Take the configuration's text as read, and the state folder."""
+        """Prepare the storage of `text`, the configuration as read, in a state folder."""
         self._data = text.encode()
         self._folder = folder
         self._kept = False
@@ -73,7 +73,7 @@ class FlownConfig:
         return clock.ticker("configuration", GOOD_START_NS, self.keep)
 
     def keep(self) -> None:
-        """Write the copy, unless it is the newest already; a failed write is retried next time."""
+        """Write the copy unless the newest copy is the same; a failed write is retried at the next call."""
         if self._kept:
             return
         with suppress(OSError):
@@ -85,22 +85,19 @@ class FlownConfig:
                 name = f"{number:06d}-{hashlib.sha256(self._data).hexdigest()}.yaml"
                 replace_file(LinuxFiles(), place / name, self._data)
                 kept = kept_configs(self._folder)
-            self._drop_others(kept)
+            # The newest copies of `KEPT` different texts stay; damaged and older copies go.
+            texts: dict[str, Path] = {}
+            for copy in kept:
+                texts.setdefault(copy.text, copy.path)
+            staying = set(list(texts.values())[:KEPT])
+            for _, path, _ in _named(self._folder):
+                if path not in staying:
+                    path.unlink(missing_ok=True)
             self._kept = True
-
-    def _drop_others(self, kept: list[KeptConfig]) -> None:
-        """Remove damaged copies, and all but the newest of each text; the newest `KEPT` texts stay."""
-        texts: dict[str, Path] = {}
-        for one in kept:
-            texts.setdefault(one.text, one.path)
-        staying = set(list(texts.values())[:KEPT])
-        for _, path, _ in _named(self._folder):
-            if path not in staying:
-                path.unlink(missing_ok=True)
 
 
 def _named(folder: Path) -> list[tuple[int, Path, str]]:
-    """Return number, path and digest of whatever has the name of a kept configuration. Raises OSError."""
+    """Return number, path and digest of the files named like a kept configuration. Raises OSError."""
     place = folder / FOLDER
     try:
         paths = list(place.iterdir())
@@ -112,7 +109,7 @@ def _named(folder: Path) -> list[tuple[int, Path, str]]:
 
 _CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
 _TRIES = 3
-"""Attempts to read a file: a single failed disk access is not damage."""
+"""Number of attempts to read a file, because a single failed disk access is not damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +118,8 @@ class Chosen:
 
     Attributes:
         path: the file that `text` was read from.
-        problem: why `path` is not the requested file, empty where it is.
-        accepted: whether its bytes are those of a checksum beside the requested file.
+        problem: why `path` is not the requested file; empty if it is.
+        accepted: whether a checksum beside the requested file confirms the bytes.
     """
 
     path: Path
@@ -152,7 +149,7 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
     for one in kept:
         try:
             configuration.parse(one.text, str(one.path))
-        except ConfigError:  # it flew with another version of the software
+        except ConfigError:  # the copy flew with another version of the software
             continue
         return Chosen(one.path, one.text, f"{path}: {problem}: the last one that flew is flown; {_CURE}")
     if os.path.lexists(sum_file(path)) or folder is not None:
@@ -161,7 +158,7 @@ def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
 
 
 def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes | None, str, bool]:
-    """Return a file's bytes, the problem, empty for none, and whether a sum confirms them."""
+    """Return a file's bytes, its problem or an empty text, and whether a checksum confirms the bytes."""
     try:
         data = _persistently(read, path)
         expected = _persistently(LinuxFiles().read, sum_file(path))
@@ -177,7 +174,7 @@ def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes |
 
 
 def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | None:
-    """Read a file, again after an error. Raises OSError."""
+    """Read a file with retries. Raises OSError."""
     for _ in range(_TRIES - 1):
         with suppress(OSError):
             return read(path)
@@ -185,7 +182,7 @@ def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | N
 
 
 def _read_any(path: Path) -> bytes | None:
-    """Return a bounded number of bytes of any kind of file: a person may fly a pipe."""
+    """Return a bounded number of bytes of any kind of file, for example a pipe."""
     try:
         with path.open("rb") as file:
             return file.read(4 * LARGEST_FILE + 1)
@@ -194,7 +191,7 @@ def _read_any(path: Path) -> bytes | None:
 
 
 def _text(path: Path, data: bytes) -> str:
-    """Return a configuration's text. Raises ConfigError for bytes that are none."""
+    """Return a configuration's text. Raises ConfigError for bytes that are not UTF-8."""
     try:
         return checked_length(data.decode("utf-8"), path)
     except UnicodeDecodeError as error:
@@ -204,8 +201,8 @@ def _text(path: Path, data: bytes) -> str:
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
     """Return the configuration as text and as values, with the request's changes in the values.
 
-    `text` is the file as it was read; without it the file is read. Raises ConfigError for the file's
-    mistakes, UsageError for the request's.
+    `text` is the content of the file; if None, the file is read. Raises ConfigError for a mistake in the
+    file, UsageError for a mistake in the request.
     """
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))

@@ -53,21 +53,21 @@ from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_m
 
 
 def fault_catalogue() -> tuple[str, str]:
-    """Return how faults of a simulation are written, and a list of all."""
+    """Return the grammar of simulated faults, and a list of all faults."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.fault_catalogue()
 
 
 def corrupted_text(request: RunRequest, text: str) -> str:
-    """Return a configuration as the requested faults corrupt it; unchanged where none does."""
+    """Return a configuration's text with the corruption that the requested faults cause."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.corrupted_text(request.faults, text, request.seed)
 
 
 def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
-    """Return the faults of a flight as they are written, the configuration's first."""
+    """Return the faults of a flight as texts, beginning with the configuration's."""
     from sim_hal import rig  # noqa: PLC0415
 
     return rig.injected_faults(_simulation_request(request, text))
@@ -103,7 +103,7 @@ def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; all but unit and coils are optional, those of an orbit come last."""
+    """The open devices; a device is None or empty if the configuration does not have it."""
 
     unit: InertialUnit
     coils: TorqueCoils
@@ -117,7 +117,7 @@ class Devices:
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
     """Open the devices, the coils first, so that they are at zero before anything else happens.
 
-    Raises DeviceError for a device that does not answer; the drivers of a `patient` flight keep trying.
+    Raises DeviceError for a device that does not answer; a `patient` flight retries instead.
     """
     coils = PwmTorqueCoils(
         Pca9685(rig.wires.i2c, config.coils.address, rig.clock), rig.clock, coil_settings(config)
@@ -138,13 +138,12 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
         stack.callback(camera.close)
     for wide in rig.wires.wide:
         stack.callback(wide.close)
-    gps = open_gps(config, rig, stack)
-    strings = open_strings(config, rig, stack)
+    gps, strings = open_gps(config, rig, stack), open_strings(config, rig, stack)
     return Devices(unit, coils, power, camera, gps, strings, rig.wires.wide)
 
 
 def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None:
-    """Open the GPS receiver where one is configured; it is set up while it is read."""
+    """Open the GPS receiver; None if it is not configured. Its first readings set it up."""
     if config.gps is None or rig.wires.gps is None:
         return None
     gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS))
@@ -153,7 +152,7 @@ def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None
 
 
 def open_strings(config: Config, rig: Rig, stack: ExitStack) -> AdsSolarStrings | None:
-    """Open the solar strings' converters where they are configured."""
+    """Open the converters of the solar cells; None if they are not configured."""
     section = config.solar_strings
     if section is None:
         return None
@@ -164,7 +163,7 @@ def open_strings(config: Config, rig: Rig, stack: ExitStack) -> AdsSolarStrings 
 
 
 def check_settings(config: Config) -> None:
-    """Refuse a value that a driver does not take. Raises ConfigError with the driver's range."""
+    """Raise ConfigError, with the driver's range, for a value that a driver does not accept."""
     for section, settings in (("coils", coil_settings), ("inertial_unit", unit_settings)):
         try:
             settings(config)
@@ -200,7 +199,7 @@ def unit_settings(config: Config) -> Vn100Settings:
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     """Open the wires, and switch the coils off before anything else can fail.
 
-    Raises ConfigError; DeviceError for missing hardware, but `patient` wires are opened once they appear.
+    Raises ConfigError, or DeviceError for missing hardware; a `patient` flight waits for it instead.
     """
     clock = SystemClock()
     i2c = LinuxI2cBus(config.coils.bus, patient=patient, exclusive=True)
@@ -228,7 +227,7 @@ def linux_camera(
 ) -> FrameSource:
     """Open the configured camera.
 
-    Raises ConfigError when none is named; DeviceError, but a `patient` camera is opened once it appears.
+    Raises ConfigError if none is named, or DeviceError for missing hardware; a `patient` flight waits for it.
     """
     device, shape = camera.device, (camera.columns, camera.rows)
     exposure_ns = round(camera.exposure * SECOND_NS)

@@ -39,7 +39,7 @@ from knightcube.errors import FlightError
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 30.0
 _MEAL_NS = 200_000_000
 _ATTEMPT_S = 30.0
-"""The service manager is asked for this time for each attempt."""
+"""Extension (s) of the start's timeout that each attempt requests from the service manager."""
 
 J = TypeVar("J")
 T = TypeVar("T")
@@ -50,10 +50,10 @@ class StoppedError(FlightError):
 
 
 class StartRetry:
-    """Waits between the attempts of a start: reports, feeds the watchdog, notices signals."""
+    """Waits between the attempts of a start, reports their problems, and feeds the watchdog."""
 
     def __init__(self, interrupted: Callable[[], bool], clock: Clock | None = None) -> None:
-        """Take a function that says whether a signal has come."""
+        """`interrupted` returns whether a signal has arrived."""
         self._interrupted = interrupted
         self._clock = clock or SystemClock()
         self._overseer = ServiceManager(os.environ, os.getpid())
@@ -62,12 +62,12 @@ class StartRetry:
         self._problem = ""
 
     def summary(self) -> str:
-        """Return how the start went, empty when it succeeded at once."""
+        """Return the number and the duration of the attempts; empty if the first attempt succeeded."""
         begun = f"begun at try {self._failed + 1} after {self._waited:.1f} s"
         return f"{begun}: {self._problem}" if self._failed else ""
 
     def wait(self, problem: str, pause: float) -> None:
-        """Wait `pause` s because of a problem. Raises StoppedError when a signal comes."""
+        """Wait `pause` (s) because of a problem. Raises StoppedError if a signal arrives."""
         self._failed += 1
         self._waited += pause
         self._problem = problem
@@ -91,10 +91,10 @@ class StartRetry:
 def retried_start(
     judge: Callable[[], J], attempt: Callable[[J, ExitStack], T], stack: ExitStack, retry: StartRetry
 ) -> T:
-    """Return the result of the first attempt that succeeds; `stack` closes what that one opened.
+    """Return the result of the first attempt that succeeds; `stack` closes what it opened.
 
-    Each attempt begins with `judge`, which reads a configuration and judges it, and gives it to `attempt`.
-    Raises UsageError for one that was judged wrong, StoppedError.
+    Each attempt reads and validates a configuration by `judge`, and opens it by `attempt`. Raises UsageError
+    for an invalid configuration, StoppedError after a signal.
     """
     for pause in pauses():
         try:
@@ -125,10 +125,10 @@ _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class EndingSignals:
-    """Ends a flight after the running cycle, or at its first cycle when a signal comes while it opens.
+    """A context that ends a flight after the running cycle when a signal arrives.
 
-    A second signal before the first cycle interrupts the opening. A SIGHUP that the process ignores, as under
-    nohup, stays ignored. As a context the signals are taken for its duration.
+    A signal during the opening ends the flight at its first cycle, and a second signal interrupts the
+    opening. A SIGHUP that the process ignores, as under nohup, stays ignored.
     """
 
     def __init__(self) -> None:
@@ -138,17 +138,17 @@ class EndingSignals:
 
     @property
     def received(self) -> bool:
-        """Whether a signal has come."""
+        """Whether a signal has arrived."""
         return bool(self._received)
 
     def end(self, loop: FlightLoop) -> None:
-        """End this flight when a signal comes, at once when one has come already."""
+        """End this flight when a signal arrives, or at once if a signal has arrived."""
         self._loop = loop
         if self._received:
             self._stop(self._received[0])
 
     def __enter__(self) -> EndingSignals:
-        # Signals come to the main thread alone; they do not end a flight in another, as a Dask worker's is.
+        # Only the main thread receives signals, so they do not end a flight in another thread.
         if threading.current_thread() is not threading.main_thread():
             return self
         for number in _ENDING:
@@ -180,10 +180,10 @@ _KEPT = 4
 
 
 class FlownRelease:
-    """The release of this flight; without a name there is nothing to prove."""
+    """The release of this flight; without a name the flight proves no release."""
 
     def __init__(self, environment: Mapping[str, str]) -> None:
-        """Take the process's environment."""
+        """Read the release's name and note from the process's environment."""
         self._name = environment.get(NAME, "")
         self.note = environment.get(NOTE, "")
         folder = service_folder(environment)
@@ -191,12 +191,12 @@ class FlownRelease:
         self._done = False
 
     def serve(self, clock: Clock, stack: ExitStack) -> None:
-        """Prove the release in time, outside the loop, until `stack` is closed."""
+        """Prove the release after `PROVEN_NS`, outside the loop, until `stack` is closed."""
         if self._path is not None:
             stack.callback(clock.ticker("release", PROVEN_NS, self.prove).stop)
 
     def prove(self) -> None:
-        """Write that this release has flown; a failed write is retried a minute later."""
+        """Record that this release has flown; a failed write is retried a minute later."""
         if self._path is None or self._done:
             return
         with suppress(OSError):
@@ -205,7 +205,7 @@ class FlownRelease:
             self._done = True
 
     def end(self) -> None:
-        """Forgive the starts of a release that ends by itself, proven or not."""
+        """Reset the count of starts of a release that ends by itself, proven or not."""
         if self._path is not None:
             with suppress(OSError):
                 self._write(_proven(self._path))

@@ -2,11 +2,11 @@
 
 The external supervisors are the guardian of the coils and the service manager. The loop calls `beat` at the
 end of every control cycle without an error, and `feed` while nothing is stalled. A running loop does not
-prove that commands reach the coils: heartbeats are passed on only while the coil driver's job runs. The first
-heartbeat also reports READY: the devices are open and the loop runs.
+prove that commands reach the coils, so heartbeats are passed on only while the coil driver's job runs. The
+first heartbeat also reports READY, because the devices are open and the loop runs.
 
-glibc raises its threshold as large blocks are freed (mallopt(3)): frames then come from the heap, small
-blocks fragment it, and the heap grows. With another libc these functions have no effect on the heap.
+When large blocks are freed, glibc raises its mmap threshold (mallopt(3)). Frames are then allocated on the
+heap, small blocks fragment the heap, and it grows. Fixed thresholds prevent this; another libc ignores them.
 """
 
 from __future__ import annotations
@@ -30,19 +30,18 @@ from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import SECOND_NS, Clock, Rig, Ticker
 
 LARGE_BYTES = 256 * 1024
-"""Blocks of at least this size are mapped separately, and returned to the kernel when freed."""
+"""Size (bytes) from which a block is mapped separately, and returned to the kernel when freed."""
 SPARE_BYTES = 4 * 1024 * 1024
-"""Free memory kept at the heap's top, so that cycles do not call the kernel each time."""
+"""Free memory (bytes) kept at the heap's top, so that cycles seldom call the kernel."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 
 
 def settle_memory() -> None:
-    """Set the thresholds, exempt all present objects from garbage collection, and stop collecting by itself.
+    """Set the heap's thresholds, and replace the automatic garbage collection by a `Collector`.
 
-    Call when all is built, and a `Collector` now and then: the flight makes no garbage that only a collection
-    finds, but a failure may. Collections then come at a known time, and examine only objects made since, not
-    modules and tasks, which would take tens of ms of a control cycle.
+    Call this once the flight is built. All present objects are exempt from collections, which would otherwise
+    take tens of ms of a control cycle to examine modules and tasks.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -54,10 +53,10 @@ def settle_memory() -> None:
 
 
 class Collector:
-    """Collects the garbage that was made since its last call, and exempts the survivors from later calls.
+    """Collects the garbage since its last call, and exempts the surviving objects from later calls.
 
-    Call it every few seconds: windows of measurements hold tens of thousands of objects a minute old or less,
-    and looking at all of them takes 2 ms. The first call only exempts the objects of the flight's start.
+    Only a failure makes garbage that needs a collection. Called every few seconds, a collection examines few
+    objects and takes at most 2 ms. The first call only exempts the objects of the flight's start.
     """
 
     def __init__(self) -> None:
@@ -72,9 +71,9 @@ class Collector:
 
 
 _THROTTLE_NS = 1_000_000_000
-"""Of the supervision's events: a guardian is replaced at most once per second."""
+"""Throttle (ns) of the supervision's events; a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""After this time without a run of the coil driver's job (three periods) the guardian should act."""
+"""Longest time (ns) without a run of the coil driver's job, three of its periods, before heartbeats stop."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,
@@ -84,12 +83,8 @@ _EVENTS = {
 }
 
 
-def _nothing() -> None:
-    """No-op."""
-
-
 class Supervision:
-    """Passes heartbeats on; reports the guardian's state changes as events."""
+    """Passes heartbeats to the guardian, and reports its state changes as events."""
 
     def __init__(
         self,
@@ -99,16 +94,17 @@ class Supervision:
         recorder: Recorder,
         status: str,
         coils: Ticker,
-        settle: Callable[[], None] = _nothing,
+        settle: Callable[[], None] | None = None,
     ) -> None:
-        """Take the supervisors; `status` is shown to people once ready, `coils` is the coil driver's job.
+        """Connect the supervisors with the coil driver's job `coils`.
 
-        `settle` is called once, before READY is reported: all parts of the flight exist by then.
+        Once ready, the service manager shows `status`. `settle` is called once, before READY is reported,
+        when all parts of the flight exist.
         """
         self._guardian = guardian
         self._overseer = overseer
         self._clock = clock
-        # A log of its own: events occur before there is a loop, and none of them needs a reaction.
+        # A separate log, because events occur before there is a loop, and none of them needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
         self._status = status
         self._coils = coils
@@ -127,7 +123,8 @@ class Supervision:
         self._guardian.beat()
         if not self._ready:
             self._ready = True
-            self._settle()
+            if self._settle is not None:
+                self._settle()
             self._overseer.ready(self._status)
 
     def close(self) -> None:
