@@ -29,9 +29,9 @@ from knightcube.vision.frame_job import StreakEstimator
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 
 COMMANDED = 1000
-"""Commanded slews are numbered from here on."""
+"""Number of the first commanded slew."""
 KEPT = -1
-"""The number of an attitude that is only held: no step or slew reaches it, and no packet carries it."""
+"""Number of an attitude that is only held; no packet has it."""
 
 
 class Reference(Protocol):
@@ -67,7 +67,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilCommand:
-    """A tracker's command: the dipole (3,) A m^2, and the currents (3,) A that make the dipole."""
+    """A tracker's command: the dipole (3,) A m^2, and the currents (3,) A that make it."""
 
     dipole: FloatArray
     currents: FloatArray
@@ -106,9 +106,9 @@ class ControlOutput:
     """The results of one control cycle.
 
     Attributes:
-        estimate: measured, or propagated by the model alone; None without one.
-        target: in force, None before the first.
-        written: the coil command on the wire at the end of the cycle.
+        estimate: measured, or propagated by the model alone; None without an estimate.
+        target: target in force; None before the first target.
+        written: coil command on the wire at the end of the cycle.
     """
 
     cycle: Cycle
@@ -128,8 +128,8 @@ class ReadingAgreement:
     """How a reading of the inertial unit agrees with the estimate.
 
     Attributes:
-        holds: whether at least a part of it agrees, so that the estimate counts as measured.
-        objection: the part that does not agree, as text; empty when all does.
+        holds: whether at least a part agrees, so that the estimate counts as measured.
+        objection: the part that does not agree, as text; empty if all parts agree.
     """
 
     holds: bool
@@ -152,39 +152,39 @@ class Filter(Protocol):
         """Whether the body does not move as commanded, so that the coil currents are unknown."""
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on; only a guess unless `known`."""
+        """Record the coil currents (3,) A in force from `time_ns` on, and whether they are known."""
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the currents recorded since then as unknown: they may not have flown."""
+        """Treat the currents recorded since a time as unknown."""
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times; `applied` is called with which of them passed the gate."""
+        """Apply measurements of past times; `applied` is called with whether each passed the gate."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Continue with late measurements by `most` steps, or to their end."""
+        """Continue with late measurements by at most `most` steps, or to the end."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself does not change."""
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, None beyond the history."""
+        """Return the estimate at a past time; None beyond the history."""
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
 
 
 class ReadingFeed(Protocol):
-    """Gives the filter the quantities of a reading that have a meaning for this body."""
+    """Gives the filter the quantities of a reading that this body uses."""
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
         """Start the filter from a reading, or apply it."""
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start the filter from an attitude of the stars, without an estimate; return whether it did."""
+        """Start a filter without an estimate from a star fix; return whether it started."""
 
 
 class WindowedLaw(Protocol):
-    """Brakes a tumble by magnetometer and gyro, in windows in which the coils pause."""
+    """Drives the coils by magnetometer and gyro alone, in windows with a pause of the coils."""
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
@@ -196,7 +196,7 @@ class WindowedLaw(Protocol):
         """
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now: zero while the field is measured or the rate is not known."""
+        """Return the command now, which is zero while the field is measured or the rate is unknown."""
 
     def sent(self, currents: FloatArray) -> None:
         """Accept the currents (3,) A that were sent, which differ from the command if a coil is excluded."""
@@ -212,20 +212,20 @@ class Tracker(Protocol):
         """Return the command that keeps the body on the reference."""
 
     def reset(self) -> None:
-        """Forget integrated errors: the coils were off, or the estimate was lost."""
+        """Discard integrated errors after a time with the coils off or without an estimate."""
 
 
 class FlownPaths(Protocol):
     """The path being flown."""
 
     def sample(self, now_ns: int) -> Any | None:
-        """Return the `Reference` now; None when there is no path yet."""
+        """Return the `Reference` now; None without a path."""
 
     def is_following(self, now_ns: int) -> bool:
         """Return whether a path is being followed, rather than its end held."""
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether an attitude is held only because no plan arrived in time."""
+        """Return whether an attitude is held because no plan arrived in time."""
 
     def release(self) -> None:
         """Discard the path."""
@@ -235,13 +235,13 @@ class Planner(Protocol):
     """Requests paths from the worker and offers them to guidance."""
 
     def busy_since_ns(self) -> int | None:
-        """Return since when the worker has been planning, None while idle."""
+        """Return when the worker began its plan (ns); None while it is idle."""
 
     def aim(self, target: Target, now_ns: int) -> None:
         """Set a new target, and request a plan for it at once."""
 
     def request(self, now_ns: int) -> None:
-        """Request a plan, made once there is an estimate and the worker is free."""
+        """Request a plan, which is made once there is an estimate and the worker is free."""
 
     def resume(self, now_ns: int) -> None:
         """Request the rest of a path after a time without control."""
@@ -256,7 +256,7 @@ class Planner(Protocol):
         """Offer the worker's plan to guidance."""
 
     def counts(self) -> tuple[int, int]:
-        """Return how many plans were accepted and refused since the start."""
+        """Return the numbers of plans accepted and refused since the start."""
 
 
 class BodyTargets(Protocol):
@@ -269,19 +269,19 @@ class BodyTargets(Protocol):
         """Return the target of a command, in this body's form. Raises UsageError if it cannot be flown."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
-        """Hold the present attitude, as near as the body can; return it as a target."""
+        """Hold the present attitude, as closely as the body can; return it as a target."""
 
     def can_hold(self, estimate: Estimate) -> bool:
         """Return whether the coils could hold the present attitude."""
 
     def speed(self, estimate: Estimate) -> float:
-        """Return the rate of the turn that the coils control, rad/s, not negative."""
+        """Return the magnitude (rad/s) of the body rate that the coils control."""
 
     def error(self, estimate: Estimate, target: Target) -> float:
         """Return the angle between body and target, rad."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle to the attitude due by now, rad; None before one is due."""
+        """Return the angle (rad) to the attitude that is due; None while none is due."""
 
 
 class BodyView(Protocol):
@@ -304,17 +304,17 @@ class BodyView(Protocol):
 
 
 class HorizonCameraUse(Protocol):
-    """The use of the wide cameras' frames by a body."""
+    """The use of the horizon cameras' frames by a body."""
 
     @property
     def needed(self) -> bool:
-        """Whether the cameras are to be read often, because the attitude is poorly known."""
+        """Whether frames are needed often, because the attitude is poorly known."""
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
         """Return the worker's job for frames by their cameras' numbers."""
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Accept Sun and nadir of a time; return whether each of them was used."""
+        """Accept Sun and nadir of a time; return whether each was used."""
 
 
 class BodyEstimation(Protocol):
@@ -326,9 +326,9 @@ class BodyEstimation(Protocol):
     Attributes:
         filter: estimates attitude, rate and the body's parameters.
         feed: passes the readings of the inertial unit to the filter.
-        coil_monitor: compares commanded currents with the supply current and the motion.
+        coil_monitor: detects broken coils.
         learned_problems: why parameters that an earlier boot learned were rejected.
-        wide: makes jobs of the wide cameras' frames and accepts the results; None: they are not used.
+        wide: makes jobs of the horizon cameras' frames and accepts the results; None without these cameras.
     """
 
     filter: Filter
@@ -344,15 +344,15 @@ class BodyEstimation(Protocol):
         """Return the density (3, 3) rad^2/s^3 of the body's white angular acceleration, body axes."""
 
     def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
-        """Return the parameters from which the next boot is to start."""
+        """Return the parameters from which the next boot starts."""
         return learned_of(estimate)
 
     def knowledge(self) -> Knowledge:
-        """Return how well the attitude is known now, if there is an estimate."""
+        """Return how well the attitude is known now."""
         return Knowledge.FINE
 
     def orbit(self, time_ns: int) -> OrbitState | None:
-        """Return the orbit's state at a time; None while it is not known."""
+        """Return the orbit's state at a time; None while the orbit is unknown."""
         return None
 
     def velocity(self, time_ns: int) -> FloatArray | None:
@@ -367,10 +367,7 @@ class BodyEstimation(Protocol):
         return False
 
     def accept_sun(self, reading: StringReading) -> str | None:
-        """Accept a reading of the solar cells; return why it shows no Sun, empty if it does.
-
-        None if the reading was not judged.
-        """
+        """Accept a reading of the solar cells; return its fault, else an empty text; None if not judged."""
         return None
 
 
@@ -382,8 +379,8 @@ class BodyControl(Protocol):
     Attributes:
         modes: the modes that this body has.
         dipole_per_ampere: n A of each coil, m^2.
-        free_axis: (3,) the only axis about which the body can turn; None for a free body.
-        brake: stops a tumble by magnetometer and gyro.
+        free_axis: (3,) the only axis about which the body can rotate; None for a free body.
+        brake: the law of detumbling.
         sun_acquisition: turns the body to the Sun without an attitude, in SAFE; None if the body cannot.
     """
 
@@ -398,7 +395,7 @@ class BodyControl(Protocol):
     sun_acquisition: WindowedLaw | None = None
 
     def follows_objects(self) -> bool:
-        """Return whether an object is searched for or followed, so that no frame is skipped."""
+        """Return whether an object is searched for or followed, so that every frame is needed."""
         return False
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
@@ -406,7 +403,7 @@ class BodyControl(Protocol):
         return
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first time from `from_ns` on at which an exposure meets no step of the coils."""
+        """Return the first time from `from_ns` on with constant coil currents over an exposure."""
         return from_ns
 
 

@@ -42,7 +42,6 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 
 import numpy as np
-import numpy.typing as npt
 
 from flight.loop.coil_response import (
     ELECTRICAL,
@@ -63,16 +62,16 @@ from flight.loop.coil_response import (
     predict,
 )
 from hal.interfaces.devices import CoilState, PowerReading
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
-"""Conversions in a row that must agree."""
+"""Number of ADC samples in a row that must agree."""
 _PATIENCE = 12
-"""Conversions without agreement after which a step is given up."""
+"""Number of ADC samples without agreement after which a step is given up."""
 _PAUSE = 50
-"""Conversions between a rest without a finding and the next rest: control has priority."""
+"""Number of ADC samples between a rest without a finding and the next rest, for control."""
 _UNCLEAR = 20
-"""Conversions in a row whose command is ambiguous, after which there is a rest as a check."""
+"""Number of ADC samples in a row with an ambiguous command, after which there is a rest as a check."""
 
 
 class _Step(Enum):
@@ -87,13 +86,13 @@ class StuckLeg:
     """Searches for a stuck leg: processes ADC samples, requests rest and brakes, and returns an axis.
 
     Attributes:
-        brake: which bridges are to be braked now.
-        rest: whether all commands are to be zero now.
-        suspicion: why there is a search, empty without a suspicion.
+        brake: which bridges to brake now.
+        rest: whether all commands must be zero now.
+        suspicion: reason for the search; empty without a suspicion.
     """
 
     def __init__(self, excess: float) -> None:
-        """Take the excess current, A, that only a fault can draw."""
+        """`excess` is the smallest excess current (A) that indicates a fault."""
         self._excess = excess
         self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
@@ -111,23 +110,23 @@ class StuckLeg:
 
     @property
     def is_searching(self) -> bool:
-        """Whether a search is running: coils at rest, and perhaps braked."""
+        """Whether a search is running, with the coils at rest and perhaps braked."""
         return self.rest
 
     def exceeds(self, supplied: Supplied) -> bool:
-        """Return whether a conversion is more than healthy coils can draw."""
+        """Return whether an ADC sample exceeds the current of healthy coils."""
         return supplied.current > supplied.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Request a rest, unless a search is running or the last rest was too recent."""
+        """Rest, unless a search is running or the last rest was too recent."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 
     def look(self, supplied: Supplied) -> int | None:
-        """Process a conversion; return the axis of a stuck leg when found."""
+        """Process an ADC sample; return the axis of a stuck leg once it is found."""
         self._pause = max(self._pause - 1, 0)
         if self.rest and supplied.driven:
-            return None  # not yet at rest
+            return None  # the coils are not yet at rest
         high = self.exceeds(supplied)
         short = supplied.current < supplied.least - self._excess
         self._high = self._high + 1 if high else 0
@@ -135,7 +134,7 @@ class StuckLeg:
         self._normal = 0 if high or short else self._normal + 1
         self._looks += 1
         if self.is_searching and self._looks > _PATIENCE:
-            self._give_up()  # an intermittent current is no stuck leg
+            self._give_up()  # an intermittent current is not a stuck leg
             return None
         self._unclear = self._unclear + 1 if supplied.spread > self._excess else 0
         if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
@@ -203,7 +202,7 @@ class StuckLeg:
         self._await()
 
     def _release_next(self) -> None:
-        """Release the next bridge; end the search when none is left."""
+        """Release the next bridge; end the search after the last bridge."""
         if not self._left:
             self.reset()
             return
@@ -230,11 +229,11 @@ def _only(axes: Sequence[int]) -> Axes:
 
 
 _PROOFS = 2
-"""Conversions in a row that must agree."""
+"""Number of ADC samples in a row that must agree."""
 
 
 class BrakeProof:
-    """Collects conversions made under brakes that are not confirmed yet."""
+    """Collects ADC samples made under brakes that are not confirmed yet."""
 
     def __init__(self) -> None:
         self._axes: set[int] = set()
@@ -245,7 +244,7 @@ class BrakeProof:
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
-        """Add an axis that is braked on a verdict alone."""
+        """Add an axis whose brake follows from a verdict alone."""
         self._axes.add(axis)
 
     def discard(self, axis: int) -> None:
@@ -253,7 +252,7 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Note whether a conversion shows current despite the brakes; return the axes braked wrongly."""
+        """Accept whether an ADC sample shows current despite the brakes; return the axes braked wrongly."""
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:
             return frozenset()
@@ -266,7 +265,7 @@ class BrakeProof:
 
 @dataclass(frozen=True, slots=True)
 class CoilVerdict:
-    """One broken axis: 0, 1, 2 for x, y, z."""
+    """The fault of one axis, numbered 0, 1, 2 for x, y, z."""
 
     axis: int
     fault: CoilFault
@@ -289,9 +288,9 @@ class CoilMonitorSettings:
         evidence: readings that a verdict needs.
         probe_current: A, of the wave that distinguishes faults of axes at rest.
         probe_half_ns: half the wave's period.
-        response: the body's response to the coils; None where the motion is not used.
-        slow: the same over longer bins, which show currents that the monitor can not tell from none.
-        tumble_rate: rad/s; a coil that looks reversed while the body turns faster rests until it is slower.
+        response: the body's response to the coils; None if the motion is not used.
+        slow: the same over longer bins, which show currents below the noise of the monitor.
+        tumble_rate: rate (rad/s) above which a coil that looks reversed rests until the body is slower.
     """
 
     full_current: tuple[float, float, float]
@@ -310,11 +309,11 @@ class CoilMonitorSettings:
 
 
 _UNSEEN_NS = 600_000_000
-"""The coil driver reads its outputs back twice a second: an error may be this old when found."""
+"""Largest age (ns) of an error when it is detected; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
-"""Four readings of the monitor: `CoilMonitorSettings.persistence` of them in a row begin a suspicion."""
+"""Largest age (ns) of a fault when its suspicion begins, which is four readings of the monitor."""
 STOOD_NS = 200_000_000
-"""If the loop stalls for longer, the guardian may have zeroed the coils."""
+"""Stall of the loop (ns) after which the guardian may have zeroed the coils."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +334,7 @@ class CurrentValidity:
 
 
 class CoilKnowledge:
-    """Checks the coil driver once a cycle."""
+    """Determines once a cycle whether the coil currents are known."""
 
     def __init__(self) -> None:
         self._obeys = True
@@ -346,7 +345,8 @@ class CoilKnowledge:
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
         """Return which currents are known, from the driver's state and the time since the last look.
 
-        `suspected` is whether the supply current fits no healthy circuit: a coil may carry any current then.
+        `suspected` is whether the supply current fits no healthy circuit, so that a coil may carry any
+        current.
         """
         obeyed, self._obeys = self._obeys, not in_force.error
         was_suspected, self._suspected = self._suspected, suspected
@@ -367,7 +367,8 @@ class CoilKnowledge:
 class Probe:
     """Applies a zero-mean square wave to one axis after the other.
 
-    The two halves last `half_ns` each and carry +`current` and -`current` A: they make no mean torque.
+    The two halves last `half_ns` each and carry +`current` and -`current` (A), so that the mean torque is
+    zero.
     """
 
     def __init__(self, current: float, half_ns: int) -> None:
@@ -377,7 +378,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int) -> int | None:
-        """Begin a wave on the next untried of `axes`; return the wave's end, None when all were tried."""
+        """Begin a wave on the next untried axis of `axes`; return its end (ns), None if all were tried."""
         candidates = sorted(axes - self._tried)
         if not candidates:
             self._tried.clear()
@@ -392,7 +393,7 @@ class Probe:
         self._tried.clear()
 
     def wave(self, now_ns: int) -> FloatArray:
-        """Return (3,) A to be added to the commands at `now_ns`."""
+        """Return the currents (3,) A to add to the commands at `now_ns`."""
         wave = np.zeros(3)
         if self._running is not None:
             axis, since_ns = self._running
@@ -404,33 +405,28 @@ class Probe:
         return wave
 
 
-__all__ = ["CoilFault", "CoilMonitor", "CoilMonitorSettings", "CoilVerdict"]
-
 AXES = "xyz"
-
-BoolArray = npt.NDArray[np.bool_]
-
 
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
 _STUCK_EXCESS = 0.3
-"""Of the current of a coil that is fully on: a leg stuck high certainly draws more."""
+"""Excess current of a leg stuck high, at least this fraction of the current of a coil that is fully on."""
 _LEAST_SHORT = 0.02
-"""A; a smaller excess could not be confirmed by the body's motion."""
+"""Smallest excess (A) of a shorted coil that the body's motion can confirm."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
-"""Readings after which a verdict may leave the kind of fault open."""
+"""Number of readings after which a verdict may leave the kind of fault open."""
 _LONGEST_REST_NS = 600_000_000_000
-"""Rest of a coil that looks reversed in a tumble; then it is tried again, however fast the body is."""
+"""Longest rest (ns) of a coil that looks reversed in a tumble, before it is tried again at any rate."""
 
 
 class CoilMonitor:
-    """Judges the coils by the commands and readings of the last seconds.
+    """Detects broken coils from the commands and readings of the last seconds.
 
     Longer than 200 lines because all methods share the state of one suspicion, from detection to verdict.
 
     Attributes:
-        tumble_rate: rad/s, above which no coil is isolated by the motion alone.
+        tumble_rate: rate (rad/s) above which no coil is isolated by the motion alone.
     """
 
     def __init__(self, settings: CoilMonitorSettings) -> None:
@@ -447,14 +443,14 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # from when on a verdict may leave the kind of fault open
-        self._sound_ns = 0  # when a driven coil last drew the expected current
-        self._unmixed_ns = 0  # from when on a reading's mean covers one state of the circuit
+        self._judge_ns = 0  # time after which a verdict may leave the kind of fault open
+        self._sound_ns = 0  # time at which a driven coil last drew the expected current
+        self._unmixed_ns = 0  # time after which a reading's mean covers one state of the circuit
         self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
-        self._weak = ""  # which coil's torque is missing in the motion
+        self._weak = ""  # the coil whose torque is missing in the motion, as text
         self._verdicts: dict[int, CoilVerdict] = {}
         # By resting axis: time at which its rest began, and the reason.
         self._rests: dict[int, tuple[int, str]] = {}
@@ -476,7 +472,7 @@ class CoilMonitor:
 
     @property
     def resting(self) -> BoolArray:
-        """(3,) whether each axis is not to be driven for now, because it looks reversed in a tumble."""
+        """(3,) which axes rest because they look reversed in a tumble."""
         return np.array([axis in self._rests for axis in range(3)])
 
     @property
@@ -497,7 +493,7 @@ class CoilMonitor:
 
     @property
     def braked(self) -> Axes:
-        """Which bridges are to be braked: those with a leg stuck high, and those of a search for one."""
+        """Which bridges to brake: with a leg stuck high, and during the search for such a leg."""
         if not self._verdicts:
             return self._leg.brake
         x, y, z = (
@@ -508,11 +504,11 @@ class CoilMonitor:
 
     @property
     def at_rest(self) -> bool:
-        """Whether all commands are to be zero now, to reveal a leg stuck high."""
+        """Whether all commands must be zero now, to reveal a leg stuck high."""
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Trust an axis again, by command; a lasting fault will be found again."""
+        """Discard the verdict on an axis, by command; a lasting fault is detected again."""
         self._verdicts.pop(axis, None)
         self._rests.pop(axis, None)
         self._proof.discard(axis)
@@ -521,7 +517,7 @@ class CoilMonitor:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NONE, written_ns: int | None = None
     ) -> None:
-        """Note the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or now."""
+        """Record the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or then."""
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # Without readings, a rest or a brake would never end.
@@ -539,9 +535,9 @@ class CoilMonitor:
                 self._judge_motion(response, time_ns)
 
     def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
-        """Give a verdict on an axis that turns the body the wrong way; suspect one that does not turn it.
+        """Give a verdict on a reversed axis, and suspect an axis without torque.
 
-        In a tumble there is no verdict: the axis rests.
+        In a tumble an axis that looks reversed rests without a verdict.
         """
         for axis in response.reversed_axes():
             # An uncommanded current turns the body too.
