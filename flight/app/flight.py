@@ -166,9 +166,9 @@ def fly(request: RunRequest, progress: Callable[[FlightProgress], None] | None =
 
 
 def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
-    """Return a flight that is ready; `stack` closes it. A board tries again until it is."""
+    """Return a flight that is ready; `stack` closes it. A board, which has an archive, retries the start."""
     judge = partial(_judge, request)
-    if not _is_patient(request):
+    if request.archive is None:
         return _open(judge(), stack)
     retry = StartRetry(lambda: signals.received)
     stack.callback(retry.close)
@@ -198,7 +198,7 @@ def _open(judged: _Judged, stack: ExitStack) -> _Opened:
     if request.archive is not None:
         unflown.callback(rmtree, request.out, ignore_errors=True)
     rig = _open_rig(request, text, config, stack)
-    patient = _is_patient(request)
+    patient = request.archive is not None
     loop, log = open_flight(config, rig, request.out, stack, patient=patient, earlier=earlier)
     if chosen.problem:
         sys.stderr.write(f"flight: {chosen.problem}\n")
@@ -226,9 +226,4 @@ def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) 
         raise UsageError("--seed: this configuration flies real devices, which draw their own noise")
     if request.devices is not None:
         raise UsageError("--devices: this configuration flies real devices, not simulated ones")
-    return linux_rig(config, stack, _is_patient(request))
-
-
-def _is_patient(request: RunRequest) -> bool:
-    """Return whether the flight waits for missing devices: on a board, where nobody can reconnect them."""
-    return request.archive is not None
+    return linux_rig(config, stack, request.archive is not None)

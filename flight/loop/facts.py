@@ -25,7 +25,6 @@ from flight.link.events import EVENTS, EventKind, Reaction
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.log import Recorder
 from flight.loop.executive import JobRunner
-from flight.schema.devices import Camera
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.wires import Clock
 from knightcube.errors import FlightError
@@ -272,17 +271,15 @@ def streams_of(config: Config) -> tuple[StreamLimits, ...]:
         rows.append(StreamLimits("power", 1.0, 3.0, POWER_POOR, -0.1 * most, most))
     if config.camera is not None:
         camera = config.camera
-        rows.append(StreamLimits("camera", 1.0 / _seldom(camera), camera.max_age, CAMERA_POOR))
+        longest = camera.period
+        if camera.fine_period is not None or camera.streak_exposure is not None:
+            # Exposures that follow the rate shift the frames.
+            longest = max(longest, camera.fine_period or 0.0)
+            longest += max(camera.streak_exposure or (camera.exposure,))
+        rows.append(StreamLimits("camera", 1.0 / longest, camera.max_age, CAMERA_POOR))
     if config.gps is not None:
         rows.append(StreamLimits("gps", 1.0 / config.gps.period, config.gps.max_age, GPS_POOR))
     return tuple(rows)
-
-
-def _seldom(camera: Camera) -> float:
-    """Return the longest time, s, between two frames; exposures that follow the rate shift them."""
-    if camera.fine_period is None and camera.streak_exposure is None:
-        return camera.period
-    return max(camera.period, camera.fine_period or 0.0) + max(camera.streak_exposure or (camera.exposure,))
 
 
 class StreamWatch:

@@ -176,14 +176,24 @@ class Board:
     def __call__(self, now_ns: int) -> ResourceSample:
         """Return the board's resources now."""
         process = os.getpid()
-        members = [process, *self._below(process)]
+        # The name in brackets may hold any character; user and system time are fields 14 and 15 (proc(5)).
+        stat = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
+        statm = _read(self._proc / str(process) / "statm").split()
+        try:
+            room = os.statvfs(self._folder)
+            disk_free = float(room.f_bavail) * room.f_frsize
+        except OSError:
+            disk_free = math.nan
+        zones = (_read(zone).strip() for zone in sorted(self._thermal.glob("thermal_zone*/temp")))
         return ResourceSample(
             now_ns,
-            self._cpu(process),
-            self._resident(process),
-            math.fsum(self._proportional(member) for member in members),
-            self._disk_free(),
-            self._temperature(),
+            cpu=(int(stat[11]) + int(stat[12])) / _TICKS if len(stat) > 12 else math.nan,
+            resident=float(statm[1]) * _PAGE if len(statm) > 1 else math.nan,
+            proportional=math.fsum(map(self._proportional, [process, *self._below(process)])),
+            disk_free=disk_free,
+            temperature=max(
+                (int(word) * 1e-3 for word in zones if word.lstrip("-").isdigit()), default=math.nan
+            ),
         )
 
     def _below(self, parent: int) -> Iterator[int]:
@@ -193,15 +203,6 @@ class Board:
                 yield int(word)
                 yield from self._below(int(word))
 
-    def _cpu(self, process: int) -> float:
-        # The name in brackets may hold any character; user and system time are fields 14 and 15 (proc(5)).
-        words = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
-        return (int(words[11]) + int(words[12])) / _TICKS if len(words) > 12 else math.nan
-
-    def _resident(self, process: int) -> float:
-        words = _read(self._proc / str(process) / "statm").split()
-        return float(words[1]) * _PAGE if len(words) > 1 else math.nan
-
     def _proportional(self, process: int) -> float:
         """Return the proportional set size in bytes; 0 for a process that has ended, waited for or not."""
         for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
@@ -209,21 +210,6 @@ class Board:
                 return float(line.split()[1]) * 1024.0
         state = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()[:1]
         return 0.0 if state in ([], ["Z"], ["X"]) else math.nan
-
-    def _disk_free(self) -> float:
-        try:
-            room = os.statvfs(self._folder)
-        except OSError:
-            return math.nan
-        return float(room.f_bavail) * room.f_frsize
-
-    def _temperature(self) -> float:
-        found = []
-        for zone in sorted(self._thermal.glob("thermal_zone*/temp")):
-            word = _read(zone).strip()
-            if word.lstrip("-").isdigit():
-                found.append(int(word) * 1e-3)
-        return max(found, default=math.nan)
 
 
 def _read(path: Path) -> str:

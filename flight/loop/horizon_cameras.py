@@ -84,7 +84,13 @@ class HorizonCameraTask:
             self._collect(now_ns)
         period_ns = self._settings.period_ns if self._sight.needed else self._settings.fine_period_ns
         if not self._waits and self._job is None and now_ns - self._triggered_ns >= period_ns:
-            self._trigger(now_ns)
+            self._triggered_ns, self._waits = now_ns, True
+            self._frames = {}
+            for number, camera in enumerate(self._cameras):
+                try:
+                    camera.trigger(self._settings.exposures_ns[number])
+                except DeviceError as error:
+                    self._errors[number] = str(error)
         self._watch(now_ns)
 
     def finish(self, result: JobResult, now_ns: int) -> None:
@@ -106,15 +112,6 @@ class HorizonCameraTask:
             self._services.facts.update(facts.WIDE_FALSE, bool(found.false), now_ns, text)
         used = self._sight.accept(job[0], found)
         self._record(now_ns, job, found, used)
-
-    def _trigger(self, now_ns: int) -> None:
-        self._triggered_ns, self._waits = now_ns, True
-        self._frames = {}
-        for number, camera in enumerate(self._cameras):
-            try:
-                camera.trigger(self._settings.exposures_ns[number])
-            except DeviceError as error:
-                self._errors[number] = str(error)
 
     def _collect(self, now_ns: int) -> None:
         for number, camera in enumerate(self._cameras):
@@ -138,17 +135,13 @@ class HorizonCameraTask:
             self._frames[number], self._seen_ns[number], self._errors[number] = frame, now_ns, ""
         if len(self._frames) == len(self._cameras) or now_ns - self._triggered_ns >= self._settings.late_ns:
             self._waits = False
-            if self._frames:
-                self._submit(now_ns)
-
-    def _submit(self, now_ns: int) -> None:
-        middles = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in self._frames.values()]
-        frames, self._frames = self._frames, {}
-        if self._services.jobs.submit(WORKER, self._sight.job(frames)):
-            self._job = sum(middles) // len(middles), sum(1 << number for number in frames), now_ns
-        else:
-            text = "wide cameras: the worker is busy or not running"
-            self._services.events.report(events.VISION_FAILED, now_ns, text)
+            frames, self._frames = self._frames, {}
+            middles = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
+            if frames and self._services.jobs.submit(WORKER, self._sight.job(frames)):
+                self._job = sum(middles) // len(middles), sum(1 << number for number in frames), now_ns
+            elif frames:
+                text = "wide cameras: the worker is busy or not running"
+                self._services.events.report(events.VISION_FAILED, now_ns, text)
 
     def _watch(self, now_ns: int) -> None:
         """Report cameras without a frame for longer than the limit."""

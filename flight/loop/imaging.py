@@ -324,14 +324,11 @@ class RepeatedRows:
         The number is 0 for an intact frame, and for a frame whose rows are all copies.
         """
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
-        here = {row: zlib.crc32(pixels[row].tobytes()) for row in rows if _has_noise(pixels[row])}
+        noisy = [row for row in rows if np.mean(pixels[row][1:] != pixels[row][:-1]) >= _LEAST_CHANGES]
+        here = {row: zlib.crc32(pixels[row].tobytes()) for row in noisy}
         old = sum(any(before.get(row) == value for before in self._seen) for row, value in here.items())
         self._seen.append(here)
         return old if old < len(here) else 0
-
-
-def _has_noise(row: Image) -> bool:
-    return int(np.count_nonzero(row[1:] != row[:-1])) >= _LEAST_CHANGES * len(row)
 
 
 _UNKNOWN = [math.nan] * 3

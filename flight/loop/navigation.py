@@ -231,7 +231,7 @@ class Positioning:
 
     def run(self, now_ns: int) -> None:
         """Accept the fixes since the last call."""
-        error = ""
+        error, clock = "", self._clock
         try:
             readings = self._receiver.poll()
         except DeviceError as lost:
@@ -242,20 +242,16 @@ class Positioning:
             self._streams.note("gps", reading.time_ns)
             if self._accept(reading):
                 self._fixed_ns = reading.time_ns
-                self._compare_clock(reading, now_ns)
+                # The position before the first fix depends on the wall clock.
+                off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
+                text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
+                self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
             else:
                 self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
         age_ns = now_ns - self._fixed_ns
         text = error or f"no fix of use for {age_ns * 1e-9:.0f} s"
         lost_now = bool(error) or age_ns > self._max_age_ns
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
-
-    def _compare_clock(self, reading: GpsReading, now_ns: int) -> None:
-        """Report a wrong wall clock, because the position before the first fix depends on it."""
-        clock = self._clock
-        off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
-        text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
-        self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
 
 
 class SunSensing:

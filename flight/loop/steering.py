@@ -17,12 +17,12 @@ import numpy as np
 from flight.link import events
 from flight.loop import facts
 from flight.loop.body import CoilCommand, FlightBody, Steered, SteeringState, WindowedLaw
-from flight.loop.coil_monitor import CoilMonitor, CoilVerdict
+from flight.loop.coil_monitor import CoilMonitor
 from flight.loop.coil_response import NONE, Axes
 from flight.loop.facts import Services
 from flight.schema.sections import Modes
 from hal.interfaces.devices import CoilState, ImuReading, PowerMonitor, TorqueCoils
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.allocation import allocate
 from knightcube.gnc.estimation.estimate import Estimate
 
@@ -107,7 +107,7 @@ class CoilDrive:
             watch.measured(answer)
         found = watch.verdicts
         for verdict in found[self._verdicts :]:
-            self._state(verdict, now_ns)
+            self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
         self._verdicts = len(found)
         self._brake(watch.braked)
         self._facts.update(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
@@ -133,7 +133,20 @@ class CoilDrive:
         """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
         usable = self.available & ~self._watch.resting
         if not all(usable.tolist()) and currents.any():
-            currents = self._reallocated(currents, field(), usable)
+            # The usable axes make the torque of all, or their part of it while the field is unknown.
+            known, settings = field(), self._settings
+            if known is None:
+                currents = np.where(usable, currents, 0.0)
+            else:
+                torque = np.cross(settings.dipole_per_ampere * currents, known)
+                currents = allocate(
+                    torque,
+                    known,
+                    settings.dipole_per_ampere,
+                    settings.limits,
+                    usable.astype(float),
+                    settings.free_axis,
+                ).currents
         self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
         self._coils.command(self.command)
 
@@ -147,19 +160,6 @@ class CoilDrive:
         if axes != self._braked:
             self._coils.brake(axes)
             self._braked = axes
-
-    def _reallocated(self, currents: FloatArray, field: FloatArray | None, usable: BoolArray) -> FloatArray:
-        """Return currents (3,) A of the `usable` axes that make the torque of `currents`."""
-        if field is None:
-            return np.where(usable, currents, 0.0)
-        dipole, limits = self._settings.dipole_per_ampere, self._settings.limits
-        torque = np.cross(dipole * currents, field)
-        return allocate(
-            torque, field, dipole, limits, usable.astype(float), self._settings.free_axis
-        ).currents
-
-    def _state(self, verdict: CoilVerdict, now_ns: int) -> None:
-        self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)
 
 
 _NO_DIPOLE: FloatArray = np.zeros(3)

@@ -61,7 +61,9 @@ def probe(config: Config) -> list[Probed]:
     cameras: dict[str, Camera | WideCamera] = {} if config.camera is None else {"camera": config.camera}
     cameras |= {f"wide_cameras[{index}]": camera for index, camera in enumerate(config.wide_cameras)}
     for name, camera in cameras.items():
-        found.append(_probed(name, _camera_place(camera), partial(_open_camera, camera)))
+        device = camera.device
+        place = "" if device is None else str(getattr(device, "path", None) or getattr(device, "name", ""))
+        found.append(_probed(name, place, partial(_open_camera, camera)))
     return found + list(_files(config))
 
 
@@ -120,11 +122,6 @@ def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
 def _open_camera(camera: Camera | WideCamera, stack: ExitStack) -> str:
     linux_camera(camera, SystemClock(), stack)
     return "opens; `flight camera` shows what it sees"
-
-
-def _camera_place(camera: Camera | WideCamera) -> str:
-    device = camera.device
-    return "" if device is None else str(getattr(device, "path", None) or getattr(device, "name", ""))
 
 
 def _files(config: Config) -> Iterator[Probed]:

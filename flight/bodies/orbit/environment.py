@@ -8,6 +8,7 @@ they take 0.3 ms for each 10 s.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 
@@ -131,7 +132,11 @@ class OrbitEnvironment:
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
             state = self._state(self.julian_date(now_ns) - BEHIND / DAY)
-            near = self._near = None if state is None else _predicted(state, BEHIND + AHEAD)
+            near = None
+            if state is not None:
+                with suppress(GeomagneticError):
+                    near = predict(state, BEHIND + AHEAD)
+            self._near = near
             seconds = BEHIND if near is None else self._seconds_into(near, now_ns)
         return near, np.array([seconds])
 
@@ -156,10 +161,3 @@ class OrbitEnvironment:
         found = fix.at(fix.julian_date)
         off = float(np.linalg.norm(found.position - expected.position))
         return off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma))
-
-
-def _predicted(state: OrbitState, seconds: float) -> Ephemeris | None:
-    try:
-        return predict(state, seconds)
-    except GeomagneticError:
-        return None
