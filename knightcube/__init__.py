@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from knightcube.vision.camera.lens import Pinhole as Pinhole
     from knightcube.vision.horizon.nadir import find_nadir as find_nadir
     from knightcube.vision.horizon.settings import HorizonKnowledge as HorizonKnowledge
+    from knightcube.vision.lens_calibration import LensCalibration as LensCalibration
+    from knightcube.vision.lens_calibration import calibrate_lens as calibrate_lens
+    from knightcube.vision.objects.detect import detect_objects as detect_objects
     from knightcube.vision.star_tracker import MatchedStars as MatchedStars
     from knightcube.vision.star_tracker import StarSolution as StarSolution
     from knightcube.vision.star_tracker import StarTracker as StarTracker
@@ -48,6 +51,9 @@ _MODULE_OF = {
     "SingleAxisPlant": "knightcube.gnc.guidance.one_axis.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
+    "LensCalibration": "knightcube.vision.lens_calibration",
+    "calibrate_lens": "knightcube.vision.lens_calibration",
+    "detect_objects": "knightcube.vision.objects.detect",
     "find_nadir": "knightcube.vision.horizon.nadir",
     "find_sun": "knightcube.vision.sun",
     "magnetic_field": "knightcube.astro.almanac",

@@ -7,52 +7,23 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ground.calibration import (
-    MIN_STARS,
-    PARAMETERS,
-    DeterminedLens,
-    MatchedFrame,
-    OmittedTerm,
-    calibrate_one_lens,
-    parameters_of,
-)
 from ground.commands.options import check_size, positive, write_new
 from knightcube.astro.arrays import Image
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import read_image
-from knightcube.vision.camera.lens import CameraModel
-from knightcube.vision.frame_job import solve_frame
-from knightcube.vision.star_tracker import camera_of_field
-from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.lost_in_space import IdentificationSettings
-from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
-
-_ROUNDS = 3
-_MIN_SIGMA_PX = 0.02
-"""Smallest standard deviation of a star's position (px), for the errors that its covariance lacks."""
-# A lens is not fitted to mirrored pictures.
-_SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SkyPicture:
-    """A picture, its solution, and the reason to exclude it, which may be empty."""
-
-    path: Path
-    solution: FrameSolution
-    excluded: str = ""
-
-    @property
-    def reason(self) -> str:
-        """Reason why the picture is not used, empty if it is used."""
-        return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
+from knightcube.vision.lens_calibration import (
+    MIN_STARS,
+    PARAMETERS,
+    CalibrationImage,
+    DeterminedLens,
+    OmittedTerm,
+    calibrate_lens,
+    parameters_of,
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -77,11 +48,19 @@ def run(options: argparse.Namespace) -> int:
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
-    camera = camera_of_field(options.fov, None, frames[0][1].shape)
-    pictures, lens = _calibrated(frames, *camera, default_index())
+
+    def show(round_number: int, number: int) -> None:
+        if sys.stderr.isatty():
+            end = "\n" if number == len(frames) else ""
+            sys.stderr.write(f"\rround {round_number}: picture {number} of {len(frames)} {end}")
+            sys.stderr.flush()
+
+    found = calibrate_lens([pixels for _, pixels in frames], fov_deg=options.fov, progress=show)
+    pictures = list(zip(options.images, found.images, strict=True))
+    lens = found.determined
     if lens is None:
-        for picture in pictures:
-            sys.stderr.write(f"{picture.path}: {picture.reason}\n")
+        for path, picture in pictures:
+            sys.stderr.write(f"{path}: {picture.reason}\n")
         return 1
     if options.json:
         sys.stdout.write(json.dumps(_facts(lens, pictures), allow_nan=False) + "\n")
@@ -117,46 +96,7 @@ def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
     return frames
 
 
-def _calibrated(
-    frames: Sequence[tuple[Path, Image]], camera: CameraModel, scale: tuple[float, float], sky: SkyIndex
-) -> tuple[list[SkyPicture], DeterminedLens | None]:
-    """Return the pictures with their solutions and the lens, which is None if no picture is solved."""
-    model, lens = camera, None
-    pictures: list[SkyPicture] = []
-    for round_number in range(_ROUNDS):
-        # The better the lens, the more stars in the corners match.
-        pictures = []
-        for number, (path, pixels) in enumerate(frames, start=1):
-            if sys.stderr.isatty():
-                end = "\n" if number == len(frames) else ""
-                counts = f"round {round_number + 1} of {_ROUNDS}: picture {number} of {len(frames)}"
-                sys.stderr.write(f"\r{counts} {end}")
-                sys.stderr.flush()
-            pictures.append(SkyPicture(path, solve_frame(pixels, model, scale, 1.0, sky, _SETTINGS)))
-        solved = [number for number, picture in enumerate(pictures) if picture.solution.fix is not None]
-        if not solved:
-            return pictures, None
-        solutions = [pictures[number].solution for number in solved]
-        focal_lengths = np.array([solution.camera.focal_length for solution in solutions])
-        sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
-        median = int(np.argsort(focal_lengths)[len(solved) // 2])
-        begun = solutions[median].camera if lens is None else model
-        matches = [_matches(solution, sky) for solution in solutions]
-        lens, excluded = calibrate_one_lens(matches, begun, focal_lengths, sigmas)
-        for number, reason in excluded.items():
-            pictures[solved[number]] = replace(pictures[solved[number]], excluded=reason)
-        model, scale = lens.calibration.lens, (0.999, 1.001)
-    return pictures, lens
-
-
-def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
-    matched = solution.matched
-    variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _MIN_SIGMA_PX**2
-    directions = sky.stars.direction[solution.star[matched]]
-    return MatchedFrame(solution.points[matched], np.sqrt(variance), directions)
-
-
-def _facts(lens: DeterminedLens, pictures: Sequence[SkyPicture]) -> dict[str, Any]:
+def _facts(lens: DeterminedLens, pictures: Sequence[tuple[Path, CalibrationImage]]) -> dict[str, Any]:
     found = lens.calibration
     return {
         **found.lens.to_mapping(),
@@ -171,23 +111,23 @@ def _facts(lens: DeterminedLens, pictures: Sequence[SkyPicture]) -> dict[str, An
         "rejected_matches": found.rejected_count,
         "pictures": [
             {
-                "path": str(picture.path),
+                "path": str(path),
                 "status": picture.solution.status.value,
                 "left_out": picture.reason or None,
                 "stars": len(picture.solution.matched),
             }
-            for picture in pictures
+            for path, picture in pictures
         ],
     }
 
 
-def _text(lens: DeterminedLens, pictures: Sequence[SkyPicture]) -> str:
+def _text(lens: DeterminedLens, pictures: Sequence[tuple[Path, CalibrationImage]]) -> str:
     found = lens.calibration
-    used = [picture for picture in pictures if not picture.reason]
+    used = [picture for _, picture in pictures if not picture.reason]
     stars = sum(len(picture.solution.matched) for picture in used)
     lines = [
-        f"{picture.path}: {'excluded' if picture.excluded else 'not solved'}: {picture.reason}"
-        for picture in pictures
+        f"{path}: {'excluded' if picture.excluded else 'not solved'}: {picture.reason}"
+        for path, picture in pictures
         if picture.reason
     ]
     lines.append(f"pictures:     {len(used)} of {len(pictures)} used, {stars} stars")

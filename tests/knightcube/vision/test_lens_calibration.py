@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from ground.calibration import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
+from knightcube.vision.camera.lens import Lens, Pinhole
+from knightcube.vision.lens_calibration import (
     PARAMETERS,
     Calibration,
     CalibrationError,
@@ -24,9 +27,6 @@ from ground.calibration import (
     residuals,
     step,
 )
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
-from knightcube.vision.camera.lens import Lens, Pinhole
 
 _OPEN = LensPrior(np.inf, np.inf, np.inf, np.inf)
 

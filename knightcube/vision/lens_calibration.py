@@ -14,18 +14,24 @@ deviation is not below half of its prior is named in `undetermined`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.attitude.solvers import solve
 from knightcube.astro.attitude.wahba import AttitudeError
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.errors import FlightError
+from knightcube.errors import FlightError, UsageError
 from knightcube.vision.camera.lens import CameraModel, Lens, LensError
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.star_tracker import camera_of_field
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2")
 MIN_STARS = 24
@@ -55,6 +61,12 @@ _MIN_COSINE = 0.05
 """Cosine of the angle to the optical axis below which a star cannot be in the image."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Prior standard deviation (px for the centre) that holds an omitted term, in the order of omission."""
+_ROUNDS = 3
+"""Number of times that the images are solved: with a better lens more stars in the corners match."""
+_MIN_SIGMA_PX = 0.02
+"""Smallest standard deviation of a star's position (px), for the errors that its covariance lacks."""
+_SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
+"""Settings for which a mirrored image is not solved: a lens does not mirror."""
 _MIN_USED = 0.5
 """Smallest used fraction of a frame's matches for a frame of the common lens."""
 
@@ -551,3 +563,101 @@ def calibrate_one_lens(
         if parts[worst] >= _MIN_USED or len(kept) == 1:
             return calibrate_determined([frames[number] for number in kept], initial), excluded
         excluded[kept[worst]] = f"the lens of the other frames fits {parts[worst]:.0%} of its stars"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationImage:
+    """One image of a calibration.
+
+    Attributes:
+        solution: the stars and the attitude of the image, or why it is not solved.
+        excluded: reason to exclude a solved image; empty otherwise.
+    """
+
+    solution: FrameSolution
+    excluded: str = ""
+
+    @property
+    def reason(self) -> str:
+        """The reason why the image is not used; empty if it is used."""
+        return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensCalibration:
+    """The outcome of `calibrate_lens`. It is true (`if found:`) if a lens was determined.
+
+    Attributes:
+        determined: lens, standard deviations, omitted terms and accuracy; None if no image was solved.
+        images: the images in the given order, each with its solution or the reason to exclude it.
+    """
+
+    determined: DeterminedLens | None
+    images: tuple[CalibrationImage, ...]
+
+    def __bool__(self) -> bool:
+        """Return whether a lens was determined."""
+        return self.determined is not None
+
+    @property
+    def lens(self) -> Lens | None:
+        """The calibrated lens, for `StarTracker(camera=...)`; None if no image was solved."""
+        return None if self.determined is None else self.determined.calibration.lens
+
+
+def calibrate_lens(
+    images: Sequence[Image],
+    *,
+    fov_deg: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> LensCalibration:
+    """Return the lens of a camera from images of the night sky: focal length, axis and radial distortion.
+
+    All images must be of one camera at one focus. Images that do not fit are excluded. Ten images with stars
+    in the corners are worth more than a hundred without. Terms that the stars do not determine are omitted.
+
+    Args:
+        images: arrays (rows, columns) of counts, all of one shape.
+        fov_deg: approximate field of view across the columns, deg; None: any from 4 to 60 deg.
+        progress: called before each image with the round and the number of the image, both from 1.
+
+    Raises:
+        UsageError: without images, or for images of different shapes.
+        InputError: for a field of view that is not between 1 and 120 deg.
+        CalibrationError: if the solved images do not determine a lens.
+    """
+    if len({image.shape for image in images}) != 1:
+        raise UsageError("a calibration needs images of one camera, all of one shape")
+    sky = default_index()
+    model: CameraModel
+    model, scale = camera_of_field(fov_deg, None, images[0].shape)
+    lens: DeterminedLens | None = None
+    outcomes: list[CalibrationImage] = []
+    for round_number in range(1, _ROUNDS + 1):
+        outcomes = []
+        for number, image in enumerate(images, start=1):
+            if progress is not None:
+                progress(round_number, number)
+            outcomes.append(CalibrationImage(solve_frame(image, model, scale, 1.0, sky, _SETTINGS)))
+        solved = [number for number, outcome in enumerate(outcomes) if outcome.solution.fix is not None]
+        if not solved:
+            return LensCalibration(None, tuple(outcomes))
+        solutions = [outcomes[number].solution for number in solved]
+        focal_lengths = np.array([solution.camera.focal_length for solution in solutions])
+        sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
+        median = int(np.argsort(focal_lengths)[len(solved) // 2])
+        initial = solutions[median].camera if lens is None else model
+        matches = [_matches(solution, sky) for solution in solutions]
+        lens, excluded = calibrate_one_lens(matches, initial, focal_lengths, sigmas)
+        for number, reason in excluded.items():
+            outcomes[solved[number]] = replace(outcomes[solved[number]], excluded=reason)
+        model, scale = lens.calibration.lens, (0.999, 1.001)
+    return LensCalibration(lens, tuple(outcomes))
+
+
+def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
+    """Return the identified stars of a solution."""
+    matched = solution.matched
+    variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _MIN_SIGMA_PX**2
+    directions = sky.stars.direction[solution.star[matched]]
+    return MatchedFrame(solution.points[matched], np.sqrt(variance), directions)
