@@ -1,15 +1,16 @@
-"""From one frame to attitude and rate: the only decision tree, of the vision worker and of `flight solve`.
+"""Attitude and rate from one frame: the decision tree of the vision worker and of `flight solve`.
 
-1. The motion over the exposure is estimated: of every frame in flight, which reports it; of any other
-   picture only where a survey of its bright areas shows streaks, for the survey is cheaper. If these give no
-   attitude (a fence or a striped wall looks like streaks too), the picture's points are tried.
-2. Stars at rest are looked for near their predicted places if there is a prior attitude, else, or if that
-   fails, in the whole frame.
-3. Streaks give their stars' places at mid-exposure, which are identified like points. A focal length that
-   proves wrong, or the stars known by then, lead to a second fit of the streaks.
+1. The motion over the exposure is estimated. In flight this is done for every frame, because each reports its
+   rate. For any other image it is done only if a survey of its bright areas, which is faster, shows streaks.
+   If these give no attitude (a fence or a striped wall looks like streaks too), the points of the image are
+   tried.
+2. Stars at rest are searched near their predicted positions if there is a prior attitude. Without one, or if
+   that fails, they are searched in the whole frame.
+3. Streaks give the positions of their stars at mid-exposure, which are identified like points. A wrong focal
+   length, or the stars that are known by then, lead to a second fit of the streaks.
 
-The control process creates the job and receives its result. The estimators, and scipy with them, take tens
-of MB that it does not need: they are imported where the work is done.
+The control process creates the job and receives its result. The estimators, and scipy with them, take tens of
+MB that it does not need. They are imported when they are used.
 """
 
 from __future__ import annotations
@@ -46,25 +47,25 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
-# The motion is fitted again where the focal length was wrong by more.
+# Relative error of the focal length above which the motion is fitted again.
 _SCALE_TOLERANCE = 0.01
-# A star that moves by less over the exposure is a point.
+# Motion (px) over the exposure below which a star is a point.
 _POINT_PX = 1.0
-# Streaks predicted to be shorter are found like points where the frame itself agrees on no motion: in a
-# crowded sky regions run together and look longer than they are.
+# Predicted length (px) of streaks below which they are measured like points if the frame gives no motion: in
+# a crowded sky, regions merge and look longer than they are.
 _SHORT_PX = 4.0
-# A trail known to this, px, is in the model of a star's light.
+# Uncertainty (px) of a trail up to which it is part of the model of a star's light.
 _KNOWN_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """How stars are identified.
+    """Settings of the identification of stars.
 
     Attributes:
         solve: settings of the steps.
-        scale: (lowest, highest) factor by which the lens's focal length may be wrong: (1, 1) when calibrated.
-        index: file of the sky index; None for the default one.
+        scale: lowest and highest factor of the focal length; (1, 1) for a calibrated lens.
+        index: file of the sky index; None: the default index.
     """
 
     solve: SolveSettings
@@ -100,16 +101,19 @@ class StreakEstimator(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FrameJob:
-    """A frame (rows, columns) with its camera, priors and settings.
+    """A frame with its camera, priors and settings.
 
     Attributes:
-        exposure: s.
+        pixels: the frame (rows, columns).
+        camera: the camera.
+        exposure: exposure time, s.
         estimator: settings of the maximum-likelihood estimator, or another estimator of streaks.
-        tracker: None: stars are not identified.
-        previous_checksum: of the frame before; the same pixels again mean a frozen camera.
+        tracker: settings of the identification of stars; None: stars are not identified.
+        rate_prior, attitude_prior: predictions; None: unknown.
+        previous_checksum: checksum of the previous frame; identical pixels mean a frozen camera.
         motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
-        objects: how objects are sighted once the stars gave the attitude; None: they are not.
-        kept: where the frame is kept; None: it is not.
+        objects: settings of the measurement of objects; None: objects are not measured.
+        kept: folder in which the frame is kept; None: it is not kept.
     """
 
     pixels: Image
@@ -127,9 +131,12 @@ class FrameJob:
 
 @dataclass(frozen=True, slots=True)
 class FrameFound:
-    """The motion over the exposure, and the attitude in its middle; None if stars were not looked for.
+    """The result of a frame.
 
-    `objects` are what may be objects; None if they were not looked for, or the attitude is not known.
+    Attributes:
+        motion: motion over the exposure.
+        solution: attitude at mid-exposure; None if stars were not identified.
+        objects: possible objects; None if they were not measured, or the attitude is unknown.
     """
 
     motion: FrameMotion
@@ -138,7 +145,7 @@ class FrameFound:
 
 
 def run(job: FrameJob) -> FrameFound:
-    """Return attitude and rate of a frame; at the top level of a module for the worker process to import."""
+    """Return attitude and rate of a frame. The worker process imports this function by its name."""
     found = _found(job)
     if job.kept is not None:
         keep_frame(job.kept, job.pixels, _facts(job, found))
@@ -146,7 +153,7 @@ def run(job: FrameJob) -> FrameFound:
 
 
 def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
-    """Return what was found in a frame as plain values, camera axes, for its file."""
+    """Return the results of a frame as plain values, camera axes, for its file."""
     motion, solution = found.motion, found.solution
     rate = motion.rate if motion.status is StreakStatus.RATE else None
     fix = None if solution is None else solution.fix
@@ -164,7 +171,7 @@ def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
 
 
 def _places(points: FloatArray) -> list[list[float]]:
-    """Return points (n, 2) px in tenths of a pixel: enough to mark them."""
+    """Return points (n, 2), px, rounded to tenths of a pixel."""
     return [[round(x, 1), round(y, 1)] for x, y in points.tolist()]
 
 
@@ -194,34 +201,34 @@ def solve_frame(
     attitude_prior: AttitudePrior | None = None,
     rate_prior: RatePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude of any picture (rows, columns), and its rate if it shows streaks.
+    """Return the attitude of any image (rows, columns), and its rate if it shows streaks.
 
     Args:
-        pixels: counts.
-        camera: assumed, of the frame's shape.
-        scale: (lowest, highest) factor of the tangents: (1, 1) for a calibrated camera.
-        exposure: s.
+        pixels: the image (rows, columns), counts.
+        camera: the assumed camera, of the size of the image.
+        scale: lowest and highest factor of the tangents; (1, 1) for a calibrated camera.
+        exposure: exposure time, s.
         sky: the guide stars.
-        settings: of the steps.
-        attitude_prior: where to look first.
-        rate_prior: gives the direction of time, which one frame does not show.
+        settings: settings of the steps.
+        attitude_prior: predicted attitude, near which stars are searched first.
+        rate_prior: predicted rate. It gives the direction of time, which one frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    # Of a picture the places of the stars are wanted: a rate that is hardly known serves as well.
+    # The positions of the stars are needed, for which a poorly known rate is sufficient.
     estimator = replace(settings.likelihood, worst_doubt=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )
     found = attitude_and_rate(job, tracker, sky).solution
-    assert found is not None  # only a flight does without one
+    assert found is not None  # the tracker is given
     return found
 
 
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
-    """Return attitude and rate of a frame: the decision tree."""
+    """Return attitude and rate of a frame by the decision tree."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # Of short streaks few are fitted, and may be taken for their reverse; all stars have predicted places.
+    # Few short streaks can be fitted, and their direction is uncertain; all stars have predicted positions.
     near = _near(job, tracker, sky) if rests or _known_to_be_short(job) else None
     if near is not None:
         return FrameFound(motion or _no_motion(job), near)
@@ -236,7 +243,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 
 
 def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted places, None without a prior or where they fail."""
+    """Return the attitude from stars near their predicted positions; None without a prior or if it fails."""
     prior = job.attitude_prior
     if prior is None:
         return None
@@ -244,7 +251,7 @@ def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSoluti
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
-    """Return the attitude of a frame of streaks by the way of the estimator that found their motion."""
+    """Return the attitude of a frame of streaks, by the method of their estimator."""
     if isinstance(motion, MotionResult):
         return _from_streaks(job, tracker, sky, motion)
     assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
@@ -255,7 +262,7 @@ def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion:
 
 
 def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
-    """Return attitude and rate of a picture, of which a survey says whether it shows points or streaks."""
+    """Return attitude and rate of an image; a survey decides whether it shows points or streaks."""
     seen = survey(job.pixels, tracker.solve.detection)
     found: FrameFound | None = None
     if seen.shape.kind is FrameKind.STREAKS:
@@ -275,7 +282,7 @@ def _from_points(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, seen: S
 
 
 def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:
-    """Return the attitude of a frame of streaks, and its motion, fitted again if the solution allows."""
+    """Return the attitude of a frame of streaks and its motion, after a second fit if possible."""
     settings, prior = tracker.solve, job.attitude_prior
     solution = solve_motion(motion, job.camera, tracker.scale, sky, settings, prior)
     if solution.status is not SolveStatus.SOLVED:
@@ -285,7 +292,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        # The refit costs a picture half as much again, for little.
+        # For a single image the refit takes half as long again for a small gain.
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
@@ -314,7 +321,7 @@ def _objects(
     solution: FrameSolution,
     settings: ObjectMeasurementSettings,
 ) -> MeasuredObjects | None:
-    """Return what may be objects."""
+    """Return the possible objects."""
     from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - scipy comes with it
 
     return measure_objects(
@@ -329,18 +336,18 @@ def _objects(
 
 
 def _no_motion(job: FrameJob) -> MotionResult:
-    """Return the motion of a frame of points of which none was estimated."""
+    """Return the result without a motion, for a frame of points."""
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
 
 
 def _shows_no_motion(job: FrameJob, motion: FrameMotion) -> bool:
-    """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
+    """Return whether stars are at rest, or move too little, by the priors, for a frame to show motion."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
 
 
 def _short_trails(job: FrameJob) -> ShortTrails | None:
-    """Return how stars move over the exposure where that is known to a fraction of a pixel."""
+    """Return the motion of stars over the exposure; None unless it is known to a fraction of a pixel."""
     prior, estimator = job.rate_prior, job.estimator
     if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
         return None
@@ -352,12 +359,12 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
 
 
 def _known_to_be_short(job: FrameJob) -> bool:
-    """Return whether streaks are known to be so short that they are measured as points with trails."""
+    """Return whether streaks are known to be short enough to be measured as points with trails."""
     return _short_trails(job) is not None and _predicted_within(job, _SHORT_PX)
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:
-    """Return whether the priors predict streaks shorter than a length, px; without a rate prior they do."""
+    """Return whether the priors predict streaks shorter than `length`, px; an unknown rate is small."""
     if job.attitude_prior is None:
         return False
     if job.rate_prior is None:

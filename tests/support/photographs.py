@@ -118,7 +118,7 @@ def solved(scene: SkyFrame, length: float) -> Solved:
     """Return what the star tracker makes of a simulated frame, lost in space and with a prior."""
     low, high = NARROW_DEG - _NARROW_KNOWN_DEG, NARROW_DEG + _NARROW_KNOWN_DEG
     camera, scale = believed(scene.pixels, NARROW_DEG, low, high)
-    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(untold_lens=False)
+    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(uncalibrated_lens=False)
     prior = AttitudePrior(scene.attitude, _PRIOR_SIGMA)
     exposure = scene.exposure
     begin = time.process_time()

@@ -59,7 +59,7 @@ from knightcube.reference.star_identification.triangle_table import (
 from knightcube.vision.startracker import lost_in_space
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.verification import nothing, verify_matrix
+from knightcube.vision.startracker.verification import nothing, verify
 
 
 def propose_angles(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
@@ -372,7 +372,7 @@ def identify_by_rate(
     if previous is not None:
         turn = np.zeros(3) if shared is None else shared.rate * previous.elapsed
         predicted = attitude_matrix(multiply(from_rotation_vector(turn), previous.attitude))
-        answer = verify_matrix(
+        answer = verify(
             stars, sky.index, predicted, 1.0, previous.part_of_all_attitudes, settings.verification
         )
     if answer.status is not MatchStatus.IDENTIFIED:

@@ -27,7 +27,7 @@ from knightcube.vision.startracker.attitude_fit import (
 from knightcube.vision.startracker.verification import (
     VerificationSettings,
     nothing,
-    verify_matrix,
+    verify,
 )
 
 
@@ -193,7 +193,7 @@ def _best(
     for number in np.argsort(-support, kind="stable")[: settings.verified]:
         if support[number] < least:
             return None
-        answer = verify_matrix(
+        answer = verify(
             view.field,
             sky.index,
             matrices[number],

@@ -1,7 +1,7 @@
 """The star tracker: identifies the stars of a frame and determines its attitude (Michalski chapter 3).
 
-    pixels -> detection -> StarField -> identification -> verification -> attitude
-
-`detection` finds and measures stars, `identification` names them with the guide stars of `index`, and
-`image_fit` determines the attitude from their positions. `solve` combines these steps into a `solution`.
+`detection` finds and measures stars. `lost_in_space` and `verification` identify them with the guide stars of
+`index`, without and with a prior attitude; `attitude_fit` fits the attitude to the identified directions.
+`image_fit` determines the attitude from the positions in the image. `solve` combines these steps, and
+`catalogue_refit` refits the streaks of an identified frame. `sky_map` converts between pixels and directions.
 """

@@ -1,6 +1,4 @@
-"""The input and the result of a star identification method (Michalski 3.2).
-
-Least-squares fits of attitude, scale and radial distortion to matched stars.
+"""Least-squares fits of attitude, scale and radial distortion to matched stars.
 
 `refine` solves Wahba's problem with one more unknown: the factor k of all tangents x/z, y/z, by which the
 assumed focal length is wrong. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation d
@@ -231,7 +229,10 @@ def refine(
             return None
         step = -(covariance @ (residual @ flat))
         longest = float(np.abs(step).max())
-        if not _determined(normal, covariance) or not longest < 1.0:
+        # Every combination of parameters must be determined beyond rounding. The largest element of a
+        # positive definite matrix is on its diagonal.
+        condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
+        if not 0.0 < condition < 1.0 or not longest < 1.0:
             return None
         matrix = turned(matrix, step[:3])
         if free_scale:
@@ -241,15 +242,6 @@ def refine(
     # The squares of the residuals after the last step.
     left = (residual + flat @ step).reshape(-1, 3)
     return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
-
-
-def _determined(normal: FloatArray, covariance: FloatArray) -> bool:
-    """Return whether every combination of parameters is determined beyond rounding.
-
-    The largest element of a positive definite matrix is on its diagonal.
-    """
-    largest = float(normal.max()) * float(covariance.max())
-    return 0.0 < largest * _LEAST_INFORMATION < 1.0
 
 
 def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:

@@ -115,7 +115,13 @@ def fit_in_image(
 
     Raises AttitudeError if the stars do not determine the parameters.
     """
-    seen = _Seen(camera.unit_vectors(points), _slopes(points, camera), covariance, reference, unknowns)
+    # The derivatives (n, 3, 2) of direction by position.
+    moved = [
+        camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
+        for offset in _STEP_PX * np.eye(2)
+    ]
+    slopes = np.stack(moved, axis=-1) / (2.0 * _STEP_PX)
+    seen = _Seen(camera.unit_vectors(points), slopes, covariance, reference, unknowns)
     pose = seen.fitted(_FittedPose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     if squares.max() > _FARTHEST:
@@ -159,7 +165,11 @@ class _Seen:
     late: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "whitener", _whitener(self.slopes, self.covariance))
+        # The whitener (n, 2, 3) transforms a direction error into two components of unit variance. It is a
+        # pseudo-inverse: the third direction, along the line of sight, carries no error.
+        spread = self.slopes @ np.linalg.cholesky(self.covariance)
+        across = np.swapaxes(spread, -1, -2)
+        object.__setattr__(self, "whitener", np.asarray(np.linalg.inv(across @ spread) @ across))
         late = self.unknowns.late
         late = np.einsum("nij,nj->ni", self.slopes, late) if len(late) else np.zeros((0, 3))
         object.__setattr__(self, "late", late)
@@ -244,15 +254,11 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
-    agree = _agreeing(squares)
-    return seen.fitted(pose, agree.astype(np.float64)), agree
-
-
-def _agreeing(squares: FloatArray) -> BoolArray:
-    """Return which stars (n,) scatter as the majority does, or all stars if too few would remain."""
+    # A star agrees if it scatters as the majority does. If too few would remain, all stars are used.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
-    enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
-    return agree if enough else np.ones(len(squares), dtype=np.bool_)
+    if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
+        agree = np.ones(len(squares), dtype=np.bool_)
+    return seen.fitted(pose, agree.astype(np.float64)), agree
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
@@ -269,22 +275,6 @@ def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen,
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)
     return seen, pose
-
-
-def _slopes(points: FloatArray, camera: CameraModel) -> FloatArray:
-    """Return the derivatives (n, 3, 2) of direction by position at points (n, 2), px."""
-    moved = [
-        camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
-        for offset in _STEP_PX * np.eye(2)
-    ]
-    return np.stack(moved, axis=-1) / (2.0 * _STEP_PX)
-
-
-def _whitener(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return matrices (n, 2, 3) that transform a direction error into two components of unit variance."""
-    spread = slopes @ np.linalg.cholesky(covariance)
-    # The pseudo-inverse: the third direction, along the line of sight, carries no error.
-    return np.asarray(np.linalg.inv(np.swapaxes(spread, -1, -2) @ spread) @ np.swapaxes(spread, -1, -2))
 
 
 def attitude_by(

@@ -41,7 +41,7 @@ from knightcube.vision.startracker.index.sky_index import (
 from knightcube.vision.startracker.verification import (
     VerificationSettings,
     nothing,
-    verify_matrix,
+    verify,
 )
 
 _BRIGHTEST = 12
@@ -229,7 +229,10 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    begin, count = _affordable(begin, end, most)
+    # The first runs that hold at most `most` entries in total.
+    count = end - begin
+    kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
+    begin, count = begin[:kept], count[:kept]
     query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
     # int32: the entries are the bulk of the work.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
@@ -251,13 +254,6 @@ def look_up(
     scale = longest / size[query] * steps.middle[step[query]]
     star = sky.triangles.corners[entry].astype(np.uint32)
     return TriangleMatches(corners[query].astype(np.uint32), star, scale), total
-
-
-def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
-    """Return the beginnings and lengths of the first runs that hold at most `most` entries in total."""
-    count = end - begin
-    kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
-    return begin[:kept], count[:kept]
 
 
 def _places(
@@ -397,7 +393,7 @@ def _search(
         found.append(finds)
         most = round(share * settings.verified)
         for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, most):
-            answer = verify_matrix(observed, sky, matrix, scale, searched, settings.verification)
+            answer = verify(observed, sky, matrix, scale, searched, settings.verification)
             if answer.status is MatchStatus.IDENTIFIED:
                 return answer
         work += read
@@ -424,16 +420,12 @@ def _candidates(
         tried.update(pairs)
         # One triangle gives an inaccurate scale, which is limited to the range of the lens.
         scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
-        yield _attitude_of(observed, sky, finds, find), scale
+        # The attitude that maps the guide stars of the match onto the observed stars.
+        seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
+        yield np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]])), scale
         yielded += 1
         if yielded == most:
             return
-
-
-def _attitude_of(observed: StarField, sky: SkyIndex, finds: TriangleMatches, find: int) -> FloatArray:
-    """Return the attitude (3, 3) that maps a match's guide stars onto the observed ones."""
-    seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
-    return np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]]))
 
 
 def _frame(corners: FloatArray) -> FloatArray:

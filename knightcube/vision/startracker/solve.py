@@ -189,10 +189,10 @@ _COLOUR_PX = 0.002
 _SHAPE_DOUBT = 0.05
 # Position error (px) of an uncalibrated lens in identification. It is tried second: most pictures need only
 # the errors of their positions, within which fewer stars agree by chance.
-_UNTOLD_SIGMA_PX = 0.3
+_UNCALIBRATED_SIGMA_PX = 0.3
 # Attitude error of an uncalibrated lens and of the air beyond the fit of the lens, in px across the boresight
 # and at the edge about it. Attitudes of photographs by other solvers differ by this.
-_UNTOLD_LENS_PX = 0.25
+_UNCALIBRATED_LENS_PX = 0.25
 # Minimum significance of a streaked star (standard deviations of its light) for identification.
 _LEAST_SIGNIFICANCE = 5.0
 # Standard deviation (px) above which a star has no usable position: its streak may end outside of the frame.
@@ -219,7 +219,7 @@ class SolveSettings:
         velocity: velocity of the camera relative to the barycentre (3,), m/s, for aberration; None: no
             correction.
         lens: accuracy of a lens of known focal length; None: exact.
-        untold_lens: whether a lens of uncertain focal length may also have a displaced axis and distortion.
+        uncalibrated_lens: whether a lens of uncertain focal length may have a displaced axis and distortion.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -229,7 +229,7 @@ class SolveSettings:
     attitude: Solver | None = None
     velocity: FloatArray | None = None
     lens: CameraKnowledge | None = None
-    untold_lens: bool = True
+    uncalibrated_lens: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -418,8 +418,8 @@ def _identify(
         # The rate of a mirrored picture would be wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
-    if found.status is MatchStatus.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
-        found = identify(star_field(seen, flux, scale, _UNTOLD_SIGMA_PX), sky, options)
+    if found.status is MatchStatus.NO_MATCH and settings.uncalibrated_lens and scale[0] != scale[1]:
+        found = identify(star_field(seen, flux, scale, _UNCALIBRATED_SIGMA_PX), sky, options)
     if found.mirrored:
         # The mirrored positions are fitted, and the original ones reported.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
@@ -460,13 +460,18 @@ def _with_attitude(
     if found.status is not MatchStatus.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
-    free_lens = free_scale and settings.untold_lens
+    free_lens = free_scale and settings.uncalibrated_lens
     camera = _camera_found(seen.camera, found)
     chosen = np.flatnonzero(found.star >= 0)
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    known = _known_bend(camera, settings, free_scale, free_lens)
+    # Prior information about the bend of the lens; none if no bend is fitted.
+    known = np.zeros(0)
+    if free_lens:
+        known = usual_bend(camera)
+    elif not free_scale and settings.lens is not None:
+        known = known_bend(camera, settings.lens)
     least = _COLOUR_PX if settings.lens is not None and not len(known) else _LEAST_SIGMA_PX
     covariance = seen.covariance[chosen] + least**2 * np.eye(2)
     places, late = seen.points[chosen], seen.late[chosen] if len(seen.late) else seen.late
@@ -482,7 +487,10 @@ def _with_attitude(
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
     if free_lens:
-        fix = replace(fix, covariance=fix.covariance + lens_floor(camera))
+        # The covariance that an uncalibrated lens adds.
+        across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
+        floor = np.diag((_UNCALIBRATED_LENS_PX * np.array([across, across, about])) ** 2)
+        fix = replace(fix, covariance=fix.covariance + floor)
     expected = np.full_like(seen.points, np.nan)
     expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
     if len(late):
@@ -501,15 +509,6 @@ def _with_attitude(
     )
 
 
-def _known_bend(
-    camera: CameraModel, settings: SolveSettings, free_scale: bool, free_lens: bool
-) -> FloatArray:
-    """Return the prior information (6,) about the bend of the lens; (0,) if no bend is fitted."""
-    if free_lens:
-        return usual_bend(camera)
-    return np.zeros(0) if free_scale or settings.lens is None else known_bend(camera, settings.lens)
-
-
 def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
     """Return the camera with the fitted focal length, and a pinhole with the fitted distortion."""
     camera = camera.rescaled(1.0 / found.scale)
@@ -521,12 +520,6 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)
     except LensError:
         return camera
-
-
-def lens_floor(camera: CameraModel) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, that an uncalibrated lens adds to an attitude."""
-    across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
-    return np.diag((_UNTOLD_LENS_PX * np.array([across, across, about])) ** 2)
 
 
 def _reason(status: MatchStatus, seen: FrameSolution) -> str:

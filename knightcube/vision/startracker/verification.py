@@ -11,8 +11,8 @@ Tracking: identifies the stars of a frame with a prior attitude.
 
 A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
 an observed and a predicted star close enough to be the same, the largest set with one shift refines the
-attitude, and the whole field verifies it as in lost in space, with the prior's uncertainty in place of the
-whole sky as the searched part.
+attitude, and the whole field verifies it as in lost in space, with the uncertainty of the prior instead
+of the whole sky as the searched part.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ _HOPELESS = 7.0
 def verify(
     field: StarField,
     sky: SkyIndex,
-    attitude: FloatArray,
+    matrix: FloatArray,
     scale: float,
     searched: float = 1.0,
     settings: VerificationSettings = VerificationSettings(),
@@ -176,24 +176,12 @@ def verify(
     Args:
         field: the observed stars.
         sky: the guide stars.
-        attitude: attitude of the candidate (4,), ICRS to camera, within some sigmas of the true attitude.
+        matrix: attitude matrix of the candidate (3, 3), ICRS to camera, within some sigmas of the truth.
         scale: scale of the candidate.
-        searched: share of all attitudes from which candidates were taken; 1 if lost in space.
+        searched: fraction of all attitudes from which candidates were taken; 1 if lost in space.
         settings: conditions of acceptance.
     """
-    return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
-
-
-def verify_matrix(
-    field: StarField,
-    sky: SkyIndex,
-    matrix: FloatArray,
-    scale: float,
-    searched: float = 1.0,
-    settings: VerificationSettings = VerificationSettings(),
-) -> StarMatch:
-    """Return the identification as `verify` does, for an attitude matrix (3, 3)."""
-    expected = expected_stars(sky, matrix, _half_width(field, scale), int(1.3 * len(field)) + 8)
+    expected = _expected_in(field, sky, matrix, scale)
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
     start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
     decided = _settle(deciding, sky, expected, start, searched, settings)
@@ -203,38 +191,29 @@ def verify_matrix(
     if matching.log10_chance > settings.log10_false_alarm:
         return nothing(field)
     if deciding is not field:
-        expected = expected_stars(
-            sky, refined.matrix, _half_width(field, refined.scale), int(1.3 * len(field)) + 8
-        )
+        expected = _expected_in(field, sky, refined.matrix, refined.scale)
         decided = _settle(field, sky, expected, refined, searched, settings)
         if decided is None:
             return nothing(field)
         matching, refined = decided
     # A calibrated lens has no unknown distortion. Other lenses have, if stars are missed or scatter.
-    if field.scale[1] > field.scale[0] and (
-        _share_of_bright(expected, matching.star) < _FEW_MISSED
-        or inflation(refined.squares, len(refined.covariance)) > 1.0
-    ):
+    bright = _bright_matched(expected, matching.star)
+    missed = not len(bright) or float(np.mean(bright)) < _FEW_MISSED
+    scattered = inflation(refined.squares, len(refined.covariance)) > 1.0
+    if field.scale[1] > field.scale[0] and (missed or scattered):
         return _distorted(field, sky, matching, refined)
     return _identified(field, matching, refined.widened())
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
     """Return the identification with distortion fitted; NO_MATCH if bright stars are displaced."""
-    width = _half_width(field, refined.scale)
-    expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
+    expected = _expected_in(field, sky, refined.matrix, refined.scale)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
         return nothing(field)
     grown = _Matching(found.observed, found.star, matching.log10_chance)
     answer = _identified(field, grown, found.refined)
     return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
-
-
-def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
-    """Return the share of the bright expected stars that match."""
-    matched = _bright_matched(expected, star)
-    return float(np.mean(matched)) if len(matched) else 0.0
 
 
 def _bright_matched(
@@ -255,7 +234,7 @@ def _share_displaced(
     unmatched = np.delete(found.seen, found.observed, axis=0)
     if not len(missed) or not len(unmatched):
         return 0.0
-    across, down = _half_width(field, found.refined.scale)
+    across, down = (width * found.refined.scale for width in field.half_width)
     radius = _DISPLACED_BY * math.hypot(across, down)
     nearest = (unmatched @ (found.refined.matrix @ missed.T)).max(axis=0)
     near = np.count_nonzero(2.0 - 2.0 * nearest < radius**2)
@@ -283,8 +262,10 @@ def expected_stars(
     return np.asarray(near[inside][:count])
 
 
-def _half_width(field: StarField, scale: float) -> tuple[float, float]:
-    return field.half_width[0] * scale, field.half_width[1] * scale
+def _expected_in(field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float) -> npt.NDArray[np.intp]:
+    """Return the numbers of the guide stars that a field of some stars may contain, the brightest first."""
+    across, down = field.half_width
+    return expected_stars(sky, matrix, (across * scale, down * scale), int(1.3 * len(field)) + 8)
 
 
 def _settle(
@@ -314,7 +295,12 @@ def _settle(
             refined.scale,
             field.scale[1] > field.scale[0],
         )
-        if found is None or not _plausible(found, field):
+        if found is None:
+            return None
+        # The fitted scale must lie in the range of the lens, within five of its sigmas.
+        lowest, highest = field.scale
+        slack = math.exp(5.0 * found.scale_sigma)
+        if lowest != highest and not lowest / slack <= found.scale <= highest * slack:
             return None
         refined = found
     return (previous, refined) if previous is not None else None
@@ -359,15 +345,6 @@ def _match(
         if best is None or value < best.log10_chance:
             best = _Matching(within, expected[nearest[within]], value)
     return best
-
-
-def _plausible(refined: Refinement, field: StarField) -> bool:
-    """Return whether the fitted scale lies in the range of the lens, within five of its sigmas."""
-    lowest, highest = field.scale
-    if lowest == highest:
-        return True
-    slack = math.exp(5.0 * refined.scale_sigma)
-    return lowest / slack <= refined.scale <= highest * slack
 
 
 def _identified(field: StarField, matching: _Matching, refined: Refinement) -> StarMatch:
@@ -421,7 +398,7 @@ def track(
             matrix, scale = found.matrix, found.scale
     # Volume of the ball of rotations around the prior over that of all rotations, 8 pi^2 in this measure.
     searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
-    return verify_matrix(field, sky, matrix, scale, searched, settings)
+    return verify(field, sky, matrix, scale, searched, settings)
 
 
 def _same_shift(

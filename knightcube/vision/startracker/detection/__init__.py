@@ -21,7 +21,6 @@ from knightcube.vision.startracker.detection.survey import (
     FrameKind,
     FrameShape,
     Survey,
-    kind_of_frame,
     survey,
 )
 
@@ -33,7 +32,6 @@ __all__ = [
     "Quality",
     "Survey",
     "detect",
-    "kind_of_frame",
     "measure_areas",
     "measure_near",
     "survey",

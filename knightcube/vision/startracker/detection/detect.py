@@ -258,7 +258,17 @@ def measure_areas(seen: Survey) -> Detections:
     open_sky = (flags & Quality.CLUTTER) == 0
     chosen = worth_measuring(peaks, open_sky, pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
     peaks, flags = peaks.select(chosen), flags[chosen]
-    targets = _targets(pixels, seen.sky, areas, peaks)
+    column, row = peaks.place.T
+    targets = StarTargets(
+        pixels,
+        peaks.place,
+        seen.sky.level.at(column, row),
+        seen.sky.pixel_noise.at(column, row),
+        areas.ceiling,
+        peaks.core,
+        np.zeros((len(peaks), 2)),
+        seen.sky.correlation,
+    )
     shapes = first_look(targets, settings.gain)
     spread = frame_spread(shapes, plain_ones(flags == 0, targets), settings)
     found = measure(targets, shapes, spread, settings)
@@ -267,7 +277,11 @@ def measure_areas(seen: Survey) -> Detections:
     quality = quality | Quality.CLUTTER * among_odd(odd, found.points)
     real = confirmed(found, targets, settings) | ((quality & REFUSED) != 0)
     whole = assemble(found, shapes, quality, targets, spread, np.full(len(peaks), -1)).select(real)
-    return _brightest(whole.in_order(), settings.most_stars).scaled(seen.unit)
+    found_all = whole.in_order()
+    # The brightest stars, and the same number of sources that are not stars.
+    star = found_all.is_star
+    kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= settings.most_stars
+    return found_all.select(kept).scaled(seen.unit)
 
 
 def quality_of(found: MeasuredStars, shapes: Shapes, spread: FrameSpread, targets: StarTargets) -> IntArray:
@@ -342,13 +356,6 @@ def assemble(
     )
 
 
-def _targets(pixels: Image, sky: SkyBackground, areas: Areas, peaks: Peaks) -> StarTargets:
-    column, row = peaks.place.T
-    level, noise = sky.level.at(column, row), sky.pixel_noise.at(column, row)
-    still = np.zeros((len(peaks.place), 2))
-    return StarTargets(pixels, peaks.place, level, noise, areas.ceiling, peaks.core, still, sky.correlation)
-
-
 def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
     """Return the flags (p,) that follow from the areas: streak and clutter."""
     noise = sky.smooth_noise
@@ -360,13 +367,6 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
         long &= np.bincount(peaks.area, minlength=len(areas))[peaks.area] == 1
         long &= (areas.length[peaks.area] > _LONGER_THAN_COMA) & (peaks.core == 0.0)
     return np.asarray(Quality.CLUTTER * clutter | Quality.STREAK * long)
-
-
-def _brightest(found: Detections, most: int) -> Detections:
-    """Return the brightest `most` stars and as many sources that are not stars."""
-    star = found.is_star
-    kept = np.where(star, np.cumsum(star), np.cumsum(~star)) <= most
-    return found.select(kept)
 
 
 # Width (px) of the rim around the search area from which the sky is measured.
@@ -447,7 +447,12 @@ def _peaks_near(
     targets = StarTargets(pixels, middle, level, noise, ceiling, core, windows.trail, correlation)
     apart = np.linalg.norm(middle - predicted, axis=1)
     number = np.flatnonzero(bright)
-    number = number[_nearest(middle[number], apart[number])]
+    points, apart = middle[number], apart[number]
+    # Of several predictions at one peak, the nearest one counts.
+    same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
+    order = np.arange(len(points))
+    better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))
+    number = number[~np.any(same & better, axis=1)]
     return targets.select(number), number
 
 
@@ -493,11 +498,3 @@ def _median(values: FloatArray) -> FloatArray:
     """Return the lower median (n,) of each row of `values` (n, k), in which infinity is ignored."""
     count = np.maximum(np.isfinite(values).sum(axis=1), 1)
     return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])
-
-
-def _nearest(points: IntArray, apart: FloatArray) -> BoolArray:
-    """Return which peaks (n,) are nearer to their prediction than all others at the same position."""
-    same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
-    order = np.arange(len(points))
-    better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))
-    return np.asarray(~np.any(same & better, axis=1))

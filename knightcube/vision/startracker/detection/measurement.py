@@ -404,7 +404,9 @@ def measure(
             continue
         some, before = targets.select(chosen), shapes.fitted.select(np.flatnonzero(chosen))
         if saturated:
-            part = _fitted(some, before, spread, _half_of(some, spread), free_width=True)
+            widest = float(some.core.max(initial=0.0)) + REACH * spread.psf_sigma + 1.0
+            half = int(np.clip(np.ceil(widest), LEAST_HALF, 2 * MOST_HALF))
+            part = _fitted(some, before, spread, half, free_width=True)
         elif settings.method != "psf":
             part = _centred(some, spread, settings)
         else:
@@ -412,11 +414,6 @@ def measure(
         for name in MeasuredStars.__slots__:
             getattr(out, name)[chosen] = getattr(part, name)
     return out
-
-
-def _half_of(targets: StarTargets, spread: FrameSpread) -> int:
-    widest = float(targets.core.max(initial=0.0)) + REACH * spread.psf_sigma + 1.0
-    return int(np.clip(np.ceil(widest), LEAST_HALF, 2 * MOST_HALF))
 
 
 def _fitted(

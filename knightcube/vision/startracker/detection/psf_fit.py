@@ -200,10 +200,6 @@ class NoiseModel:
         seen = np.maximum(light, 0.0)
         return np.asarray((noise**2)[:, None, None] + self.photon * seen + (self.mismatch * seen) ** 2)
 
-    def tolerant(self, light: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return `variance` (n, k, k) increased for PSFs that are not Gaussian."""
-        return np.asarray(variance + (_TOLERATED * light) ** 2)
-
 
 def measure_noise(
     residual: FloatArray,
@@ -369,7 +365,8 @@ def fit(
         variance = noise.variance(star, windows.noise)
         good = windows.good
         if step >= steps - _CLIP_FROM_END:
-            good = good & ~_foreign(residual, noise.tolerant(star, variance))
+            # The limit tolerates PSFs that are not Gaussian.
+            good = good & ~(residual * residual > _CLIP**2 * (variance + (_TOLERATED * star) ** 2))
         weight = (good / variance).reshape(len(values), -1)
         weighted = jacobian * weight[:, None, :]
         normal = weighted @ jacobian.transpose(0, 2, 1)
@@ -395,34 +392,23 @@ def fit(
 
 def _jacobian(values: FloatArray, windows: StarWindows, count: int) -> tuple[FloatArray, FloatArray]:
     """Return the light (n, k, k) of the stars and its derivatives (n, count, k k)."""
-    out: FloatArray | None = None
+    total: FloatArray | None = None
+    flux, size = values[:, FLUX, None], 2 * windows.half + 1
     for shift, share in path(windows.trail):
-        part = _derivatives(values, shift, windows.half, count)
-        out = share * part if out is None else out + share * part
-    assert out is not None  # a path has places
-    star = values[:, FLUX, None, None] * out[:, FLUX]
-    return star, out.reshape(len(values), count, -1)
-
-
-def _derivatives(values: FloatArray, shift: FloatArray, half: int, count: int) -> FloatArray:
-    """Return the derivatives (n, count, k, k) of the light of stars displaced by `shift` (n, 2) px."""
-    across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], half)
-    down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], half)
-    flux = values[:, FLUX, None]
-    size = 2 * half + 1
-    out = np.empty((len(values), count, size, size))
-    np.multiply(down[:, :, None], (flux * across_x)[:, None, :], out=out[:, X])
-    np.multiply((flux * down_y)[:, :, None], across[:, None, :], out=out[:, Y])
-    np.multiply(down[:, :, None], across[:, None, :], out=out[:, FLUX])
-    out[:, SKY] = 1.0
-    if count > WIDTH:
-        out[:, WIDTH] = (flux * down)[:, :, None] * across_w[:, None, :]
-        out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
-    return out
-
-
-def _foreign(residual: FloatArray, variance: FloatArray) -> BoolArray:
-    return np.asarray(residual * residual > _CLIP**2 * variance)
+        across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], windows.half)
+        down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], windows.half)
+        out = np.empty((len(values), count, size, size))
+        np.multiply(down[:, :, None], (flux * across_x)[:, None, :], out=out[:, X])
+        np.multiply((flux * down_y)[:, :, None], across[:, None, :], out=out[:, Y])
+        np.multiply(down[:, :, None], across[:, None, :], out=out[:, FLUX])
+        out[:, SKY] = 1.0
+        if count > WIDTH:
+            out[:, WIDTH] = (flux * down)[:, :, None] * across_w[:, None, :]
+            out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
+        total = share * out if total is None else total + share * out
+    assert total is not None  # a path has at least one point
+    star = values[:, FLUX, None, None] * total[:, FLUX]
+    return star, total.reshape(len(values), count, -1)
 
 
 def _advance(values: FloatArray, step: FloatArray, half: int) -> None:

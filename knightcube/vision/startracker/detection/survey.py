@@ -398,7 +398,7 @@ def find_areas(pixels: Image, sky: SkyBackground, bright: BrightPixels, saturati
         column,
         owner,
         bright.smooth,
-        _peaks(bright.smooth, *_adjoining(bright.index, bright.shape[1])),
+        _local_maxima(bright.index, bright.smooth, bright.shape[1]),
         counts >= ceiling,
         ceiling,
         np.bincount(owner, minlength=count),
@@ -428,25 +428,20 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     return found
 
 
-def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
-    """Return pairs (p,), (p,) of adjacent pixels, as positions in the increasing flat numbers `index` (m,).
+def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArray:
+    """Return which pixels (m,) are higher than all adjacent pixels; of equal neighbours, the last one is.
 
-    The outermost columns hold no bright pixel, so pixels at opposite borders of the frame are never paired.
+    `index` (m,) are the increasing flat numbers of the pixels. Pixels below the noise threshold are lower
+    than those above it. The outermost columns hold no bright pixel, so pixels at opposite borders of the
+    frame are never compared.
     """
     pairs = []
     for step in (1, columns - 1, columns, columns + 1):
         other = np.searchsorted(index, index + step)
         other[other == len(index)] = 0
-        first = np.flatnonzero(index[other] == index + step) if len(index) else other
-        pairs.append((first, other[first]))
-    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
-
-
-def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
-    """Return which pixels (m,) are higher than all adjacent pixels; of equal neighbours, the last one is.
-
-    Pixels below the noise threshold are lower than those above it.
-    """
+        lower = np.flatnonzero(index[other] == index + step) if len(index) else other
+        pairs.append((lower, other[lower]))
+    first, second = (np.concatenate(each) for each in zip(*pairs, strict=True))
     best = np.ones(len(smooth), dtype=bool)
     best[first[smooth[first] <= smooth[second]]] = False
     best[second[smooth[second] < smooth[first]]] = False
@@ -540,11 +535,3 @@ def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
     sky = measure_sky(pixels)
     bright = find_bright(pixels, sky, settings.threshold_sigmas)
     return Survey(pixels, unit, settings, sky, find_areas(pixels, sky, bright, settings.saturation))
-
-
-def kind_of_frame(pixels: Image, settings: DetectionSettings | None = None) -> FrameShape:
-    """Return whether a frame (rows, columns) shows points, streaks or neither, and the median length.
-
-    Raises ValueError as `detect`.
-    """
-    return survey(pixels, settings).shape

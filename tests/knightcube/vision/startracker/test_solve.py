@@ -53,7 +53,7 @@ def _solve(
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
     # The simulated lens is perfect but for its focal length.
-    camera, settings = NARROW.pinhole, SolveSettings(untold_lens=False)
+    camera, settings = NARROW.pinhole, SolveSettings(uncalibrated_lens=False)
     return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 
 

@@ -11,7 +11,13 @@ import math
 import numpy as np
 import pytest
 
-from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply, normalise
+from knightcube.astro.quaternion import (
+    angle_between,
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+)
 from knightcube.vision.startracker.attitude_fit import MatchStatus
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.verification import Chance, order_probability, track, verify
@@ -107,7 +113,7 @@ def test_the_truth_verifies_and_its_false_stars_are_left_out() -> None:
     drawn = _drawn(ListKind(noise_px=0.2, false_stars=5, known_deg=0.1), 4)
     field = drawn.field()
     scale = 0.5 * 1024 / drawn.camera.focal_length / field.half_width[0]
-    found = verify(field, SKY, drawn.attitude, scale)
+    found = verify(field, SKY, attitude_matrix(drawn.attitude), scale)
     assert found.status is MatchStatus.IDENTIFIED
     wrong = (found.star >= 0) & (found.star != drawn.star)
     assert wrong.sum() <= 1
@@ -117,7 +123,10 @@ def test_the_truth_verifies_and_its_false_stars_are_left_out() -> None:
 def test_an_attitude_off_by_half_a_degree_does_not_verify() -> None:
     drawn = _drawn(ListKind(noise_px=0.2), 6)
     off = from_rotation_vector(np.deg2rad([0.5, 0.0, 0.0]))
-    assert verify(drawn.field(), SKY, multiply(off, drawn.attitude), 1.0).status is MatchStatus.NO_MATCH
+    assert (
+        verify(drawn.field(), SKY, attitude_matrix(multiply(off, drawn.attitude)), 1.0).status
+        is MatchStatus.NO_MATCH
+    )
 
 
 def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> None:
@@ -128,7 +137,7 @@ def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> 
         field = drawn.field().subset(np.arange(4))
         scale = 0.5 * 1024 / drawn.camera.focal_length / field.half_width[0]
         for case, searched in (("tracking", 1e-9), ("lost", 1.0)):
-            found = verify(field, SKY, drawn.attitude, scale, searched)
+            found = verify(field, SKY, attitude_matrix(drawn.attitude), scale, searched)
             convinced[case] += found.status is MatchStatus.IDENTIFIED
     assert convinced["tracking"] >= 12
     assert convinced["lost"] <= 5

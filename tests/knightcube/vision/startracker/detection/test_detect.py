@@ -22,8 +22,8 @@ from knightcube.vision.startracker.detection import (
     FrameKind,
     Quality,
     detect,
-    kind_of_frame,
     measure_near,
+    survey,
 )
 from knightcube.vision.startracker.detection.survey import Method
 from knightcube.vision.streaks.geometry import Motion
@@ -199,12 +199,12 @@ def test_a_sky_cut_off_at_zero_gives_no_flood_of_false_stars() -> None:
 
 
 def test_frames_of_points_and_of_streaks_are_told_apart() -> None:
-    assert kind_of_frame(real_sky(1, 1.2, 0.001, 0.2).pixels).kind is FrameKind.POINTS
-    streaked = kind_of_frame(real_sky(1, 1.2, 40.0, 0.2).pixels)
+    assert survey(real_sky(1, 1.2, 0.001, 0.2).pixels).shape.kind is FrameKind.POINTS
+    streaked = survey(real_sky(1, 1.2, 40.0, 0.2).pixels).shape
     assert streaked.kind is FrameKind.STREAKS
     assert streaked.length == pytest.approx(40.0, rel=0.25)
     noise = counts(sky(np.random.default_rng(1)))
-    assert kind_of_frame(noise).kind is FrameKind.NEITHER
+    assert survey(noise).shape.kind is FrameKind.NEITHER
 
 
 def test_streaks_are_refused_as_points() -> None:
@@ -371,7 +371,7 @@ def test_nearly_all_of_the_twenty_brightest_detections_are_bright_catalogue_star
     places = catalogue_places(json.loads((SKY / "truth.json").read_text())[name], pixels.shape)
     apart = np.linalg.norm(found.points[:20, None] - places, axis=-1).min(axis=1)
     assert np.count_nonzero(apart < max(4.0, _TOLERANCE * pixels.shape[1])) >= 15
-    assert kind_of_frame(pixels).kind is FrameKind.POINTS
+    assert survey(pixels).shape.kind is FrameKind.POINTS
 
 
 def test_leaves_are_not_among_the_stars() -> None:
@@ -380,7 +380,7 @@ def test_leaves_are_not_among_the_stars() -> None:
     in_tree = (found.points[:, 0] > 310.0) & (found.points[:, 1] < 310.0)
     assert np.count_nonzero(in_tree[:20]) <= 5
     assert np.count_nonzero(~in_tree) >= 14
-    assert kind_of_frame(read_image(SKY / "tree.jpg")).kind is not FrameKind.STREAKS
+    assert survey(read_image(SKY / "tree.jpg")).shape.kind is not FrameKind.STREAKS
 
 
 def test_a_noisy_raw_frame_gives_few_false_stars_and_a_dark_one_too() -> None:
