@@ -24,7 +24,7 @@ from flight.schema.values import (
     Vector,
 )
 from knightcube.vision.camera.lens import CameraKnowledge, CameraModel, Lens, Pinhole
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 
 _KNOWN = CameraKnowledge()
 ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
@@ -263,17 +263,12 @@ def camera_knowledge(camera: Camera) -> CameraKnowledge:
     The fit has no lens model, so the deviation of a calibrated lens from the pinhole adds to the uncertainty.
     """
     accuracy = camera.accuracy
-    centre, distortion = accuracy.centre, accuracy.distortion
-    if camera.lens is not None:
-        lens = camera.lens
-        middle = 0.5 * (camera.columns - 1), 0.5 * (camera.rows - 1)
-        square = math.hypot(*middle) ** 2 / lens.focal_length**2
-        centre = math.hypot(centre, math.dist(lens.centre, middle))
-        distortion = math.hypot(distortion, square * (lens.k1 + square * lens.k2))
     line_time = accuracy.line_time
     if line_time is None and camera.line_time is not None:
         line_time = 0.0
-    return CameraKnowledge(accuracy.focal_length, centre, distortion, line_time)
+    knowledge = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion, line_time)
+    lens = camera_model(camera)
+    return knowledge_of_pinhole(knowledge, lens) if isinstance(lens, Lens) else knowledge
 
 
 def likelihood_settings(camera: Camera) -> LikelihoodSettings:

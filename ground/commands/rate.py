@@ -25,18 +25,9 @@ from knightcube.vision.objects.detect import SpaceObject, detect_objects
 from knightcube.vision.objects.settings import ObjectSettings
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
+from knightcube.vision.streaks.streak_result import REASONS, FrameMotion, MotionResult, StreakStatus
 
 LIKELIHOOD = "likelihood"
-
-_REASONS = {
-    StreakStatus.FAILED: "no motion that enough of the light vouches for",
-    StreakStatus.TOO_FEW: "too few streaks stand out of the noise",
-    StreakStatus.TOO_SHORT: "the stars hardly moved",
-    StreakStatus.BLACK: "the frame is of one value: it shows no scene",
-    StreakStatus.SATURATED: "the frame is overexposed",
-}
-
 
 _SHUTTER = (
     "shutter:       not described, which the claim allows for: give --line-time, 0 for all rows at once\n"
@@ -192,7 +183,7 @@ def _reason(found: FrameMotion) -> str:
     if found.rate is not None:
         return ""
     detailed = found.reason if isinstance(found, MotionResult) else ""
-    return detailed or _REASONS.get(found.status, "")
+    return detailed or REASONS.get(found.status, "")
 
 
 def _text(found: FrameMotion, objects: tuple[SpaceObject, ...]) -> str:

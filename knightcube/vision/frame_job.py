@@ -215,7 +215,7 @@ def solve_frame(
     """
     tracker = TrackerSettings(settings, scale)
     # The positions of the stars are needed, for which a poorly known rate is sufficient.
-    estimator = replace(settings.likelihood, worst_doubt=math.inf, worst_shaking=math.inf)
+    estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )

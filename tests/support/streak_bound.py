@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.geometry import Motion, paths, sensitivities
+from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
 
 # Parameters of one star's information: turn (3), point spread, then position (2), electrons, background.
 _SHARED = 4
@@ -56,7 +56,7 @@ def rate_bound(
     `electrons` (n,) are of the whole exposure, `floor` e-^2 a pixel. Raises numpy.linalg.LinAlgError when
     the stars do not fix the rate.
     """
-    motion = Motion.steady(np.asarray(rate) * exposure)
+    motion = CameraMotion.steady(np.asarray(rate) * exposure)
     shared = np.zeros((_SHARED, _SHARED))
     parts = []
     for star, light in zip(stars, electrons, strict=True):
@@ -105,7 +105,7 @@ def endpoint_bound(
 
 
 def star_information(
-    pinhole: Pinhole, motion: Motion, star: FloatArray, electrons: float, psf_sigma: float, floor: float
+    pinhole: Pinhole, motion: CameraMotion, star: FloatArray, electrons: float, psf_sigma: float, floor: float
 ) -> FloatArray:
     """Return the Fisher information (8, 8) of turn (3) rad, PSF sigma px, x, y px, electrons, background.
 

@@ -26,19 +26,19 @@ from knightcube.vision.startracker.solve import (
     SolveStatus,
     solve_motion,
 )
-from knightcube.vision.streaks.estimate import Wholeness, with_rate, with_stars
-from knightcube.vision.streaks.frame import ExposedFrame, expose_frame
+from knightcube.vision.streaks.estimate import StreakVerdict, with_rate, with_stars
+from knightcube.vision.streaks.frame import ReducedFrame, reduce_frame
 from knightcube.vision.streaks.geometry import (
-    Motion,
-    Scene,
+    CameraMotion,
     Shutter,
-    apart,
-    circles,
-    close_by,
+    StreakScene,
+    azimuth_differences,
+    near_streaks,
     path_lengths,
+    polar_angles,
     positions,
 )
-from knightcube.vision.streaks.joint_fit import ExposedCamera, joint_fit
+from knightcube.vision.streaks.joint_fit import FitProblem, joint_fit
 from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
@@ -115,8 +115,8 @@ def refit_motion(
     known = _known_stars(motion, solution, sky, settings, course, most)
     if known is None:
         return None
-    camera = ExposedCamera(
-        expose_frame(pixels, likelihood.saturation, likelihood.gain),
+    camera = FitProblem(
+        reduce_frame(pixels, likelihood.saturation, likelihood.gain),
         pinhole,
         Shutter(likelihood.delay_per_row / exposure, pinhole.centre[1]),
         likelihood,
@@ -130,7 +130,7 @@ def refit_motion(
         return None
     # The stars that were not fitted are known from the catalogue, so no fit of fewer streaks is better.
     done = replace(done, hidden=None)
-    refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
+    refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None
     assumed = np.zeros((3, 3)) if motion.course is None else motion.course.covariance(exposure)
@@ -149,12 +149,12 @@ def refit_motion(
     )
 
 
-def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
+def _course_of(motion: MotionResult, rate: FloatArray) -> CameraMotion:
     """Return the rotation over the exposure from the mean `rate` (3,), rad/s, and the terms of `motion`."""
     exposure = motion.exposure
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
-    return Motion.between(rate * exposure, growth, shape)
+    return CameraMotion.between(rate * exposure, growth, shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,7 +173,7 @@ class _Known:
 
     @classmethod
     def seen(
-        cls, pinhole: Pinhole, course: Motion, places: FloatArray, light: FloatArray, most: int
+        cls, pinhole: Pinhole, course: CameraMotion, places: FloatArray, light: FloatArray, most: int
     ) -> _Known:
         """Return the stars in the frame, at most `most`, those with the most light in it first."""
         n = len(places)
@@ -203,7 +203,7 @@ def _known_stars(
     solution: FrameSolution,
     sky: SkyIndex,
     settings: SolveSettings,
-    course: Motion,
+    course: CameraMotion,
     most: int,
 ) -> _Known | None:
     """Return the stars in the frame; None if no fitted star was identified, whose light gives the scale."""
@@ -216,7 +216,7 @@ def _known_stars(
     magnitude = sky.stars.magnitude
     zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
     pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
-    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.whole)), 0.5 * np.pi)
+    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.rotation)), 0.5 * np.pi)
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
     direction = sky.stars.direction[near]
     if settings.velocity is not None:
@@ -226,14 +226,14 @@ def _known_stars(
 
 
 def _scenes(
-    camera: ExposedCamera, course: Motion, known: _Known, motion: MotionResult
-) -> tuple[Scene, Scene]:
+    camera: FitProblem, course: CameraMotion, known: _Known, motion: MotionResult
+) -> tuple[StreakScene, StreakScene]:
     """Return the stars to fit, of which the brightest are trusted, and the stars to subtract."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
     room = _NEAR * settings.reach * width
-    near = leading | close_by(camera.pinhole, course, known.places, known.places[leading], room)
+    near = leading | near_streaks(camera.pinhole, course, known.places, known.places[leading], room)
     twin = known.twins()
     path = path_lengths(camera.pinhole, course, known.places) + 2.0 * np.sqrt(np.pi) * width
     light = known.light * known.inside
@@ -249,20 +249,22 @@ def _scenes(
     )
 
 
-def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, trusted: BoolArray) -> Scene:
-    return Scene(course, width, places, light, np.zeros(len(light)), trusted)
+def _scene(
+    course: CameraMotion, width: float, places: FloatArray, light: FloatArray, trusted: BoolArray
+) -> StreakScene:
+    return StreakScene(course, width, places, light, np.zeros(len(light)), trusted)
 
 
-def _foreign(pinhole: Pinhole, course: Motion, motion: MotionResult, known: _Known) -> IntArray:
+def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known: _Known) -> IntArray:
     """Return which measured stars are not in the catalogue, neither at their position nor along their streak.
 
     The first fit may have split a bright star into two, one behind the other.
     """
     near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
-    polar, azimuth = circles(pinhole, course, motion.stars)
-    known_polar, known_azimuth = circles(pinhole, course, known.places)
+    polar, azimuth = polar_angles(pinhole, course, motion.stars)
+    known_polar, known_azimuth = polar_angles(pinhole, course, known.places)
     beside = np.abs(polar[:, None] - known_polar) * pinhole.focal_length < _BESIDE
-    near |= beside & (apart(azimuth, known_azimuth) < float(np.linalg.norm(course.whole)))
+    near |= beside & (azimuth_differences(azimuth, known_azimuth) < float(np.linalg.norm(course.rotation)))
     alike = known.light > _ALIKE * motion.flux[:, None]
     return np.flatnonzero(~(near & alike).any(axis=1))
 
@@ -273,7 +275,7 @@ def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
     return np.asarray((worst > _SAME).all(axis=1))
 
 
-def _without(camera: ExposedCamera, hidden: Scene) -> ExposedFrame:
+def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
     """Return the frame without the light of `hidden` stars, with their uncertainty added to its noise."""
     frame = camera.frame
     if not len(hidden.light):

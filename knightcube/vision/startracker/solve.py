@@ -310,7 +310,7 @@ def solve_motion(
         seen,
         points=motion.stars[chosen],
         covariance=motion.star_covariance[chosen],
-        late=motion.late(chosen, camera.centre[1]),
+        late=motion.line_time_displacement(chosen, camera.centre[1]),
     )
     solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
     if solution.fix is None:

@@ -1,4 +1,16 @@
-"""The frame on circles about the axis of rotation: there every streak is straight and equally long."""
+"""Detection of faint streaks under a known motion, and a search for the angle of rotation, on polar grids.
+
+The 3 x 3 sums of the frame are sampled on circles about the axis of rotation, where every streak is straight
+and of the same length. A running sum of that length is the matched filter of a streak: along its circle, the
+response of a star is a triangle, truncated at the border of the detector; across, it is the profile of the
+star. Peaks of the response are stars; the heights of overlapping responses are solved for together. For
+bright stars, the second difference along the circle separates merging triangles.
+
+If a few regions do not give the angle of rotation, because streaks are faint and fragmented or all are cut by
+the border, all circles are searched. A box along a circle is compared with the pixels before and behind it,
+together as long as the box. The squared significance of all boxes that stand out is largest at the true
+length.
+"""
 
 from __future__ import annotations
 
@@ -13,27 +25,32 @@ from scipy.special import ndtr
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import less_boxes
-from knightcube.vision.streaks.frame import ExposedFrame, Float32Array
-from knightcube.vision.streaks.geometry import Motion, paths
+from knightcube.vision.streaks.frame import Float32Array, ReducedFrame
+from knightcube.vision.streaks.geometry import CameraMotion, paths
 
-ACROSS = 1.8
-"""Spacing of the circles, px."""
-
-# Spacing of the samples along them, px.
+# Spacing (px) of the circles.
+_ACROSS = 1.8
+# Spacing (px) of the samples along a circle.
 _ALONG = 4.0
-# Circles worked on at a time, so that they stay in the processor's cache.
+# Number of circles processed at a time, so that they fit into the processor's cache.
 _CHUNK = 64
+# Smallest polar angle (rad) of a circle.
 _NEAREST = 0.003
-# The detector's border is looked at in steps of this many pixels.
+# Spacing (px) of the points that represent the border of the detector.
 _BORDER_STEP = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarGrid:
-    """Samples (r, c) on circles about the axis.
+    """Samples (r, c) on circles about the axis of rotation.
 
-    `frame` (3, 3) has two axes across and the axis as rows; `polar` (r,) and `azimuth` (c,) rad; `length`
-    samples make a streak of `angle` rad; `speed` (r,) px per rad.
+    Attributes:
+        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
+        polar: (r,) rad, angle of each circle from the axis.
+        azimuth: (c,) rad, of each sample on a circle.
+        length: number of samples in a streak.
+        angle: rad, rotation over the exposure.
+        speed: (r,) px per rad of azimuth.
     """
 
     frame: FloatArray
@@ -45,26 +62,26 @@ class PolarGrid:
 
     @property
     def full(self) -> bool:
-        """Whether the circles close."""
+        """Whether the circles are complete."""
         return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
 
     @property
     def off_centre(self) -> float:
-        """By how much an even number of samples is not about its middle one."""
+        """The offset of the centre of a running sum from a sample: 0.5 for an even number of samples."""
         return 0.0 if round(self.length) % 2 else 0.5
 
     def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
-        """Return the pixels (k, 2) of places (k,) between samples."""
+        """Return the pixels (k, 2) at fractional rows and columns (k,) of the grid."""
         polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
         azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
         local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
         return pinhole.project((self.frame.T @ local).T)
 
 
-def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
-    """Return the circles that cross the detector, one in `every`."""
-    angle = float(np.linalg.norm(motion.whole))
-    axis = motion.whole / angle
+def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
+    """Return the circles that cross the detector, or one in `every` of them."""
+    angle = float(np.linalg.norm(motion.rotation))
+    axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
     if axis @ middle < 0.0:
         axis = -axis
@@ -75,7 +92,7 @@ def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
     first = first / np.linalg.norm(first)
     frame = np.stack([first, np.cross(axis, first), axis])
     half = pinhole.half_diagonal
-    spacing = every * ACROSS / pinhole.focal_length
+    spacing = every * _ACROSS / pinhole.focal_length
     polar = np.arange(max(inside_field - half, _NEAREST), inside_field + half, spacing)
     fastest = float(np.max(np.sin(polar))) * pinhole.focal_length
     step = min(_ALONG / fastest, angle / 6.0)
@@ -90,19 +107,18 @@ def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
 def sampled(
     sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
 ) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
-    """Yield some circles after others: which, and where they cross the detector; their samples there.
+    """Yield groups of circles: their rows, the columns on the detector, samples, and which samples exist.
 
-    The samples of `sums`, zero along the border, are in whole `unit`s: whole numbers add up several times
-    faster than others, and exactly. Beside them stands which exist. Where circles close, `room` samples
-    beside those that cross the detector are on the grid too.
+    The samples of `sums` (zero along the border) are integer multiples of `unit`, for fast and exact
+    summation. If the circles are complete, the columns include `room` samples on either side of the detector.
     """
-    # Directions over the sine of the polar angle: one part for the azimuth, one for the circle.
+    # Directions divided by the sine of the polar angle are a term of the azimuth plus a term of the circle.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
     last = np.int32(pinhole.columns - 1), np.int32(pinhole.rows - 1)
     flat = sums.reshape(-1)
-    for part, crossing in _crossings(pinhole, grid, room):
+    for part, crossing in _groups(pinhole, grid, room):
         depth = around[2, crossing] + aloft[2, part, None]
         np.maximum(depth, np.float32(1e-3), out=depth)
         np.divide(np.float32(pinhole.focal_length), depth, out=depth)
@@ -110,7 +126,7 @@ def sampled(
         for axis, limit in ((0, last[0]), (1, last[1])):
             place = around[axis, crossing] + aloft[axis, part, None]
             place *= depth
-            # Half a pixel more, and the fraction cut off: rounded.
+            # Rounding by truncation.
             place += np.float32(pinhole.centre[axis] + 0.5)
             np.maximum(place, np.float32(0.0), out=place)
             np.minimum(place, np.float32(limit), out=place)
@@ -124,8 +140,8 @@ def sampled(
         yield part, crossing, np.rint(samples, out=samples), inside
 
 
-def _crossings(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
-    """Yield circles, some after others, and between which azimuths they cross the detector."""
+def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
+    """Yield groups of circles, and the range of azimuths in which they cross the detector."""
     x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
     sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
     along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
@@ -137,7 +153,7 @@ def _crossings(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[s
     for start in range(0, len(grid.polar), _CHUNK):
         part = slice(start, min(start + _CHUNK, len(grid.polar)))
         near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # The azimuths are about the direction to the field's middle: away from it the field ends first.
+        # Azimuth pi points away from the image centre.
         behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
         if grid.full and pinhole.contains(behind, margin=2.0)[0]:
             yield part, slice(0, count)
@@ -151,20 +167,21 @@ def _crossings(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[s
 
 Int32Array = npt.NDArray[np.int32]
 
-# Pixels to a side of what is summed for a sample.
+# Side (px) of the square that is summed for a sample.
 _BOX = 3.0
-# What a sum of samples, in whole units, never exceeds.
+# Largest sum of samples, in units.
 _HIGHEST = 2.0**30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSums:
-    """Samples summed over a streak's length.
+    """Samples summed over the length of a streak.
 
     Attributes:
-        light: (r, c) counts; count: (r, c) how many samples exist.
-        span: (r, 2) between which columns a circle's samples exist; without bounds where not in one piece.
-        excess: (r,) by what factor noise exceeds that of samples which share no pixels.
+        light: (r, c) counts.
+        count: (r, c) number of existing samples.
+        span: (r, 2) first and last column of existing samples; infinite if they are not contiguous.
+        excess: (r,) noise relative to that of samples that share no pixels.
     """
 
     light: Float32Array
@@ -174,20 +191,21 @@ class RunningSums:
 
 
 def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
-    """Return the running sums of samples of `sums` within half a streak.
+    """Return the running sums of samples of `sums` within half a streak of each sample.
 
-    `sums` is zero along the border, where all that is outside is sampled; it is rounded to `unit` counts.
+    `sums` must be zero along the border, which represents all positions outside. It is rounded to `unit`
+    counts.
     """
     width = max(round(grid.length), 1)
     before, after = width // 2, width - width // 2
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Where no circle crosses the detector nothing is ever written: such memory is never fetched.
+    # Memory that is not written, where no circle crosses the detector, is never allocated.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
     for part, crossing, samples, inside in sampled(sums, pinhole, grid, width, unit):
         wide = samples.shape[1]
-        # Samples, and whether they exist, with room for a streak to either side.
+        # Samples, and whether they exist, with a margin of one streak on either side.
         padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
         middle = slice(width + 1, width + 1 + wide)
         padded[0, :, middle] = samples
@@ -204,14 +222,21 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
         count[part, low:high] = held[1]
         begin, end = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
         whole = inside.sum(axis=1) == end - begin + 1
-        # An even number of samples is not about its middle one, but half a sample before it.
+        # An even number of samples is centred half a sample before its middle one.
         edges = np.stack([begin - 0.5, end + 0.5], axis=1) + crossing.start + grid.off_centre
         span[part] = np.where(whole[:, None], edges, span[part])
-    return RunningSums(response, count, span, _excess(grid, width))
+    # Samples on the slow circles near the axis share pixels, so that their noise is correlated.
+    spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
+    slow = np.flatnonzero(spacing < _BOX)
+    steps = np.arange(1, width)
+    common = np.maximum(1.0 - spacing[slow, None] * steps / _BOX, 0.0)
+    excess = np.ones(len(spacing))
+    excess[slow] = np.sqrt(1.0 + 2.0 * common @ (1.0 - steps / width))
+    return RunningSums(response, count, span, excess)
 
 
-def totals(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the totals (r, c + 1) of the samples of `sums` before each sample of a circle."""
+def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
+    """Return the cumulative sums (r, c + 1) of the samples of `sums` before each sample of a circle."""
     out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
     for part, crossing, samples, _ in sampled(sums, pinhole, grid, 0, 1.0):
         out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
@@ -219,52 +244,37 @@ def totals(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Arra
     return out
 
 
-def _excess(grid: PolarGrid, width: int) -> FloatArray:
-    """Return the noise (r,) of sums of `width` samples of 3 x 3 pixels over that of samples far apart.
-
-    On the slow circles near the axis samples are so close that they are of the same pixels.
-    """
-    spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
-    slow = np.flatnonzero(spacing < _BOX)
-    steps = np.arange(1, width)
-    common = np.maximum(1.0 - spacing[slow, None] * steps / _BOX, 0.0)
-    out = np.ones(len(spacing))
-    out[slow] = np.sqrt(1.0 + 2.0 * common @ (1.0 - steps / width))
-    return out
-
-
-LEAST_SEEN = 0.35
-"""A streak needs this part of itself on the detector."""
-FARTHEST = 5
-"""Circles so far apart share no light."""
-
-# Width of the point spread and the pixel together that the filter supposes, px.
+# Minimum fraction of a streak on the detector.
+_LEAST_SEEN = 0.35
+# Number of circles between stars that share no light.
+_FARTHEST = 5
+# Width (px) of the point spread convolved with a pixel, as the filter assumes it.
 _WIDTH = 1.05
-# Samples between a response and its neighbours by which two ends are separated, used for streaks of this many
-# samples or more; how much it takes, in sigmas and as a share of the height.
+# Step (samples) of the second difference, minimum length (samples) of a streak for it, and the minimum second
+# difference of a star, in standard deviations and relative to its height.
 _SHARP_STEP = 3
 _SHARP_FROM = 40.0
 _SHARP_SIGMAS = 6.0
 _SHARP_SHARE = 0.3
-# A peak under another's shoulder must hold so much of what is there on its own.
+# Minimum own part of the response of a peak that overlaps a stronger one.
 _OWN_SHARE = 0.45
 _MOST_PEAKS = 1000
-# A summit is no lower than these: rows and columns from it, those first that rule most out.
+# Rows and columns from a local maximum to its neighbours, in order of their distance.
 _NEIGHBOURS = sorted(
     ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# The response of circles beside a star's own is tabulated in this many steps a px.
+# Tabulated response across the circles, and number of entries per px.
 _PER_PX = 50.0
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
 
-def shared(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
-    """Return the part of a streak of `length` samples about `one` that another has in common with it.
+def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
+    """Return the overlap of streaks centred at columns `one` and `other` (...), relative to their length.
 
-    All arrays alike, `span` (..., 2) with between what columns there are samples at all.
+    `span` (..., 2) is the range of columns in which samples exist; `length` is in samples.
     """
     first = np.maximum(np.maximum(one, other) - 0.5 * length, span[..., 0])
     last = np.minimum(np.minimum(one, other) + 0.5 * length, span[..., 1])
@@ -272,7 +282,7 @@ def shared(one: FloatArray, other: FloatArray, span: FloatArray, length: float) 
 
 
 def profile(distance: FloatArray) -> FloatArray:
-    """Return the response of circles `distance` px beside a star's own, 1 at the star."""
+    """Return the response at `distance` px across the circle of a star, relative to that at the star."""
     index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
     return np.asarray(_PROFILE[index])
 
@@ -280,10 +290,10 @@ def profile(distance: FloatArray) -> FloatArray:
 def sharp_peaks(
     held: RunningSums, place: IntArray, deviation: FloatArray, grid: PolarGrid
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rows and columns of the stars whose both ends stand out.
+    """Return fractional rows and columns of the bright stars, by the second difference of the response.
 
-    The second difference of a response by a few samples is a narrow peak, be there other stars a little
-    farther along the circle; it tells of the bright, which have the light for it.
+    Its peak is narrow, so that it separates stars that are close to each other on one circle. `place` (p,)
+    are flat indices of high responses, `deviation` (p,) the noise there.
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -293,61 +303,39 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # Of the height that a lone star's bend gives; its noise is that of few samples, times the leverage.
+    # Scaled to the height of an isolated star; the noise is that of few samples times the leverage.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
     sharp = np.zeros(held.light.shape, dtype=np.float32)
     sharp.reshape(-1)[place] = bend
-    row, column = _summits(sharp, place[sharply])
+    row, column = _local_maxima(sharp, place[sharply])
     return _refined(sharp, row, column, 0), _refined(sharp, row, column, 1)
 
 
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rows and columns, between samples, of the peaks, strongest first, that stand on their own.
+    """Return fractional rows and columns of the peaks, strongest first, that stronger ones do not explain.
 
-    Only the flat places (p,) are looked at; all others are lower.
+    Only the flat indices `place` (p,) are searched. `span` is that of `RunningSums`.
     """
-    row, column = _summits(significance, place)
-    value = significance[row, column].astype(np.float64)
-    kept = _standing(row, column, value, span[row], grid, sigmas)
-    row, column = row[kept], column[kept]
-    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
-
-
-def _summits(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of those flat places (p,) that no neighbour exceeds, the highest first."""
-    flat, columns = values.reshape(-1), values.shape[1]
-    value = flat[place]
-    # Past the last column comes the next circle's first: on full circles nearly the neighbour it should be.
-    for down, beside in _NEIGHBOURS:
-        summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
-        place, value = place[summit], value[summit]
-    place = place[np.argsort(-value, kind="stable")[:_MOST_PEAKS]]
-    row, column = np.divmod(place, columns)
-    return row, column
-
-
-def _standing(
-    row: IntArray, column: IntArray, value: FloatArray, span: FloatArray, grid: PolarGrid, sigmas: float
-) -> BoolArray:
-    """Return which peaks (n,), strongest first, rise above the shoulders of those kept before them."""
+    row, column = _local_maxima(significance, place)
+    value, spans = significance[row, column].astype(np.float64), span[row]
     by_row = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[by_row], row - FARTHEST + 1)
-    count = np.searchsorted(row[by_row], row + FARTHEST) - first
+    first = np.searchsorted(row[by_row], row - _FARTHEST + 1)
+    count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # In a crowd there are hundreds of thousands of pairs: most are too far apart to share anything.
+    # A crowded frame has hundreds of thousands of pairs, most too far apart to overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
-    share = shared(there[stronger], there[weaker], span[stronger], grid.length)
-    share /= np.maximum(shared(there, there, span, grid.length), LEAST_SEEN)[stronger]
+    share = overlap_of(there[stronger], there[weaker], spans[stronger], grid.length)
+    share /= np.maximum(overlap_of(there, there, spans, grid.length), _LEAST_SEEN)[stronger]
     shading = np.flatnonzero(share > 0.0)
     stronger, weaker = stronger[shading], weaker[shading]
-    share = share[shading] * profile((row[stronger] - row[weaker]) * ACROSS)
+    share = share[shading] * profile((row[stronger] - row[weaker]) * _ACROSS)
     begin = np.searchsorted(stronger, np.arange(len(row) + 1))
     own = value.copy()
     kept = np.zeros(len(row), dtype=np.bool_)
@@ -357,11 +345,25 @@ def _standing(
         kept[k] = True
         shaded = slice(begin[k], begin[k + 1])
         own[weaker[shaded]] -= own[k] * share[shaded]
-    return kept
+    row, column = row[kept], column[kept]
+    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
+
+
+def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the flat indices `place` (p,) that are local maxima, highest first."""
+    flat, columns = values.reshape(-1), values.shape[1]
+    value = flat[place]
+    # The index after the last column is on the next circle, a close neighbour if the circles are complete.
+    for down, beside in _NEIGHBOURS:
+        summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
+        place, value = place[summit], value[summit]
+    place = place[np.argsort(-value, kind="stable")[:_MOST_PEAKS]]
+    row, column = np.divmod(place, columns)
+    return row, column
 
 
 def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
-    """Return the peaks' places along `axis`, between samples: the vertex of a parabola."""
+    """Return the fractional positions of peaks along `axis`, from the vertex of a parabola."""
     place = (row, column)[axis]
     size = significance.shape[axis]
     before, after = np.maximum(place - 1, 0), np.minimum(place + 1, size - 1)
@@ -372,28 +374,29 @@ def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: 
     return np.asarray(place + np.clip(offset, -0.5, 0.5))
 
 
-# Samples are rounded to this part of their noise.
+# Ratio of the noise of a sample to the unit to which it is rounded.
 _ROUNDING = 30.0
-# The first for what stands out sharply.
+# Number of passes of the search; the first one uses second differences.
 _PASSES = 3
+# Relative and absolute ridge of the equations for the heights, for stars that nearly coincide.
 _RIDGE = 0.01
 _TINY = 1e-6
-# Heights are solved for to this part of them, by this many conjugate gradients at most.
+# Relative accuracy of the heights, and largest number of conjugate-gradient steps.
 _SOLVED = 1e-4
 _MOST_GRADIENTS = 200
-# Places that stars reach, worked on at a time.
+# Number of responses computed at a time.
 _SOME_PLACES = 1 << 16
-# Shorter streaks, px, are no lines that a filter could follow.
+# Minimum length (px) of a streak for the filter.
 _LEAST_LENGTH = 6.0
-# The part of a streak's light that falls in the three pixels across.
+# Fraction of a streak's light in the three pixels across it.
 _CAPTURED = 0.83
-# Noise of a sum of samples over a pixel's and the root of their number: nine pixels each, which overlap.
+# Noise of a sum of n overlapping samples of nine pixels, relative to a pixel's noise and the root of n.
 _SAMPLE_NOISE = 3.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaintStars:
-    """Streaks found: stars (n, 2) px at mid-exposure, light and significance (n,)."""
+    """Detected streaks: stars (n, 2) px at mid-exposure, light (n,) counts and significance (n,)."""
 
     stars: FloatArray
     light: FloatArray
@@ -401,25 +404,30 @@ class FaintStars:
 
 
 def find_faint(
-    frame: ExposedFrame,
+    frame: ReducedFrame,
     modelled: tuple[IntArray, Float32Array],
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     sigmas: float,
     most: int,
 ) -> FaintStars:
-    """Return the `most` strongest streaks along `motion` in the frame less `modelled`: pixels (m,), light."""
+    """Return the `most` significant streaks along `motion` in the frame without `modelled` light.
+
+    `modelled` has flat indices of pixels (m,) and their light (m,) in counts.
+    """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
-    reach = float(np.linalg.norm(motion.whole)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
+    reach = (
+        float(np.linalg.norm(motion.rotation)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
+    )
     if max(float(np.hypot(*middle[0])), reach) < _LEAST_LENGTH:
         return FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
-    held = running_sums(_left_over(frame, modelled), pinhole, grid, usual / _ROUNDING)
-    # The noise for every number of samples; too few are ignored.
+    held = running_sums(_residual_sums(frame, modelled), pinhole, grid, usual / _ROUNDING)
+    # Noise by number of samples; sums of too few are excluded.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
-    noise[: math.ceil(LEAST_SEEN * grid.length)] = np.inf
-    row, column, height = _cleaned(held, noise, grid, sigmas, most)
+    noise[: math.ceil(_LEAST_SEEN * grid.length)] = np.inf
+    row, column, height = _found_stars(held, noise, grid, sigmas, most)
     significance = _significance(held, noise, grid, row, column, height)
     order = np.argsort(-significance, kind="stable")
     row, column, height, significance = row[order], column[order], height[order], significance[order]
@@ -430,33 +438,33 @@ def find_faint(
     return FaintStars(stars[seen], light[seen], significance[seen])
 
 
-def _left_over(frame: ExposedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
-    """Return the 3 x 3 sums (rows * columns,) of the frame less `modelled` light and pixels to leave out."""
+def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
+    """Return the 3 x 3 sums (rows * columns,) of the frame without `modelled` light and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Where a bright star was taken out, what is left is mostly its own noise.
+    # Residuals of bright stars, which are mostly their own photon noise, are attenuated.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
     lost = frame.bad.copy()
     lost[pixels] = False
-    untold = np.flatnonzero(lost)
+    unmodelled = np.flatnonzero(lost)
     return less_boxes(
         frame.sums,
         frame.shape,
-        np.concatenate([pixels, untold]),
-        np.concatenate([signal - left, frame.signal[untold]]),
+        np.concatenate([pixels, unmodelled]),
+        np.concatenate([signal - left, frame.signal[unmodelled]]),
     )
 
 
-def _cleaned(
+def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return rows, columns (between samples) and heights of the stars whose responses add up to those `held`.
+    """Return fractional rows and columns, and heights, of the stars whose responses add up to `held`.
 
-    Passes find the peaks that rise above what is left, solve the heights of all found together (their
-    responses overlap), and take them out. `noise` is by count of samples. What does not exceed it at first
-    never will: all passes look at few places.
+    Each pass finds peaks in the residual response, solves for the heights of all stars together, and
+    subtracts them. `noise` is the noise by number of samples. All passes search only responses that exceed it
+    initially.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())
@@ -480,7 +488,7 @@ def _cleaned(
         height = _heights(held, row, column, grid)
         kept = _significance(held, noise, grid, row, column, height) > sigmas
         row, column, height = row[kept], column[kept], height[kept]
-        left = flat[place] - _given(held, place, grid, row, column, height)
+        left = flat[place] - _responses(held, place, grid, row, column, height)
     return row, column, height
 
 
@@ -492,18 +500,14 @@ def _significance(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return how many deviations of the noise the visible part of stars (k,) makes."""
+    """Return the significance (k,) of stars of `height` (k,), in standard deviations of the noise."""
     middle = np.rint(row).astype(int)
-    seen = shared(column, column, held.span[middle], grid.length)
-    own = noise[held.count[middle, _wrapped(column, held.light)]] * held.excess[middle]
+    seen = overlap_of(column, column, held.span[middle], grid.length)
+    own = noise[held.count[middle, np.rint(column).astype(int) % held.light.shape[1]]] * held.excess[middle]
     return np.asarray(height * seen / own)
 
 
-def _wrapped(column: FloatArray, response: Float32Array) -> IntArray:
-    return np.asarray(np.rint(column).astype(int) % response.shape[1])
-
-
-def _given(
+def _responses(
     held: RunningSums,
     place: IntArray,
     grid: PolarGrid,
@@ -511,11 +515,11 @@ def _given(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the responses of stars (k,) of `height` at the flat places (p,), ascending."""
+    """Return the responses (p,) at the flat indices `place` (p,), ascending, of stars of `height` (k,)."""
     rows, columns = held.light.shape
-    # On each circle near a star's its response is one stretch of places.
-    circle = row.astype(np.int64)[:, None] + np.arange(1 - FARTHEST, FARTHEST + 1)
-    weight = height[:, None] * profile((circle - row[:, None]) * ACROSS)
+    # On each neighbouring circle the response of a star is a contiguous range of columns.
+    circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
+    weight = height[:, None] * profile((circle - row[:, None]) * _ACROSS)
     weight = np.where((circle >= 0) & (circle < rows), weight, 0.0)
     circle = np.clip(circle, 0, rows - 1)
     low = np.maximum(np.ceil(column - grid.length), 0.0).astype(np.int64)
@@ -525,15 +529,15 @@ def _given(
     reached = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
     first, count = first[reached], count[reached]
     circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
-    star = reached // (2 * FARTHEST)
+    star = reached // (2 * _FARTHEST)
     out = np.zeros(len(place))
-    # A crowd of stars gives a multiple of the frame: some stretches at a time.
+    # Ranges are processed in groups, because many stars need more memory than the frame.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
     for some in np.split(np.arange(len(reached)), np.unique(cuts)):
         many = count[some]
         which = np.arange(many.sum()) + np.repeat(first[some] - np.cumsum(many) + many, many)
         at = (place[which] - np.repeat(circle[some] * columns, many)).astype(np.float64)
-        common = shared(
+        common = overlap_of(
             at,
             np.repeat(column[star[some]], many),
             np.repeat(held.span[circle[some]], many, axis=0),
@@ -545,28 +549,30 @@ def _given(
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Return the heights (k,) whose overlapping responses best give what is `held` at the stars' places."""
+    """Return the heights (k,) of stars whose overlapping responses add up to the response at each star."""
     middle = np.rint(row).astype(int)
     one, other = _neighbours(row, column, grid.length)
     span = held.span[middle]
     common = np.stack(
         [np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])], axis=-1
     )
-    overlap = shared(column[one], column[other], common, grid.length) * profile(
-        (row[one] - row[other]) * ACROSS
+    overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
+        (row[one] - row[other]) * _ACROSS
     )
-    # A ridge, for stars that almost coincide; the scale it takes from all others is given back.
+    # The ridge is for stars that nearly coincide; the right side compensates its effect on the others.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
-    seen = (1.0 + _RIDGE) * held.light[middle, _wrapped(column, held.light)].astype(np.float64)
+    seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
+        np.float64
+    )
     return _solved(one, other, overlap, seen)
 
 
 def _neighbours(row: FloatArray, column: FloatArray, length: float) -> tuple[IntArray, IntArray]:
-    """Return the pairs of stars (k,), each with itself among them, whose responses may overlap."""
+    """Return the pairs of stars, including each star with itself, whose responses may overlap."""
     order = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[order], row - FARTHEST, side="right")
-    count = np.searchsorted(row[order], row + FARTHEST) - first
+    first = np.searchsorted(row[order], row - _FARTHEST, side="right")
+    count = np.searchsorted(row[order], row + _FARTHEST) - first
     one = np.repeat(np.arange(len(row)), count)
     other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
     near = np.flatnonzero(np.abs(column[one] - column[other]) < length)
@@ -574,9 +580,9 @@ def _neighbours(row: FloatArray, column: FloatArray, length: float) -> tuple[Int
 
 
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution (k,) of the equations whose elements `overlap` (e,) stand at `one`, `other`.
+    """Return the solution (k,) of sparse equations by conjugate gradients.
 
-    Conjugate gradients: each star meets few others.
+    The elements `overlap` (e,) of the matrix are at rows `one` and columns `other`.
     """
     k = len(right)
     scale = 1.0 / np.sqrt(overlap[one == other])
@@ -596,44 +602,47 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
     return np.asarray(x * scale)
 
 
-# Lengths tried differ by this factor, from this many samples on.
+# Ratio of consecutive trial lengths, and the shortest length in samples.
 _FACTOR = 1.1
 _SHORTEST = 5
-# One circle in this many suffices.
+# Number of circles per circle that is used.
 _SPARSE = 2
-# Noise of a sum of samples over a pixel's and the root of their number: nine pixels each, which overlap.
-_TOTAL_NOISE = 3.1
+# Minimum significance of a box, and the significance to which it is limited (standard deviations).
 _LEAST_SIGMAS = 5.0
-# No streak counts more than this many sigmas.
 _ENOUGH = 40.0
 
 
-def frame_angles(frame: ExposedFrame, pinhole: Pinhole, turn: FloatArray, most: int) -> list[float]:
-    """Return the `most` likeliest angles, rad, about the axis of `turn` (3,), the likeliest first."""
-    # A turn by one radian has the longest steps and the widest circles.
-    grid = polar_grid(pinhole, Motion.steady(turn / np.linalg.norm(turn)), _SPARSE)
+def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
+    """Return the `most` likeliest angles (rad) about the axis of `rotation` (3,), likeliest first."""
+    # A rotation by one radian has the longest steps and the widest circles.
+    grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
-    held = totals(frame.sums, pinhole, grid)
-    held *= np.float32(1.0 / (_TOTAL_NOISE * np.sqrt(np.median(frame.floor[::97]))))
+    held = cumulative_sums(frame.sums, pinhole, grid)
+    held *= np.float32(1.0 / (_SAMPLE_NOISE * np.sqrt(np.median(frame.floor[::97]))))
     longest = min(len(grid.azimuth) // 2, int(np.pi / step))
     if longest < 2 * _SHORTEST:
         return []
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
-    # Azimuth by azimuth, so that what is compared lies side by side.
+    # Azimuth is the first axis, for contiguous memory.
     padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
-    score = np.array([_standing_out(padded, room, int(width)) for width in widths])
+    score = np.array([_box_significance(padded, room, int(width)) for width in widths])
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")][:most]
-    return [_sharpened(padded, room, sharper_widths(int(widths[index]), longest)) * step for index in peak]
+    angles = []
+    for index in peak:
+        near = sharper_widths(int(widths[index]), longest)
+        refined = [_box_significance(padded, room, int(width)) for width in near]
+        angles.append(int(near[int(np.argmax(refined))]) * step)
+    return angles
 
 
-def _standing_out(padded: Float32Array, room: int, width: int) -> float:
-    """Return the squared significance of the boxes of `width` samples that stand out most.
+def _box_significance(padded: Float32Array, room: int, width: int) -> float:
+    """Return the sum of squared significances of the boxes of `width` samples that are local maxima.
 
-    `padded` (c, r) are the totals by azimuth, with `room` more on either side.
+    `padded` (c, r) are the cumulative sums by azimuth, with a margin of `room` samples on either side.
     """
     stretches = (len(padded) - 2 * room - width) // width
     outer, inner, behind, beyond = (
@@ -644,7 +653,7 @@ def _standing_out(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The highest box of each stretch of a circle, if none beside it is higher.
+    # The highest box of each stretch of a circle, if no neighbour is higher.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)
@@ -656,12 +665,6 @@ def _standing_out(padded: Float32Array, room: int, width: int) -> float:
 
 
 def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the widths within half a step of `width`, none over `longest`."""
+    """Return the widths (samples) within half a step of `width`, limited to `longest`."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
     return np.arange(max(width - room, 2), min(width + room, longest) + 1)
-
-
-def _sharpened(padded: Float32Array, room: int, widths: IntArray) -> int:
-    """Return the best of the widths."""
-    score = [_standing_out(padded, room, int(each)) for each in widths]
-    return int(widths[int(np.argmax(score))])

@@ -1,4 +1,11 @@
-"""The joint fit: the brightest stars, and all that share their pixels."""
+"""The joint fit of the motion and the brightest stars, with all stars that share their pixels.
+
+The fit iterates until the shared parameters have settled. It sees only a few pixels beyond the ends of the
+streaks: a rotation that is too small by a fifth can fit one end of every streak, and one that is too large
+has dark stretches. The brightness along the paths shows both (`true_ends`, `unbroken`). If an end lies more
+than a few widths of the point spread beyond the light, the pixels around it are only dark, and the fit may
+settle there; the end of the light along a longer stretch then corrects the length (`stretched`).
+"""
 
 from __future__ import annotations
 
@@ -10,46 +17,47 @@ from scipy.special import fdtri
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.faint_stars import FaintStars, find_faint
-from knightcube.vision.streaks.frame import ExposedFrame, Float32Array
+from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import (
-    Motion,
-    Scene,
+    CameraMotion,
     Shutter,
-    close_by,
-    mid_exposure,
+    StreakScene,
+    exposure_bounds,
+    mid_exposure_positions,
+    near_streaks,
     path_lengths,
     paths,
     positions,
-    window_times,
 )
 from knightcube.vision.streaks.normal_equations import (
     ALONE,
     SHARED,
     Evaluation,
-    OwnEstimates,
+    FitWindows,
     Solution,
-    Windows,
-    agreed_step,
-    agreeing,
+    StarEstimates,
+    consistent_stars,
     cut_windows,
     evaluate,
     light_of,
-    moved,
-    own_estimates,
     solve,
+    star_estimates,
+    step_significance,
+    stepped,
     window_areas,
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Beyond this no rival motion is begun. A fit in hand is finished: the whole frame may take twice as much.
-_MOST = 1_600_000
-# What an evaluation of the model costs whatever its pixels, and a pass over the frame, a part of its pixels.
+# Work (pixels) after which no other motion is tried. A fit in progress is finished, so that a frame may take
+# twice as much.
+_MOST_WORK = 1_600_000
+# Fixed work of an evaluation of the model, and work per pixel of a pass over the frame.
 _EVALUATION = 15_000
 _PASS = 0.15
 
 
-class Work:
-    """The work that was done on one frame."""
+class WorkBudget:
+    """Counts the work on one frame in pixels, not in time, so that results are the same on all machines."""
 
     def __init__(self) -> None:
         self._spent = 0.0
@@ -64,47 +72,50 @@ class Work:
 
     @property
     def exhausted(self) -> bool:
-        """Whether nothing more may be begun."""
-        return self._spent > _MOST
+        """Whether the work exceeds the limit for further motions."""
+        return self._spent > _MOST_WORK
 
 
+# Longest displacement (px) of an end in one step.
 _LONGEST_STEP = 3.0
-# An end so far, px, from where its window was cut has left the window's middle.
+# Displacement (px) of an end after which windows are cut again.
 _DRIFT = 2.0
-# Ends of untrusted stars may be farther from it; after the first round in fresh windows by any distance: all
-# windows are not cut again for those whose light hardly fixes their place.
+# The same for untrusted stars in the first round. Later rounds ignore them, because the light of some of them
+# hardly determines their position.
 _FAINT_DRIFT = 3.2
-# The growth may change by this part of the turn before that.
+# Change of the acceleration, relative to the rotation, after which windows are cut again.
 _GROWN = 0.1
-# Converged: no shared parameter moves by more than this part of its standard deviation. The step is
-# taken, and what it leaves is of second order.
+# Step of the shared parameters, in standard deviations, at which the fit has settled. The step is applied, so
+# that the remaining error is of second order.
 SETTLED = 0.4
-# Out of patience, a step that is not so much shorter than the one before ends the rounds.
+# Ratio of consecutive steps above which the fit stops once its patience is exhausted.
 _LEAST_PROGRESS = 0.7
-# After this many rounds the choice of pixels left out is final.
+# Number of rounds after which the selection of clipped pixels is final.
 _LOOKS = 1
-# Probability of a constant rate being taken for a changing one.
+# Probability of rejecting a constant rate by chance.
 _BY_CHANCE = 1e-4
-# Below this part of the limit no closer test is needed.
+# Fraction of the limit below which the exact test is omitted.
 _FAR_BELOW = 0.5
-# The parameters of the change.
+# Number of parameters of the acceleration.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
+"""The free shared parameters of a changing rate."""
+# Largest width (px) of the point spread, and largest ratio to the initial width in a joint fit.
 _WIDEST = 6.0
-# A joint fit whose point spread grows beyond this many of the first fit's has lost the streaks.
 _WIDER = 1.6
 
 
 @dataclass(frozen=True, slots=True)
-class Rounds:
-    """How a scene is fitted.
+class IterationLimits:
+    """Limits of the iteration.
 
     Attributes:
-        rounds: at most.
-        clipped: whether pixels far beyond the noise are left out.
-        tolerance: steps of an end or the width that are as good as none, px; settled: in deviations.
-        conjugate: gradients at most for the pixels that stars share.
-        patience: rounds that are spent whether or not they bring the fit on.
+        rounds: maximum number of rounds.
+        clipped: whether pixels far beyond the noise are excluded.
+        tolerance: px, step of an end or of the width at which the fit has settled.
+        settled: step of the shared parameters, in standard deviations, at which the fit has settled.
+        conjugate: maximum number of conjugate-gradient steps for shared pixels.
+        patience: number of rounds without a check of progress.
     """
 
     rounds: int
@@ -115,32 +126,36 @@ class Rounds:
     patience: int
 
 
-FIRST = Rounds(6, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
-ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=6, patience=3)
-LAST = Rounds(7, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
+FIRST = IterationLimits(6, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
+ROUGH = IterationLimits(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=6, patience=3)
+LAST = IterationLimits(7, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ExposedCamera:
-    """A frame with all that is known of how it was taken.
+class FitProblem:
+    """A frame with everything known about its exposure.
 
     Attributes:
-        growing: whether the rate may change.
-        course: the motion as it is known from elsewhere; None where unknown, or as good as constant.
-        work: that was done on the frame.
-        sigma: px, of the point spread, where the fit of its width starts.
-        sense: (3,) a vector along which the camera turns, not against it; None where either will do.
+        frame: the frame.
+        pinhole: geometry of the camera.
+        shutter: times of exposure of the rows.
+        settings: settings of the estimator.
+        sigma: px, initial width of the point spread.
+        growing: whether the acceleration is fitted.
+        sense: (3,) direction that the rotation must have a positive component along; None: either sense.
+        course: the motion as known from navigation; None if unknown or nearly constant.
+        work: work spent on the frame.
     """
 
-    frame: ExposedFrame
+    frame: ReducedFrame
     pinhole: Pinhole
     shutter: Shutter
     settings: LikelihoodSettings
     sigma: float
     growing: bool = False
     sense: FloatArray | None = None
-    course: Motion | None = None
-    work: Work = field(default_factory=Work)
+    course: CameraMotion | None = None
+    work: WorkBudget = field(default_factory=WorkBudget)
 
     @property
     def free(self) -> BoolArray:
@@ -149,49 +164,53 @@ class ExposedCamera:
 
     @property
     def undecided(self) -> bool:
-        """Whether the pixels are yet to show that the rate changes."""
+        """Whether the pixels decide if the rate changes, and have not done so."""
         return self.settings.rate_model == "auto" and not self.growing
 
-    def windows(self, scene: Scene) -> Windows:
-        """Return the pixels about the scene's streaks."""
+    def windows(self, scene: StreakScene) -> FitWindows:
+        """Return the pixels near the streaks of `scene`."""
         return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
 
-    def evaluate(self, scene: Scene, windows: Windows, clip: float) -> Evaluation:
-        """Return the normal equations."""
+    def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
+        """Return the normal equations of `scene`, see `normal_equations.evaluate`."""
         self.work.evaluated(len(windows.slot))
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class StreakFit:
     """A scene after its last step, with the equations of that step.
 
     Attributes:
-        windows: its pixels; free: (SHARED,) which shared parameters were fitted.
-        restless: the last step of the shared parameters, in standard deviations; 0 when the fit has settled.
-        hidden: stars on its pixels that were not fitted, but taken out as they were known; None without.
+        scene: the fitted scene.
+        solution: last step.
+        evaluation: equations of the last step.
+        last_step: last step of the shared parameters, in standard deviations; 0 if the fit has settled.
+        windows: fitted pixels.
+        free: (SHARED,) which shared parameters were fitted.
+        hidden: stars on the fitted pixels that were subtracted and not fitted; None without any.
     """
 
-    scene: Scene
+    scene: StreakScene
     solution: Solution
     evaluation: Evaluation
-    restless: float
-    windows: Windows
+    last_step: float
+    windows: FitWindows
     free: BoolArray
-    hidden: Scene | None = None
+    hidden: StreakScene | None = None
 
     def grows(self) -> bool:
-        """Return whether the pixels show that the rate changes: a score test of the constant one.
+        """Return whether the pixels show a change of the rate, by a score test of the constant rate.
 
-        The stars' agreement on the change is held against their spread (Hotelling).
+        The scatter of the stars' accelerations enters the test (Hotelling).
         """
-        # As if no stars shared pixels first: mostly that decides.
+        # The approximation without shared pixels decides most cases.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
                 return False
-            agreed, stars = agreed_step(self.evaluation, solution.shared)
+            agreed, stars = step_significance(self.evaluation, solution.shared)
             freedom = stars - _GROWTHS
             if freedom < 1:
                 return False
@@ -202,62 +221,60 @@ class Fit:
 
 
 def iterate(
-    camera: ExposedCamera, scene: Scene, free: BoolArray, how: Rounds, windows: Windows | None = None
-) -> Fit | None:
-    """Return the fit after some rounds, None when the stars do not fix the motion."""
+    camera: FitProblem,
+    scene: StreakScene,
+    free: BoolArray,
+    how: IterationLimits,
+    windows: FitWindows | None = None,
+) -> StreakFit | None:
+    """Return the fit of all stars and the `free` (SHARED,) shared parameters, None if not determined."""
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
-    restless, asked, before = np.inf, np.inf, np.zeros(SHARED)
+    last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
-        evaluation = None  # tens of MB, as is the next
+        evaluation = None  # frees tens of MB before the next evaluation
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
-        scene, wanted = moved(scene, solution, camera.pinhole, _LONGEST_STEP)
-        if not _possible(scene) or scene.width > widest:
+        scene, wanted = stepped(scene, solution, camera.pinhole, _LONGEST_STEP)
+        valid = 0.3 < scene.width < _WIDEST and scene.width <= widest
+        valid &= bool(np.all(np.isfinite(scene.stars)))
+        if not valid or not np.linalg.norm(scene.motion.rotation) <= np.pi:
             return None
         deviation = np.sqrt(np.maximum(np.diag(solution.covariance)[free], 1e-30))
-        restless = float(np.max(np.abs(solution.shared[free]) / deviation))
-        if restless <= how.settled or wanted <= how.tolerance:
-            restless = 0.0
+        last_step = float(np.max(np.abs(solution.shared[free]) / deviation))
+        if last_step <= how.settled or wanted <= how.tolerance:
+            last_step = 0.0
             break
-        # Steps that lead on in one direction are a long way; those to and fro lead nowhere.
+        # Consecutive steps in the same direction still make progress.
         onward = (
             float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
         )
-        if turn >= how.patience and wanted > _LEAST_PROGRESS * asked and not onward:
+        if turn >= how.patience and wanted > _LEAST_PROGRESS * previous and not onward:
             break
-        asked, before = wanted, solution.shared
+        previous, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
-            del windows, whole  # tens of MB, as are the new ones
+            del windows, whole  # frees tens of MB before new windows are cut
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
-            # Pixels that come and go as they are left out and taken in would keep the fit from settling.
+            # A changing selection of clipped pixels would keep the fit from settling.
             windows = whole.only(*evaluation.kept)
     if solution is None or evaluation is None:
         return None
-    return Fit(scene, solution, evaluation, restless, whole, free)
+    return StreakFit(scene, solution, evaluation, last_step, whole, free)
 
 
-def _possible(scene: Scene) -> bool:
-    return (
-        0.3 < scene.width < _WIDEST
-        and bool(np.all(np.isfinite(scene.stars)))
-        and float(np.linalg.norm(scene.motion.whole)) <= np.pi
-    )
+def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
+    """Return whether windows must be cut again: an end has moved, or the acceleration has changed.
 
-
-def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -> bool:
-    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px.
-
-    Windows are also cut for where a rate that changes makes the streaks slow.
+    `faint` (px) is the limit for the ends of untrusted stars.
     """
-    grown = float(np.linalg.norm(after.motion.growth - before.motion.growth))
-    if grown > _GROWN * float(np.linalg.norm(after.motion.whole)):
+    grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
+    if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
         return True
     n = len(before.stars)
     at = np.repeat([-0.5, 0.5], n)
@@ -267,49 +284,52 @@ def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -
     return bool(np.any(far > np.where(after.trusted, _DRIFT, faint)))
 
 
-def misfit(evaluation: Evaluation) -> float:
-    """Return the median chi-square a pixel of the stars."""
-    freedom = np.maximum(evaluation.pixels - ALONE - 1.0, 1.0)
-    return float(np.median(evaluation.chi2 / freedom))
+def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> float:
+    """Return the median chi-square per degree of freedom of some `stars`, NaN without any."""
+    freedom = np.maximum(evaluation.pixels[stars] - ALONE - 1.0, 1.0)
+    return float(np.median(evaluation.chi2[stars] / freedom)) if len(freedom) else float("nan")
 
 
-# The stretch judged: part of the path, its least length and its distance from the end, px.
+# Length of the stretch at an end: fraction of the path, minimum (px), and its distance from the end (px).
 _STRETCH = 0.1
 _LEAST_STRETCH = 8.0
 _FROM_END = 4.0
 _SAMPLES = 24
-# Within the path as many stretches are looked at.
+# Number of stretches within a path, and number of samples in each.
 _WITHIN = 10
 _WITHIN_SAMPLES = 10
+# Offsets (px) of the samples across the path.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# The part of a streak's light per px of length that each of the middle three pixels across has.
+# Mean brightness of the three central pixels across a streak, relative to its light per px of length.
 _MIDDLE = 0.287
+# Brightness relative to the expected one that separates lit from dark stretches.
 _HALF = 0.5
+# Minimum fraction of usable pixels in a stretch.
 _LEAST_VALID = 0.7
-# A stretch can be judged when the light expected exceeds this many deviations of its mean.
-_TELLING = 4.0
-# Instants at which the progress along a path is taken.
+# Minimum expected brightness of a usable stretch, in standard deviations.
+_LEAST_SIGNIFICANCE = 4.0
+# Number of instants at which the progress along a path is evaluated.
 _INSTANTS = 65
-# Where a star is slower than this part of its rate, the point spread hides how much brighter its path is.
+# Minimum speed relative to the mean in the expected brightness; the point spread smooths brighter stretches.
 _SLOW = 0.5
-# Light beyond an end is a trail from this part of the streak's mean brightness on.
+# Brightness beyond an end, relative to the streak's mean, that indicates a trail.
 _TRAIL = 0.08
-# Part of a streak that may be dark for reasons of its own.
+# Fraction of a streak's stretches that may be dark.
 _DARK = 0.15
 
 
 def true_ends(
-    frame: ExposedFrame,
+    frame: ReducedFrame,
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     stars: FloatArray,
     light: FloatArray,
     times: FloatArray,
 ) -> FloatArray:
-    """Return (n, 2) 1 for the ends that are where they should be, 0 for those that are not.
+    """Return an array (n, 2) with 1 for the ends at which the light ends, and 0 for other ends.
 
-    `times` (n, 2) are when stars (n, 2) of `light` (n,) counts begin and end to be exposed. Ends that are not
-    on the detector, and those of streaks too short to judge, are NaN.
+    Ends outside the detector and those of streaks too short to judge are NaN. `times` (n, 2) are the times
+    between which stars (n, 2) px of `light` (n,) counts are exposed.
     """
     out = np.full((len(stars), 2), np.nan)
     length = path_lengths(pinhole, motion, stars)
@@ -320,8 +340,8 @@ def true_ends(
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
     for end, sign in ((0, -1.0), (1, 1.0)):
-        steady, there, speed = ending(pinhole, motion, stars, times[:, end])
-        part = relative_brightness(motion, sign, _FROM_END / speed, (_FROM_END + stretch) / speed)
+        steady, there, speed = _end_motion(pinhole, motion, stars, times[:, end])
+        part = _relative_brightness(motion, sign, _FROM_END / speed, (_FROM_END + stretch) / speed)
         expected = expected_brightness(light, length) * part
         time = sign * away / speed[:, None]
         within, beyond = (brightness(frame, pinhole, steady, there, t)[0] for t in (-time, time))
@@ -331,52 +351,52 @@ def true_ends(
     return out
 
 
-def trailing(
-    frame: ExposedFrame,
+def trailing_fraction(
+    frame: ReducedFrame,
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     stars: FloatArray,
     light: FloatArray,
     times: FloatArray,
 ) -> float:
-    """Return the part of the stars that can be judged whose light goes on, faintly, beyond an end.
+    """Return the fraction of stars with faint light beyond an end, of the stars that can be judged.
 
-    Arguments as of `true_ends`. A rate that changes otherwise than assumed leaves a short streak with a dim
-    tail.
+    An error of the rate's change leaves such a trail. The arguments are those of `true_ends`.
     """
     faint = _TRAIL * expected_brightness(light, path_lengths(pinhole, motion, stars))
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * _LEAST_STRETCH
     judged, lit = np.zeros(len(stars), dtype=np.bool_), np.zeros(len(stars), dtype=np.bool_)
     for end, sign in ((0, -1.0), (1, 1.0)):
-        steady, there, speed = ending(pinhole, motion, stars, times[:, end])
+        steady, there, speed = _end_motion(pinhole, motion, stars, times[:, end])
         mean, deviation = brightness(frame, pinhole, steady, there, sign * away / speed[:, None])
-        known = np.isfinite(mean) & (faint > _TELLING * deviation)
+        known = np.isfinite(mean) & (faint > _LEAST_SIGNIFICANCE * deviation)
         judged |= known
         lit |= known & (mean > faint)
     return float(np.mean(lit[judged])) if judged.any() else 0.0
 
 
-def ending(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
-) -> tuple[Motion, FloatArray, FloatArray]:
-    """Return a steady motion through ends of paths, where those are (n, 2) px, and its speed (n,) there.
+def _end_motion(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
+) -> tuple[CameraMotion, FloatArray, FloatArray]:
+    """Return a steady motion, the ends of the paths (n, 2) px at `times` (n,), and the speed (n,) there.
 
-    `times` (n,) are those of the ends. Where the rate changes the path itself may be at rest there.
+    The motion itself may be at rest at an end, so that the steady motion extends the paths.
     """
     there = positions(pinhole, motion, stars, times)
-    steady = Motion.steady(motion.whole)
+    steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, there, np.zeros(len(there))).velocity
     return steady, there, np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
 
 
-def relative_brightness(motion: Motion, sign: float, near: FloatArray, far: FloatArray) -> FloatArray:
-    """Return how bright (n,) the path is from `near` to `far` (n,) of its end, over its mean.
+def _relative_brightness(motion: CameraMotion, sign: float, near: FloatArray, far: FloatArray) -> FloatArray:
+    """Return the brightness (n,) of the path between distances `near` and `far` (n,) of an end.
 
-    Distances are in parts of the path; `sign` is 1 for the last end, -1 for the first.
+    The brightness is relative to the mean, distances are fractions of the path. `sign` is 1 for the last end
+    and -1 for the first.
     """
     time = np.linspace(-0.5, 0.5, _INSTANTS)
     progress = np.maximum.accumulate(motion.progress(time))
-    # A little more with time, so that a rest has its duration.
+    # The small term in time keeps the progress increasing during a rest.
     progress += 1e-9 * np.arange(_INSTANTS)
     end = progress[-1 if sign > 0.0 else 0]
     begin, stop = (np.interp(end - sign * distance, progress, time) for distance in (near, far))
@@ -384,16 +404,16 @@ def relative_brightness(motion: Motion, sign: float, near: FloatArray, far: Floa
 
 
 def unbroken(
-    frame: ExposedFrame,
+    frame: ReducedFrame,
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     stars: FloatArray,
     light: FloatArray,
     times: FloatArray,
 ) -> FloatArray:
-    """Return 1 for each star that is bright all along its path on the detector, else 0, in one row (k,).
+    """Return 1 for each star that is bright along its entire path on the detector, else 0; (k,).
 
-    Arguments as of `true_ends`; stars too short or too faint to judge are left out.
+    Stars too short or too faint to judge are omitted. The arguments are those of `true_ends`.
     """
     length = path_lengths(pinhole, motion, stars)
     long = length > _WITHIN * _LEAST_STRETCH
@@ -404,9 +424,9 @@ def unbroken(
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
     each = np.repeat(stars, _WITHIN, axis=0)
     mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    rate = np.clip(motion.pace(time.reshape(-1)), _SLOW, None).reshape(len(each), _WITHIN_SAMPLES)
+    rate = np.clip(motion.relative_rate(time.reshape(-1)), _SLOW, None).reshape(len(each), _WITHIN_SAMPLES)
     expected = np.repeat(expected_brightness(light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
-    known = np.isfinite(mean) & (expected > _TELLING * deviation)
+    known = np.isfinite(mean) & (expected > _LEAST_SIGNIFICANCE * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
     known_of = known.reshape(-1, _WITHIN).sum(axis=1)
     judged = known_of > 0
@@ -414,16 +434,16 @@ def unbroken(
 
 
 def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the mean counts (n,) that `brightness` finds on streaks of `light` (n,) and `length` (n,) px."""
+    """Return the expected `brightness` (n,) of streaks of `light` (n,) counts and `length` (n,) px."""
     return np.asarray(_MIDDLE * light / length)
 
 
 def brightness(
-    frame: ExposedFrame, pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray
+    frame: ReducedFrame, pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean counts (n,) of pixels about a stretch of the path, at `time` (n, s), and its deviation.
+    """Return the mean counts (n,) of pixels along stretches of paths, and their standard deviations (n,).
 
-    NaN where too few are seen.
+    `time` (n, s) are the instants of each stretch. The mean is NaN if too few pixels are usable.
     """
     samples = time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
@@ -442,35 +462,35 @@ def brightness(
     return np.where(enough, total / count, np.nan), np.sqrt(variance) / count
 
 
-# Looked at is this part of a streak's length to either side of its end, between this many px, in this many
-# steps.
+# Distance from an end that is searched for the end of the light: fraction of the length, minimum and maximum
+# (px), and number of steps.
 _REACH = 0.08
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 _STEPS = 41
-# An end can be judged when its stretch of light stands out by this many deviations.
-_TELLING_EDGE = 5.0
-# Light of others counts at most this many times the star's own.
+# Minimum significance of the light near a usable end, in standard deviations.
+_EDGE_SIGNIFICANCE = 5.0
+# Largest brightness relative to the expected one, to limit the effect of other stars.
 _CAP = 2.0
-# This many streaks at least must be too long or too short, by this many px, by the same to this many, and
-# this many times as many as are as long as they should be.
+# Minimum number of streaks of wrong length, minimum error (px) and largest difference (px) of their errors,
+# and minimum ratio to the number of streaks of correct length.
 _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 _ALIKE = 3.0
 _MORE = 2
-# Beyond this change of the rate, in parts of it, the light is too uneven.
-_MOST_STRETCHED_GROWTH = 0.5
+# Largest relative change of the rate for a correction of the length.
+_MOST_STRETCHED_CHANGE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Edges:
-    """By how many px (n, 2) streaks go on beyond where they should end, NaN where unknown."""
+class LightEnds:
+    """Distances (n, 2) px of the light beyond the ends of the paths, NaN if unknown; path lengths (n,) px."""
 
     beyond: FloatArray
     length: FloatArray
 
     @property
     def stretch(self) -> float:
-        """The part of itself by which the motion is too small, 0 where streaks do not agree against it."""
+        """The relative correction of the rotation on which most streaks agree, 0 without agreement."""
         off = self.beyond.sum(axis=1)
         known = np.isfinite(off)
         off, length = off[known], self.length[known]
@@ -484,18 +504,18 @@ class Edges:
         return float(np.median(off[most] / length[most]))
 
 
-def find_edges(camera: ExposedCamera, scene: Scene) -> Edges:
-    """Return where the streaks of `scene` end in the frame, beside where its motion puts their ends."""
+def find_edges(camera: FitProblem, scene: StreakScene) -> LightEnds:
+    """Return the ends of the light in the frame relative to those of the streaks of `scene`."""
     motion, stars = scene.motion, scene.stars
     length = path_lengths(camera.pinhole, motion, stars)
     beyond = np.full((len(stars), 2), np.nan)
     long = np.flatnonzero(length > 2.0 * _LEAST_REACH)
     if not len(long):
-        return Edges(beyond, length)
+        return LightEnds(beyond, length)
     stars, own = stars[long], np.maximum(length[long], 1.0)
     reach = np.clip(_REACH * own, _LEAST_REACH, _MOST_REACH)
     outward = np.linspace(-1.0, 1.0, _STEPS) * reach[:, None]
-    times = window_times(camera.pinhole, motion, camera.shutter, stars)
+    times = exposure_bounds(camera.pinhole, motion, camera.shutter, stars)
     expected = expected_brightness(scene.light[long], own)[:, None]
     for end, sign in ((0, -1.0), (1, 1.0)):
         time = times[:, end, None] + sign * outward / own[:, None]
@@ -504,70 +524,69 @@ def find_edges(camera: ExposedCamera, scene: Scene) -> Edges:
         )
         mean, deviation = mean.reshape(-1, _STEPS), np.maximum(deviation.reshape(-1, _STEPS), 1e-6)
         seen = np.minimum(np.maximum(mean, -expected), _CAP * expected)
-        # What light explains more than darkness does, from the inside on.
+        # Log-likelihood ratio of a lit and a dark path, accumulated outwards.
         explained = np.cumsum((seen - 0.5 * expected) * expected / deviation**2, axis=1)
         last = np.argmax(explained, axis=1)
-        sure = np.sum((expected / deviation) ** 2, axis=1) > _TELLING_EDGE**2
+        sure = np.sum((expected / deviation) ** 2, axis=1) > _EDGE_SIGNIFICANCE**2
         known = np.isfinite(mean).all(axis=1) & sure
         found = outward[np.arange(len(last)), last] + 0.5 * (outward[:, 1] - outward[:, 0])
         beyond[long, end] = np.where(known, found, np.nan)
-    return Edges(beyond, length)
+    return LightEnds(beyond, length)
 
 
-def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
-    """Return `scene` with a motion by which its streaks end where their light does; None when they do.
+def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
+    """Return `scene` with its rotation corrected so that streaks and light have the same ends.
 
-    Also None where the rate changes so much that the light along a streak is not alike.
-    A star stays where its ends are, or the one that is on the detector.
+    None if no correction is needed, or if the rate changes so much that the brightness varies along a streak.
+    The stars are moved to the centre of their ends, or to the right distance from the only end in the frame.
     """
-    if abs(scene.motion.relative_growth) > _MOST_STRETCHED_GROWTH:
+    if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
     edges = find_edges(camera, scene)
     stretch = edges.stretch
     if stretch == 0.0:
         return None
     off = edges.beyond / np.maximum(edges.length, 1.0)[:, None]
-    # Mid-exposure, in exposures of the old motion, from the one end and from the other.
+    # Time of mid-exposure under the uncorrected motion, by either end.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     moved = positions(camera.pinhole, scene.motion, scene.stars, time)
-    motion = replace(scene.motion, turn=scene.motion.turn + stretch * scene.motion.whole)
+    motion = replace(scene.motion, rate=scene.motion.rate + stretch * scene.motion.rotation)
     return replace(scene, motion=motion, stars=moved)
 
 
-# A rate that changes by more than this part of itself is beyond the model: 2 is from rest, or to it.
-_MOST_GROWTH = 2.2
-# A star is trusted within this many deviations; ends (px) and width (px) are never modelled better than this.
+# Largest relative change of the rate over the exposure; 2 is a motion from rest or to rest.
+_MOST_CHANGE = 2.2
+# Deviation of a star, in standard deviations, from which it is not trusted.
 _TRUST_SIGMAS = 3.5
+# Errors of the model at the ends (px) and in the width (px).
 _END_FLOOR = 0.01
 _WIDTH_FLOOR = 0.002
-# Streaks this many reaches beside a bright one's are fitted with it: farther ones touch only its window's
-# edge.
+# Distance between streaks, in reaches, below which they are fitted together.
 _NEAR = 1.4
-# Ends that move by more px than this from the first fit to the last make the stars to be found again.
+# Displacement (px) of the ends between first and last fit from which faint stars are searched again.
 _FAR = 6.0
 _MOST_REPEATS = 2
-# How wrong the light of a faint star found along the motion may be on a pixel, as part of it.
-_DOUBT = 0.35
-# Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
-# streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
+# Relative error of the light of a subtracted star on a pixel.
+_SUBTRACTION_ERROR = 0.35
+# Maximum number of pixels in all windows, shared pixels counted for each star. It bounds memory and time.
 _MOST_PIXELS = 60_000
-# Streaks that are fitted anew with all on their pixels take this part of that, but are so many at least.
-_BARED_SHARE = 0.5
-_LEAST_BARED = 10
-# Stars that share a bright one's pixels are sought down to this significance: what they hide moves its ends.
+# Fraction of those pixels for the brightest streaks in a fit with all their neighbours, and the minimum
+# number of these streaks.
+_BRIGHTEST_SHARE = 0.5
+_LEAST_BRIGHTEST = 10
+# Minimum significance of stars that are searched on the pixels of bright ones, whose ends they shift.
 _HIDDEN_SIGMAS = 4.5
-# This many stars' light is taken out at a time.
+# Number of stars subtracted at a time.
 _AT_ONCE = 16
 
 
-def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
-    """Return the joint fit of the brightest stars, and the faint ones that it left to the matched filter.
+def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
+    """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
-    Where it comes far from `first`, the stars found along that motion are not where they seemed: once more.
-    Likewise from where the streaks really end, where the fit has other ends. A fit that they contradict again
-    is dropped.
+    If the motion differs much from that of `first`, or if the light ends elsewhere than the streaks, the
+    faint stars are searched again along the new motion. A fit that the light contradicts twice is rejected.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -589,38 +608,37 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
     return done, faint
 
 
-def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
+def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
     """Return whether the ends of the streaks have moved by more than the fit can follow."""
-    changed = float(np.linalg.norm(after.motion.whole - before.motion.whole))
-    turn = float(np.linalg.norm(after.motion.whole))
+    changed = float(np.linalg.norm(after.motion.rotation - before.motion.rotation))
+    turn = float(np.linalg.norm(after.motion.rotation))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
     return length * changed / max(turn, 1e-12) > _FAR
 
 
-def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
-    """Return the joint fit of the stars that are found along the motion of `first`, and the faint ones left.
+def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
+    """Return the joint fit of the stars detected along the motion of `first`, and the faint stars not fitted.
 
-    Of the models of the rate the fit takes the constant one unless the settings or the pixels demand the
-    other.
+    The rate is constant unless the settings or the pixels require a changing rate.
     """
     settings, before = camera.settings, first.scene
     if not before.motion.constant:
         camera = replace(camera, growing=True)
-    faint = _found_along(camera, first)
+    faint = _find_along(camera, first)
     whole = before.with_stars(faint.stars, faint.light)
     order = np.argsort(-whole.light, kind="stable")
     bright, rest = order[: settings.most_stars], order[settings.most_stars :]
     scene, others = whole.select(bright), whole.select(rest)
     scene = replace(scene, trusted=np.ones(len(bright), dtype=np.bool_))
     near = np.flatnonzero(
-        close_by(
+        near_streaks(
             camera.pinhole, scene.motion, others.stars, scene.stars, _NEAR * settings.reach * scene.width
         )
     )
     fitted = others.select(near[: settings.most_neighbours])
     scene = scene.with_stars(fitted.stars, fitted.light)
     beyond = others.select(near[settings.most_neighbours :])
-    done = joint_fit(_accounted(camera, beyond), scene)
+    done = joint_fit(_subtracted(camera, beyond), scene)
     if done is not None and done.hidden is not None:
         done = replace(done, hidden=done.hidden.with_stars(beyond.stars, beyond.light))
     rest = np.delete(rest, near[: settings.most_neighbours])
@@ -629,8 +647,8 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
 
 
-def _found_along(camera: ExposedCamera, first: Fit) -> FaintStars:
-    """Return the streaks along the motion of `first`, less its own, by their places at mid-exposure."""
+def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
+    """Return the streaks along the motion of `first` other than its own, with stars at mid-exposure."""
     settings, motion = camera.settings, first.scene.motion
     camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
@@ -642,36 +660,36 @@ def _found_along(camera: ExposedCamera, first: Fit) -> FaintStars:
         min(_HIDDEN_SIGMAS, settings.faint_sigmas),
         settings.most_faint,
     )
-    return replace(faint, stars=mid_exposure(camera.pinhole, motion, camera.shutter, faint.stars))
+    return replace(faint, stars=mid_exposure_positions(camera.pinhole, motion, camera.shutter, faint.stars))
 
 
-def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | None:
-    """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for.
+def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
+    """Return the fit of `scene`, its motion determined by the stars that agree; None if the fit fails.
 
-    Of the untrusted stars the brightest are fitted, as far as there is room, `room` times as much as usual;
-    the others' light is taken out as it is known. None where the fit fails.
+    The pixels decide between a constant and a changing rate. The brightest untrusted stars are fitted within
+    `room` times the usual number of pixels; the light of the others is subtracted.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
-    camera, scene = _accounted(camera, hidden), scene.select(fitted)
+    camera, scene = _subtracted(camera, hidden), scene.select(fitted)
     done = iterate(camera, scene, camera.free, ROUGH)
     if done is not None and camera.undecided and done.grows():
         camera = replace(camera, growing=True)
         done = iterate(camera, done.scene, camera.free, LAST, done.windows)
-    if done is None or _beyond(done.scene.motion):
+    if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # equations of tens of MB; the windows too are let go where new ones are cut
+    del done  # frees tens of MB; `pop` lets the iteration free the windows too
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
-    return None if done is None or _beyond(done.scene.motion) else replace(done, hidden=hidden)
+    return None if done is None or _excessive(done.scene.motion) else replace(done, hidden=hidden)
 
 
-def refit(camera: ExposedCamera, last: Fit) -> Fit | None:
-    """Return the joint fit again, from the result `last` on, with all its brightest stars trusted.
+def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
+    """Return the joint fit repeated from the result `last` with another `camera`, None if it fails.
 
-    `camera` differs from that of `last` in how it draws paths.
+    All of the brightest stars are trusted again.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -680,11 +698,11 @@ def refit(camera: ExposedCamera, last: Fit) -> Fit | None:
     return joint_fit(camera, scene if hidden is None else scene.with_stars(hidden.stars, hidden.light))
 
 
-def bared_fit(camera: ExposedCamera, last: Fit) -> Fit | None:
-    """Return a fit of the brightest streaks of `last` and all that lies on their pixels.
+def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
+    """Return a fit of the brightest streaks of `last` with all stars on their pixels.
 
-    Stars that are hidden in a streak move its ends: where the joint fit had no room for them, fewer streaks
-    with all of those know the motion better. None where it had room, and where the fit fails or goes astray.
+    Stars hidden in a streak shift its ends. If the joint fit had no room for them, fewer streaks with all
+    hidden stars determine the motion better. None if there was room, or if the fit fails or diverges.
     """
     others, scene = last.hidden, last.scene
     if others is None or not len(others.light):
@@ -692,38 +710,40 @@ def bared_fit(camera: ExposedCamera, last: Fit) -> Fit | None:
     camera = replace(camera, growing=bool(last.free[3]))
     order = np.argsort(-scene.light * scene.trusted, kind="stable")[: np.count_nonzero(scene.trusted)]
     areas = np.cumsum(window_areas(camera.pinhole, scene.select(order), camera.settings.reach))
-    leading = order[: max(_LEAST_BARED, int(np.count_nonzero(areas < _BARED_SHARE * _MOST_PIXELS)))]
+    leading = order[: max(_LEAST_BRIGHTEST, int(np.count_nonzero(areas < _BRIGHTEST_SHARE * _MOST_PIXELS)))]
     first, rest = scene.select(leading), scene.select(np.setdiff1d(np.arange(len(scene.light)), leading))
     stars, light = (np.concatenate(both) for both in ((rest.stars, others.stars), (rest.light, others.light)))
     distance = _NEAR * camera.settings.reach * scene.width
-    near = close_by(camera.pinhole, scene.motion, stars, first.stars, distance)
+    near = near_streaks(camera.pinhole, scene.motion, stars, first.stars, distance)
     whole = first.with_stars(stars[near], light[near])
     fitted = _affordable(camera, whole, 1.0)
-    camera = _accounted(camera, whole.select(~fitted))
+    camera = _subtracted(camera, whole.select(~fitted))
     done = iterate(camera, whole.select(fitted), last.free, LAST)
-    lost = done is None or _beyond(done.scene.motion) or _far(camera, scene, done.scene)
+    lost = done is None or _excessive(done.scene.motion) or _far(camera, scene, done.scene)
     return None if lost else done
 
 
-def _beyond(motion: Motion) -> bool:
-    """Return whether the rate changes by more than the model can describe; known otherwise, it does not."""
-    if motion.shape.any():
+def _excessive(motion: CameraMotion) -> bool:
+    """Return whether the rate changes by more than the model describes, unless the motion is a known one."""
+    if motion.higher_terms.any():
         return False
-    return float(np.linalg.norm(motion.growth)) > _MOST_GROWTH * float(np.linalg.norm(motion.turn))
+    return float(np.linalg.norm(motion.acceleration)) > _MOST_CHANGE * float(np.linalg.norm(motion.rate))
 
 
-def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
-    """Return which stars stay trusted: those that agree with most; all when too few do."""
-    estimates = own_estimates(rough.evaluation, rough.scene, camera.free)
+def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
+    """Return which trusted stars agree with the majority, all trusted stars if too few agree."""
+    estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:
         return before
     had = np.flatnonzero(before)
-    moved = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
-    turn = float(np.linalg.norm(rough.scene.motion.whole))
-    angle = _END_FLOOR * turn / max(float(np.median(moved)), 1.0)
+    length = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
+    turn = float(np.linalg.norm(rough.scene.motion.rotation))
+    angle = _END_FLOOR * turn / max(float(np.median(length)), 1.0)
     floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
-    agree = agreeing(OwnEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS)
+    agree = consistent_stars(
+        StarEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS
+    )
     if np.count_nonzero(agree) < max(camera.settings.least_stars, len(had) // 3):
         return before
     after = before.copy()
@@ -731,8 +751,8 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
     return after
 
 
-def _affordable(camera: ExposedCamera, scene: Scene, more: float) -> BoolArray:
-    """Return which stars (n,) the fit has room for: the trusted, of the others the brightest."""
+def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
+    """Return which stars (n,) are fitted: the trusted ones, and the brightest others while there is room."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
@@ -740,20 +760,16 @@ def _affordable(camera: ExposedCamera, scene: Scene, more: float) -> BoolArray:
     return np.asarray(scene.trusted | (needed <= more * _MOST_PIXELS))
 
 
-def _accounted(camera: ExposedCamera, others: Scene) -> ExposedCamera:
-    """Return the camera with a frame less the light of `others`, which is not known to the last electron."""
+def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
+    """Return the camera with the light of `others` subtracted and its uncertainty added to the noise."""
     if not len(others.light):
         return camera
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()
     count = len(others.light)
     for some in np.split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE)):
-        pixels, light = _modelled(camera, others.select(some))
+        scene = others.select(some)
+        windows = camera.windows(scene)
+        pixels, light = windows.pixels, light_of(camera.pinhole, camera.shutter, scene, windows)
         signal[pixels] -= light
-        floor[pixels] += np.square(np.float32(_DOUBT) * light)
+        floor[pixels] += np.square(np.float32(_SUBTRACTION_ERROR) * light)
     return replace(camera, frame=replace(camera.frame, signal=signal, floor=floor))
-
-
-def _modelled(camera: ExposedCamera, scene: Scene) -> tuple[IntArray, Float32Array]:
-    """Return the pixels (m,) about the stars of `scene`, and its light there."""
-    windows = camera.windows(scene)
-    return windows.pixels, light_of(camera.pinhole, camera.shutter, scene, windows)

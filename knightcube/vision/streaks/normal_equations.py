@@ -1,7 +1,17 @@
-"""What the pixels say of a scene: score and information, star by star (Fisher scoring).
+"""The pixels that are fitted, and the normal equations of a scene: gradient and information (Fisher scoring).
 
-Each pixel weighs by the variance that the model itself predicts, so the fixed point is that of maximum
-likelihood for Poisson light. The residual is of all stars together, so streaks may cross.
+Strips cover long streaks, patches cover spots. The model of the strips expands the light of a streak, which
+is inversely proportional to its speed, and fails near a rest: if the rate grows from zero or falls to it, a
+patch covers the slow part of each streak.
+
+The weight of a pixel is the inverse of the variance that the model predicts, so that the fixed point is the
+maximum likelihood for Poisson noise. The residual is that of all stars together, so that streaks may cross.
+The shared parameters (rate, acceleration, width) are solved for after the four parameters of each star are
+eliminated. Stars that share pixels are coupled, which a few rounds of conjugate gradients account for.
+
+Each star also gives its own estimate of the shared parameters. A blend of two stars is wider or longer than
+the others, and light of another star shifts its ends; such stars disagree with the majority and are no longer
+trusted.
 """
 
 from __future__ import annotations
@@ -13,47 +23,52 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.frame import ExposedFrame, Float32Array
+from knightcube.vision.streaks.frame import Float32Array, ReducedFrame
 from knightcube.vision.streaks.geometry import (
-    Motion,
-    Scene,
+    CameraMotion,
     Shutter,
+    StreakScene,
+    exposure_bounds,
     path_lengths,
     paths,
     positions,
     sensitivities,
-    window_times,
 )
 from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
-# Paths shorter than this many widths are summed instant by instant.
+# Length of a path, in widths, below which it is a spot.
 _SPOT_WIDTHS = 8.0
-# Predicted light within this many sigmas of saturation is left out: chosen by the model, not by the noise.
+# Distance of the predicted light from saturation, in standard deviations, below which a pixel is excluded.
+# The prediction decides, because a selection by the noise would be biased.
 _MARGIN = 3.0
-# Instants at which a path is tested for being in the frame.
+# Number of instants at which the position of a star is evaluated.
 _INSTANTS = 9
+# Residual, relative to the model, that is never clipped.
 _UNRESOLVED = 0.1
-# The speed along a strip may change by this part of itself over a width of the point spread.
+# Largest relative change of the speed along a strip over a width of the point spread.
 _STEADY = 0.05
-# A fast part shorter than this many widths is left to the patch.
+# Minimum length of the fast part of a path, in widths; the patch covers shorter ones.
 _LEAST_FAST = 4.0
+# Minimum speed, px per exposure.
 _SLOWEST = 1e-3
-# Instants at which the rate is looked at for that.
+# Number of instants at which the rate is evaluated to find the slow part.
 _SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """The frame on some blocks of pixels, all arrays (b, ...) alike.
+class BlockPixels:
+    """The frame on blocks of pixels; arrays (b, ...) unless stated otherwise.
 
     Attributes:
-        slot: number of the pixel among those in use, the same for every star that shares it; one past the
-            last where the pixel does not exist.
-        inside: whether the pixel exists, is usable and wanted.
-        signal, floor, ceiling: of the frame.
-        gain: electrons a count.
-        crowded: (e,) flat positions of the pixels that other stars share; common: (e,) their numbers among
-            all that are shared.
+        slot: number of the pixel among all fitted pixels, the same for all stars that share it; the number of
+            fitted pixels if the pixel is outside the frame.
+        inside: whether the pixel is fitted.
+        signal: counts above the background.
+        floor: counts^2, variance without a star.
+        ceiling: counts above the background at which the pixel saturates.
+        gain: electrons per count.
+        crowded: (e,) flat positions of the pixels that other stars share.
+        common: (e,) their numbers among all shared pixels.
     """
 
     slot: IntArray
@@ -66,10 +81,9 @@ class Sight:
     common: IntArray
 
     def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights (1/variance, 0 where left out) and residuals under the light `total` by slot.
+        """Return weights (1/variance, 0 if excluded) and residuals for the modelled light `total` by slot.
 
-        Residuals of more than `clip` sigma and a tenth of the model are no noise: left out; 0 leaves none out
-        for that.
+        Residuals beyond `clip` standard deviations plus a tenth of the model are excluded; 0 disables this.
         """
         model = total.take(self.slot)
         variance = np.maximum(model, np.float32(0.0))
@@ -88,16 +102,19 @@ class Sight:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows:
-    """The pixels that are fitted: strips about long streaks, patches about spots.
+class FitWindows:
+    """The pixels that are fitted: strips along long streaks, patches around spots.
 
     Attributes:
-        long, spot: stars (a,), (b,) with a strip and with a patch, indices into the scene; a streak that is
-            slow in part has both.
-        strips, patches: their pixels; star i of the strips is `long[i]`.
-        pixels: (m,) flat indices of the pixels in use, by slot; slot: of all blocks' pixels, one after other.
-        on_strips, on_patches: the frame there.
-        shared: how many pixels are of several stars.
+        long: (a,) indices of the stars with a strip; a streak with a slow part also has a patch.
+        spot: (b,) indices of the stars with a patch.
+        strips: pixels of the strips; star i of the strips is `long[i]`.
+        patches: pixels of the patches; patch i is of star `spot[i]`.
+        pixels: (m,) flat indices of the fitted pixels, by slot.
+        slot: slots of the pixels of all blocks, flat.
+        on_strips: the frame on the strips.
+        on_patches: the frame on the patches.
+        shared: number of pixels of more than one star.
     """
 
     long: IntArray
@@ -106,20 +123,20 @@ class Windows:
     patches: Patches
     pixels: IntArray
     slot: IntArray
-    on_strips: Sight
-    on_patches: Sight
+    on_strips: BlockPixels
+    on_patches: BlockPixels
     shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the light (m + 1,) of all stars on the pixels in use, from that on each star's own.
+        """Return the light (m + 1,) of all stars by slot, from the light of each star on its own pixels.
 
-        The last one is for pixels that do not exist.
+        The last element is for pixels outside the frame.
         """
         light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
         return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
 
-    def only(self, on_strips: BoolArray, on_patches: BoolArray) -> Windows:
-        """Return the windows with only these pixels meant."""
+    def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
+        """Return the windows restricted to some pixels."""
         return replace(
             self,
             on_strips=replace(self.on_strips, inside=on_strips),
@@ -127,10 +144,10 @@ class Windows:
         )
 
 
-def window_areas(pinhole: Pinhole, scene: Scene, reach: float) -> FloatArray:
-    """Return about how many pixels (n,) each star's window takes, `reach` widths to either side of its path.
+def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
+    """Return the approximate number of pixels (n,) of each star's window, `reach` widths around its path.
 
-    All lines of all strips are as long as that which its path crosses most obliquely.
+    All lines of all strips are as long as the line that its path crosses most obliquely.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -146,19 +163,19 @@ def window_areas(pinhole: Pinhole, scene: Scene, reach: float) -> FloatArray:
 
 
 def cut_windows(
-    frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float
-) -> Windows:
-    """Return the pixels of `frame` within `reach` widths of the stars' paths."""
-    long, spot, strips, patches = _placed(pinhole, shutter, scene, reach * scene.width)
+    frame: ReducedFrame, pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float
+) -> FitWindows:
+    """Return the windows with the pixels of `frame` within `reach` widths of the paths of the stars."""
+    long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Each pixel belongs to the last place that names it; only memory of pixels in use is touched.
-    turn = np.arange(len(named), dtype=np.int32)
+    # Each pixel is numbered by its last occurrence; only memory of fitted pixels is touched.
+    order = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
-    number[named] = turn
+    number[named] = order
     last = number.take(named)
-    own = last == turn
+    own = last == order
     pixels = named[own]
     place = (np.cumsum(own) - 1).take(last)
     shared = np.bincount(place, minlength=len(pixels)) > 1
@@ -167,50 +184,52 @@ def cut_windows(
     crowded = np.flatnonzero(np.append(shared, False).take(slot))
     common = np.cumsum(shared) - 1
     cut = strips.index.size
-    return Windows(
+    return FitWindows(
         long,
         spot,
         strips,
         patches,
         pixels,
         slot,
-        _sight(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
-        _sight(frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common),
+        _block_pixels(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
+        _block_pixels(
+            frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common
+        ),
         int(np.count_nonzero(shared)),
     )
 
 
-def _placed(
-    pinhole: Pinhole, shutter: Shutter, scene: Scene, room: float
+def _strips_and_patches(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, room: float
 ) -> tuple[IntArray, IntArray, Strips, Patches]:
-    """Return which stars have strips (a,), and patches (b,), within `room` px of their paths, and those."""
-    times = window_times(pinhole, scene.motion, shutter, scene.stars)
+    """Return the stars with strips (a,) and with patches (b,), and those, `room` px around the paths."""
+    times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)
     whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
     long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # The part of a path that a patch serves: the slow one of a streak, all of a spot.
+    # A patch covers the slow part of a streak, or all of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     patches = _patches_about(pinhole, scene, spot, part, room)
-    strips = _beside_patches(strips, long, patches, spot)
+    strips = _without_patches(strips, long, patches, spot)
     return long, spot, strips, patches
 
 
-def _divided(pinhole: Pinhole, scene: Scene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return when (n, 2) each star is fast enough for strips within `times` (n, 2), and when it is slow.
+def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the times (n, 2) between which each star is fast enough for a strip, and those of its slow part.
 
-    The slow part is at the end towards which the rate falls; what there is none of has no duration.
+    The slow part is at the end towards which the rate decreases. A missing part has zero duration.
     """
     motion = scene.motion
-    if motion.constant or not motion.whole.any():
+    if motion.constant or not motion.rotation.any():
         return times, np.zeros_like(times)
     time = np.linspace(times.min(), times.max(), _SAMPLES)
-    pace, change = motion.pace(time), np.abs(motion.pace(time, 1)).max()
-    steady = Motion.steady(motion.whole)
+    pace, change = motion.relative_rate(time), np.abs(motion.relative_rate(time, 1)).max()
+    steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # Slow wherever the speed may change by too much of itself over a width.
+    # A star is slow where its speed may change too much over a width.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:
@@ -224,8 +243,10 @@ def _divided(pinhole: Pinhole, scene: Scene, times: FloatArray) -> tuple[FloatAr
     return fast, rest
 
 
-def _patches_about(pinhole: Pinhole, scene: Scene, spot: IntArray, part: FloatArray, room: float) -> Patches:
-    """Return patches with all pixels within `room` px of stars `spot` (n,) at times `part` (n, 2)."""
+def _patches_about(
+    pinhole: Pinhole, scene: StreakScene, spot: IntArray, part: FloatArray, room: float
+) -> Patches:
+    """Return patches with all pixels within `room` px of stars `spot` (n,) between times `part` (n, 2)."""
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
     stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
     there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
@@ -234,8 +255,8 @@ def _patches_about(pinhole: Pinhole, scene: Scene, spot: IntArray, part: FloatAr
     return cut_patches(pinhole, 0.5 * (low + high), half)
 
 
-def _beside_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the strips without the pixels that a patch of the same star has."""
+def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
+    """Return the strips without the pixels of a patch of the same star."""
     both = np.isin(long, spot)
     if not both.any():
         return strips
@@ -251,21 +272,22 @@ def _beside_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntA
     return replace(strips, inside=inside)
 
 
-def _sight(
-    frame: ExposedFrame,
+def _block_pixels(
+    frame: ReducedFrame,
     index: IntArray,
     inside: BoolArray,
     slot: IntArray,
     crowded: IntArray,
     common: IntArray,
-) -> Sight:
+) -> BlockPixels:
+    """Return the frame on blocks of pixels `index`, see `BlockPixels`."""
     signal = frame.signal.take(index)
-    return Sight(
+    return BlockPixels(
         slot.reshape(index.shape),
         inside & ~frame.bad.take(index),
         signal,
         frame.floor.take(index),
-        # The background's level is what a pixel's counts exceed its signal by.
+        # The background is the difference of counts and signal.
         np.float32(frame.top) - frame.counts.take(index) + signal,
         frame.gain,
         crowded,
@@ -274,18 +296,18 @@ def _sight(
 
 
 SHARED = 7
-"""Turn (3), growth (3), width of the point spread."""
+"""Number of shared parameters: rate (3), acceleration (3), width of the point spread."""
 ALONE = 4
-"""x, y, light, sky of a star."""
+"""Number of parameters of each star: x, y, light, sky."""
 
-# This many blocks are multiplied at a time: the weighted ones stay in the processor's cache.
+# Number of blocks multiplied at a time, so that they fit into the processor's cache.
 _AT_ONCE = 128
-# A star's place along a streak whose ends are both outside is not known: this keeps its step finite, px.
+# Prior standard deviation (px) of a star's position; a streak with both ends outside does not determine it.
 _LOOSE = 30.0
-# The sky about a star is near the frame's background, counts.
+# Prior standard deviation (counts) of the sky around a star relative to the background.
 _SKY = 3.0
 PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
-"""The information (ALONE,) that keeps finite the numbers that the pixels do not determine."""
+"""Prior information (ALONE,) on the parameters of a star."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,30 +315,36 @@ class Evaluation:
     """The normal equations of a scene.
 
     Attributes:
-        information: (n, SHARED + ALONE, SHARED + ALONE), of each star's pixels.
-        gradient: (n, SHARED + ALONE).
-        chi2, pixels: (n,) of each star's pixels: sum of squared residuals over their variance, and how many.
-        crowds: the light's derivatives on the pixels that stars share; shared: how many those are.
-        kept: which pixels of the strips and of the patches were not left out.
+        information: (n, SHARED + ALONE, SHARED + ALONE), of the pixels of each star.
+        gradient: (n, SHARED + ALONE), of the pixels of each star.
+        chi2: (n,) chi-square of the pixels of each star.
+        pixels: (n,) number of pixels of each star.
+        crowds: derivatives of the light on shared pixels.
+        shared: number of shared pixels.
+        kept: which pixels of the strips and of the patches were not excluded.
     """
 
     information: FloatArray
     gradient: FloatArray
     chi2: FloatArray
     pixels: FloatArray
-    crowds: list[Crowd]
+    crowds: list[SharedPixels]
     shared: int
     kept: tuple[BoolArray, BoolArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Crowd:
-    """Derivatives of stars' light on pixels (e,) that other stars share, in order of their blocks (b,).
+class SharedPixels:
+    """Derivatives of the light on pixels (e,) that other stars share, in order of their blocks (b,).
 
     Attributes:
-        star: (b,) whose block it is; `matrix` (b, i, SHARED + ALONE) mixes images to derivatives.
-        block, slot: (e,) of each pixel; first: (b,) where each block's pixels begin.
-        weight: (e,); images: (i, e).
+        star: (b,) star of each block.
+        matrix: (b, i, SHARED + ALONE) coefficients of the images for the derivatives.
+        block: (e,) block of each pixel.
+        first: (b,) first pixel of each block.
+        slot: (e,) number of each pixel among all shared pixels.
+        weight: (e,) weight of each pixel.
+        images: (i, e) images on the pixels.
     """
 
     star: IntArray
@@ -329,14 +357,14 @@ class Crowd:
 
 
 def evaluate(
-    pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows, clip: float, growing: bool
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, clip: float, growing: bool
 ) -> Evaluation:
     """Return the normal equations of `scene` on its windows.
 
-    Pixels whose residual exceeds `clip` sigma (and a tenth of the model) are left out; 0 leaves none.
+    `clip` is that of `BlockPixels.residual`. `growing`: whether the acceleration is fitted.
     """
     strips = windows.strips
-    images, spots, change = shapes(pinhole, shutter, scene, windows)
+    images, spots, change = model_images(pinhole, shutter, scene, windows)
     of_block = windows.long[strips.star]
     streak_light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
     streak_light += scene.sky[of_block, None, None].astype(np.float32)
@@ -356,7 +384,7 @@ def evaluate(
         (weights[0] > 0.0, weights[1] > 0.0),
     )
     if len(strips.star):
-        matrix = _block_parameters(pinhole, shutter, scene, windows, growing)
+        matrix = _block_coefficients(pinhole, shutter, scene, windows, growing)
         matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
         images[:, streak_model.IMAGES] = residuals[0]
         _add(out, of_block, windows.on_strips, weights[0], images, matrix)
@@ -369,32 +397,32 @@ def evaluate(
     return out
 
 
-def light_of(pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows) -> Float32Array:
-    """Return the light of all stars of `scene` on the pixels in use of its windows, sky left out."""
-    images, spots, _ = shapes(pinhole, shutter, scene, windows)
+def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
+    """Return the light (m,) of all stars of `scene` on the fitted pixels of its windows, without the sky."""
+    images, spots, _ = model_images(pinhole, shutter, scene, windows)
     streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
     return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
 
 
-def shapes(
-    pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows
+def model_images(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the images of the strips, the spots' light and its derivatives, all of stars of light 1.
+    """Return the images of the strips, the light of the spots and its derivatives, for stars of unit light.
 
-    The images have room for the residual behind them.
+    One additional image is left for the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
-    spots, change = streak_model.derivatives(
+    spots, change = streak_model.spot_derivatives(
         pinhole, scene.motion, shutter, spot, scene.sigma, windows.patches
     )
     return images, spots, change
 
 
-def _block_parameters(
-    pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows, growing: bool
+def _block_coefficients(
+    pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return (b, IMAGES, SHARED + ALONE): which mixture of a block's images each parameter changes."""
+    """Return coefficients (b, IMAGES, SHARED + ALONE) of the images for the derivatives of each block."""
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -412,15 +440,15 @@ def _block_parameters(
 def _add(
     out: Evaluation,
     star: IntArray,
-    sight: Sight,
+    view: BlockPixels,
     weight: Float32Array,
     images: Float32Array,
     matrix: FloatArray,
 ) -> None:
     """Add blocks of pixels, in order of their stars, to the normal equations.
 
-    The last of the `images` is the residual: its products with the others are the score, with itself the
-    chi-square.
+    The last image is the residual. Its products with the other images give the gradient, and its product with
+    itself gives the chi-square.
     """
     blocks, count = images.shape[:2]
     flat = images.reshape(blocks, count, -1)
@@ -429,21 +457,26 @@ def _add(
     for begin in range(0, blocks, _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
         gram[part] = (flat[part] * weight[part, None]) @ flat[part].swapaxes(1, 2)
-    turned = matrix.swapaxes(1, 2)
+    transposed = matrix.swapaxes(1, 2)
     first = np.flatnonzero(np.diff(star, prepend=-1))
     owner = star[first]
-    out.information[owner] += np.add.reduceat(turned @ gram[:, :-1, :-1] @ matrix, first)
-    out.gradient[owner] += np.add.reduceat((turned @ gram[:, :-1, -1:])[..., 0], first)
+    out.information[owner] += np.add.reduceat(transposed @ gram[:, :-1, :-1] @ matrix, first)
+    out.gradient[owner] += np.add.reduceat((transposed @ gram[:, :-1, -1:])[..., 0], first)
     out.chi2[owner] += np.add.reduceat(gram[:, -1, -1], first)
     out.pixels[owner] += np.add.reduceat((weight > 0.0).sum(axis=1), first)
-    if len(sight.crowded):
-        out.crowds.append(_crowd(star, sight, weight, flat, matrix))
+    if len(view.crowded):
+        out.crowds.append(_shared_pixels(star, view, weight, flat, matrix))
 
 
-def _crowd(
-    star: IntArray, sight: Sight, weight: Float32Array, images: Float32Array, matrix: FloatArray
-) -> Crowd:
-    block, place = np.divmod(sight.crowded, images.shape[2])
+def _shared_pixels(
+    star: IntArray,
+    view: BlockPixels,
+    weight: Float32Array,
+    images: Float32Array,
+    matrix: FloatArray,
+) -> SharedPixels:
+    """Return the derivatives on the pixels that other stars share."""
+    block, place = np.divmod(view.crowded, images.shape[2])
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
     _, count, size = images.shape
@@ -452,23 +485,25 @@ def _crowd(
     for image in drawn:
         image[:] = images.reshape(-1).take(place)
         place += size
-    return Crowd(
+    return SharedPixels(
         star[held],
         matrix[held],
         np.repeat(np.arange(len(held)), np.diff(first, append=len(block))),
         first,
-        sight.common,
-        weight.reshape(-1)[sight.crowded],
+        view.common,
+        weight.reshape(-1)[view.crowded],
         drawn,
     )
 
 
-def _spot_images(scene: Scene, windows: Windows, spots: FloatArray, change: FloatArray) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the spots' light, the last left empty."""
+def _spot_images(
+    scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
+) -> Float32Array:
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the light of spots, the last uninitialised."""
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
-    # The width is that of Gaussian and pixel together: d sigma / d width = width / sigma.
+    # The width includes the pixel, so that d sigma / d width = width / sigma.
     images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
     images[:, 7:9] = change[:, 6:8] * light
     images[:, 9] = spots
@@ -479,9 +514,9 @@ def _spot_images(scene: Scene, windows: Windows, spots: FloatArray, change: Floa
 def apply_information(
     evaluation: Evaluation, shared: FloatArray, alone: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the information of all stars together times (shared (SHARED,), alone (n, ALONE)).
+    """Return the product of the information of all stars with a vector of `shared` (SHARED,) and `alone`.
 
-    To the blocks of `Evaluation.information` the coupling of stars that share pixels is added.
+    `alone` (n, ALONE) are the parameters of each star. The coupling of stars that share pixels is included.
     """
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
@@ -499,22 +534,23 @@ def apply_information(
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone
 
 
-# Conjugate gradients stop at this part of the first step's squared norm: covariances are then as exact.
+# Squared norm of the residual, relative to that of the first step, at which conjugate gradients stop.
 _CONVERGED = 1e-2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """One step and the covariance.
+    """One step of the fit and the covariance.
 
     Attributes:
-        shared: (SHARED,) step of the shared parameters; alone: (n, ALONE) of each star's own.
-        eliminated: the equations that gave it, stars not sharing pixels.
+        shared: (SHARED,) step of the shared parameters.
+        alone: (n, ALONE) step of the parameters of each star.
+        eliminated: equations that neglect the coupling of stars.
     """
 
     shared: FloatArray
     alone: FloatArray
-    eliminated: Eliminated
+    eliminated: EliminatedEquations
 
     @property
     def covariance(self) -> FloatArray:
@@ -526,7 +562,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared parameters and each star's."""
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared parameters with each star's."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -538,12 +574,13 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Eliminated:
-    """The normal equations with every star's own numbers eliminated, stars not sharing pixels.
+class EliminatedEquations:
+    """The normal equations after elimination of the parameters of each star, without coupling of stars.
 
     Attributes:
-        kept: (k,) which shared parameters are fitted.
-        own: (n, ALONE, ALONE) inverse of each star's block; gain: (n, k, ALONE).
+        kept: (k,) indices of the fitted shared parameters.
+        own: (n, ALONE, ALONE) inverse of each star's block.
+        gain: (n, k, ALONE) product of the coupling block and `own`.
         inner: (k, k) covariance of the shared parameters.
     """
 
@@ -553,24 +590,28 @@ class Eliminated:
     inner: FloatArray
 
     def solve(self, shared: FloatArray, alone: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the solution for a right-hand side (SHARED,), (n, ALONE)."""
+        """Return the solution for a right-hand side `shared` (SHARED,) and `alone` (n, ALONE)."""
         step = self.inner @ (shared[self.kept] - np.einsum("nij,nj->i", self.gain, alone))
         out = np.zeros(SHARED)
         out[self.kept] = step
         return out, np.einsum("nij,nj->ni", self.own, alone) - step @ self.gain
 
 
-def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
-    """Return the eliminated equations, None when the shared parameters are not determined.
+def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | None:
+    """Return the eliminated equations, None if they do not determine the shared parameters.
 
-    `free` (SHARED,): which shared parameters are fitted.
+    `free` (SHARED,) tells which shared parameters are fitted.
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # Light of a star outside has no information: a unit keeps the block regular, its gradient is zero.
+    # A star outside the frame has no information on its light; a unit keeps its block regular.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
-    own = _scaled_inverse(alone)
+    root = np.sqrt(np.einsum("nii->ni", alone))
+    outer = root[:, :, None] * root[:, None, :]
+    unit = alone / outer
+    unit[:, range(ALONE), range(ALONE)] += 1e-9
+    own = np.asarray(np.linalg.inv(unit) / outer)
     kept = np.flatnonzero(free)
     cross = evaluation.information[:, kept, SHARED:]
     gain = cross @ own
@@ -582,37 +623,34 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
     least, most = np.linalg.eigvalsh(scaled)[[0, -1]]
     if most > 1e10 * least:
         return None
-    return Eliminated(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
+    return EliminatedEquations(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
 
 
-def solve(evaluation: Evaluation, scene: Scene, free: BoolArray, rounds: int) -> Solution | None:
-    """Return the step to the maximum, None when the shared parameters are not determined.
+def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
+    """Return the step to the maximum, None if the shared parameters are not determined.
 
-    At most `rounds` conjugate gradients account for the pixels that stars share; 0 neglects them.
+    At most `rounds` conjugate-gradient steps account for shared pixels; 0 neglects them.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    alone = evaluation.gradient[:, SHARED:] - PRIOR * _from_prior(scene)
+    # The prior of the sky is zero; that of the position is centred at its current value.
+    offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
+    alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
     step = _conjugate(evaluation, eliminated, free, (shared, alone), rounds)
     return Solution(*step, eliminated)
 
 
-def _from_prior(scene: Scene) -> FloatArray:
-    """Return how far each star's numbers are from where the prior puts them: only the sky has a place."""
-    return np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
-
-
-def turn_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (3, 3) of the turn, shared pixels accounted for; None without one."""
+def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
+    """Return the covariance (3, 3) of the rate with shared pixels accounted for, None if not determined."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
     alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
-        # Scaled to a unit of the solution, so that one tolerance serves all.
+        # Scaled for a solution of order one, so that one tolerance suits all.
         unit = np.zeros(SHARED)
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
@@ -622,14 +660,14 @@ def turn_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
 
 def _conjugate(
     evaluation: Evaluation,
-    eliminated: Eliminated,
+    eliminated: EliminatedEquations,
     free: BoolArray,
     right: tuple[FloatArray, FloatArray],
     rounds: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the solution of the normal equations of all stars together for `right`.
+    """Return the solution of the coupled normal equations for the right-hand side `right`.
 
-    Conjugate gradients, preconditioned by the equations of stars that share no pixels: few rounds do.
+    The equations without coupling precondition the conjugate gradients, so that a few rounds suffice.
     """
     x = eliminated.solve(*right)
     if rounds == 0:
@@ -660,18 +698,12 @@ def _conjugate(
     return x
 
 
-def _scaled_inverse(matrices: FloatArray) -> FloatArray:
-    scale = np.sqrt(np.einsum("nii->ni", matrices))
-    outer = scale[:, :, None] * scale[:, None, :]
-    scaled = matrices / outer
-    scaled[:, range(ALONE), range(ALONE)] += 1e-9
-    return np.asarray(np.linalg.inv(scaled) / outer)
+def stepped(
+    scene: StreakScene, solution: Solution, pinhole: Pinhole, longest: float
+) -> tuple[StreakScene, float]:
+    """Return the scene after a step that is limited to `longest` px at the ends of the streaks.
 
-
-def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) -> tuple[Scene, float]:
-    """Return the scene after a step that moves no end of a streak by more than `longest` px.
-
-    Also returned is by how many px the shared parameters' step would have moved an end, or the width.
+    The second value is the largest displacement (px) of an end, or change of the width, of the full step.
     """
     n = len(scene.stars)
     growing = bool(solution.shared[3:6].any())
@@ -685,10 +717,10 @@ def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) ->
     far = np.hypot(step[:, 0], step[:, 1])
     step[:, :2] *= np.minimum(1.0, longest / np.maximum(far, 1e-9))[:, None]
     shared = share * solution.shared
-    turn, growth = scene.motion.turn + shared[:3], scene.motion.growth + shared[3:6]
+    turn, growth = scene.motion.rate + shared[:3], scene.motion.acceleration + shared[3:6]
     after = replace(
         scene,
-        motion=replace(scene.motion, turn=turn, growth=growth),
+        motion=replace(scene.motion, rate=turn, acceleration=growth),
         width=scene.width + float(shared[6]),
         stars=scene.stars + step[:, :2],
         light=np.maximum(scene.light + step[:, 2], 0.3 * scene.light),
@@ -697,33 +729,32 @@ def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) ->
     return after, max(ends, abs(float(solution.shared[6])))
 
 
-# The error of a median over that of a mean.
+# Standard error of a median, relative to that of a mean.
 _MEDIAN = 1.25
-
-
-# A star with less than this part of the best one's information is ignored.
+# Information of a star, relative to the best one, below which it is ignored.
 _NOTHING = 1e-9
-# Of what a star knows a direction that has less than this part of its best known one's is ignored.
+# Information of a star on a direction, relative to its best direction, below which it is ignored.
 _KNOWN = 1e-4
-# Stars of unequal weight count as fewer equal ones; fewer than this have no spread.
+# Minimum effective number of stars for a scatter; unequal weights reduce the effective number.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OwnEstimates:
-    """Each star's own estimate of the shared parameters: change (n, k) along k directions; deviation."""
+class StarEstimates:
+    """Each star's estimate of the shared parameters along k directions: change and deviation, both (n, k)."""
 
     change: FloatArray
     deviation: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OwnEquations:
-    """What each star by itself says of the free shared parameters, its own numbers eliminated.
+class StarEquations:
+    """The equations of each star for the free shared parameters, its own parameters eliminated.
 
     Attributes:
-        kept: (k,) which shared parameters are free.
-        information: (n, k, k); score: (n, k).
+        kept: (k,) indices of the free shared parameters.
+        information: (n, k, k) information of each star.
+        score: (n, k) gradient of each star.
     """
 
     kept: IntArray
@@ -731,18 +762,18 @@ class OwnEquations:
     score: FloatArray
 
 
-def own_estimates(evaluation: Evaluation, scene: Scene, free: BoolArray) -> OwnEstimates | None:
-    """Return each star's own estimate of the turn and the width; None when they are not determined."""
-    alone = own_equations(evaluation, free)
+def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
+    """Return each star's estimate of rate and width, None if the shared parameters are not determined."""
+    alone = star_equations(evaluation, free)
     return None if alone is None else estimates_of(alone, scene)
 
 
-def estimates_of(alone: OwnEquations, scene: Scene) -> OwnEstimates:
-    """Return each star's own estimate of the turn, along it and across it twice, and of the width.
+def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
+    """Return each star's estimates of the rate, along its axis and two normal directions, and of the width.
 
-    All are steps from the scene's; the units are rad, and px for the width.
+    All are changes of the scene's values, in rad per exposure, and in px for the width.
     """
-    axis = scene.motion.whole / max(float(np.linalg.norm(scene.motion.whole)), 1e-12)
+    axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
     directions = np.zeros((4, SHARED))
     directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0
@@ -750,18 +781,18 @@ def estimates_of(alone: OwnEquations, scene: Scene) -> OwnEstimates:
     information = np.einsum("ai,nij,aj->na", directions, alone.information, directions)
     informed = information > _NOTHING * information.max(axis=0)
     information = np.where(informed, information, _NOTHING * information.max(axis=0) + 1e-300)
-    return OwnEstimates(
+    return StarEstimates(
         np.where(informed, alone.score @ directions.T / information, 0.0), 1.0 / np.sqrt(information)
     )
 
 
-def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
-    """Return by how much, in sigmas squared, the stars together ask for `step` (SHARED,), and how many ask.
+def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
+    """Return the squared significance of `step` (SHARED,) of the shared parameters, and the number of stars.
 
-    Each star asks for its own part of the step. The spread of what they ask is the measure, where it is more
-    than the noise: one star in whose light another's is hidden moves no agreement.
+    The scatter of the stars limits the significance if it exceeds the noise, so that one blended star does
+    not make a step significant.
     """
-    alone = own_equations(evaluation, step != 0.0)
+    alone = star_equations(evaluation, step != 0.0)
     if alone is None:
         return 0.0, 0
     part = step[alone.kept]
@@ -772,8 +803,8 @@ def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     return total**2 / max(total, spread, 1e-300), count
 
 
-def own_equations(evaluation: Evaluation, free: BoolArray) -> OwnEquations | None:
-    """Return what each star says of the `free` shared parameters; None when they are not determined."""
+def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | None:
+    """Return the equations of each star for the `free` shared parameters, None if not determined."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
@@ -781,14 +812,13 @@ def own_equations(evaluation: Evaluation, free: BoolArray) -> OwnEquations | Non
     cross = evaluation.information[:, SHARED:][:, :, kept]
     schur = evaluation.information[:, kept[:, None], kept] - gain @ cross
     score = evaluation.gradient[:, kept] - np.einsum("nij,nj->ni", gain, evaluation.gradient[:, SHARED:])
-    return OwnEquations(kept, schur, score)
+    return StarEquations(kept, schur, score)
 
 
-def agreeing(estimates: OwnEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
-    """Return which stars (n,) agree with most: within `sigmas` of the weighted median in all directions.
+def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
+    """Return which stars (n,) lie within `sigmas` of the weighted median in all k directions.
 
-    A star in whose light another's is hidden is wider or longer than the rest; `floors` (k,) are added to the
-    deviations for what the model does not describe.
+    `floors` (k,) are added to the deviations, for errors of the model.
     """
     agree = np.ones(len(estimates.change), dtype=np.bool_)
     for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):
@@ -796,30 +826,30 @@ def agreeing(estimates: OwnEstimates, floors: FloatArray, sigmas: float) -> Bool
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # The median of few is itself uncertain: a star that knows more than all others is not to yield to it.
+        # The uncertainty of the median keeps a star that is better known than all others.
         error = _MEDIAN * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 
 
-def disagreement(estimates: OwnEstimates, which: BoolArray) -> float:
-    """Return the chi-square per degree of freedom between stars `which` (n,): 1 when all obey the model."""
+def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
+    """Return the chi-square per degree of freedom between the estimates of stars `which` (n,)."""
     change, weight = estimates.change[which], estimates.deviation[which] ** -2
     if len(change) < 3:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # Each counts by its weight: the spread of a few bright ones is not lost among many faint.
+    # Squared weights, so that many faint stars do not hide the scatter of a few bright ones.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # The largest of several is larger than one, by about a standard deviation.
+    # The largest of several values is expected to exceed one by about a standard deviation.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 
-def contradiction(alone: OwnEquations) -> float:
-    """Return by how much all that the stars say contradicts itself: chi-square per degree of freedom.
+def contradiction(alone: StarEquations) -> float:
+    """Return the chi-square per degree of freedom of all stars' equations about their common solution.
 
-    Unlike `disagreement` it counts every direction that a star knows of, each star by its own noise.
+    Unlike `disagreement` it includes all directions that a star determines, with the noise of each star.
     """
     total = alone.information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))

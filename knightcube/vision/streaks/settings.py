@@ -1,11 +1,12 @@
-"""The settings of the maximum-likelihood estimator; the defaults serve the demonstration's camera."""
+"""Settings of the maximum-likelihood estimator; the defaults suit the demonstration's camera."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge
+from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Lens
 
 _UNCALIBRATED = CameraKnowledge()
 
@@ -14,37 +15,37 @@ RateModel = Literal["auto", "constant", "accelerating"]
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodSettings:
-    """How a frame is turned into a motion.
+    """How the motion is estimated from a frame.
 
     Attributes:
-        gain: electrons a count.
-        saturation: counts at which a pixel clips; None takes the frame's highest count when several pixels
-            share it, else the top of the integer type.
-        saturated_fraction: of the pixels, from which the frame is called saturated.
-        psf_sigma: px, where the fit of the point spread starts; from 2 on, pixels are summed (`Binning`).
-        rate_model: `constant`; `accelerating`: the rate's change over the exposure is fitted too; `auto`: the
-            pixels decide.
-        line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global. None,
-            not stated, is fitted as 0 and not believed to be.
-        threshold_sigmas: of the 3 x 3 sum, for the first guess.
-        most_stars: the brightest are fitted, no more: they hold most of the information.
-        most_neighbours: faint stars on the bright ones' pixels that are fitted with them.
-        most_faint: at most this many more are found along the known motion and taken out of the others'
-            windows.
-        faint_sigmas: significance from which a streak along the known motion is believed.
-        reach: widths of the point spread to either side of a path that are fitted.
-        clip: sigmas of a residual that is no noise.
-        least_stars: fewer fix no rate; two do, though none contradicts them.
-        least_length: px, median path below which no rate is given.
-        least_significance: of the rate in its standard deviations, below which no rate is given.
-        worst_misfit: chi-square per degree of freedom above which the motion is not believed, where what is
-            left over is as much as a displacement of the streaks by `worst_aside` px.
-        worst_shaking: px of displacement, or share of brightness, that all streaks waver in common, above
-            which the motion is not smooth.
-        worst_doubt: share of the rate to which errors of the model may leave it uncertain, one deviation.
-        knowledge: how well the camera is known.
-        sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
-            direction of time.
+        gain: electrons per count.
+        saturation: counts at which a pixel saturates; None: the highest count of the frame if several pixels
+            share it, else the maximum of the integer type.
+        saturated_fraction: fraction of saturated pixels from which a frame is rejected.
+        psf_sigma: px, initial standard deviation of the point spread; from 2 px on, pixels are summed.
+        rate_model: `constant`; `accelerating`: a linear change of the rate is fitted too; `auto`: chosen by
+            the pixels.
+        line_time: s, delay of each row's exposure to the row above (rolling shutter); 0: global shutter.
+            None: unknown, fitted as 0 with a large uncertainty.
+        threshold_sigmas: threshold of the 3 x 3 sums for the first guess, in standard deviations.
+        most_stars: maximum number of the brightest stars, which determine the motion.
+        most_neighbours: maximum number of fainter stars that overlap the bright ones and are fitted too.
+        most_faint: maximum number of further stars that are detected and subtracted.
+        faint_sigmas: minimum significance of a detected streak.
+        reach: half width of the fitted strip along a path, in widths of the point spread.
+        clip: residuals beyond this number of standard deviations are excluded.
+        least_stars: minimum number of stars; two determine a rate, but cannot contradict each other.
+        least_length: px, minimum median path length.
+        least_significance: minimum ratio of the rate to its standard deviation.
+        worst_misfit: chi-square per degree of freedom above which a motion is rejected, if the residuals also
+            exceed `worst_displacement`.
+        worst_displacement: px, displacement across the streaks that is equivalent to the residuals.
+        worst_shaking: largest displacement (px), or relative change of brightness, common to all streaks.
+        worst_uncertainty: largest relative uncertainty (one standard deviation) of the rate due to errors of
+            the model.
+        sign_sigmas: ratio of the prior's projection on the axis to its standard deviation from which the
+            prior decides the direction of time.
+        knowledge: accuracy of the camera's calibration.
     """
 
     gain: float = 1.0
@@ -64,25 +65,39 @@ class LikelihoodSettings:
     least_length: float = 3.0
     least_significance: float = 5.0
     worst_misfit: float = 4.0
-    worst_aside: float = 0.45
+    worst_displacement: float = 0.45
     worst_shaking: float = 0.05
-    worst_doubt: float = 0.008
+    worst_uncertainty: float = 0.008
     sign_sigmas: float = 3.0
     knowledge: CameraKnowledge = _UNCALIBRATED
 
     @property
     def delay_per_row(self) -> float:
-        """The line time that is fitted, s."""
+        """The line time (s) assumed in the fit."""
         return 0.0 if self.line_time is None else self.line_time
 
     @property
     def line_time_sigma(self) -> float:
-        """By how much the line time may differ from that, one standard deviation, s."""
+        """The standard deviation (s) of the assumed line time."""
         if self.knowledge.line_time is not None:
             return self.knowledge.line_time
         return UNSTATED if self.line_time is None else 0.0
 
     @property
     def shutter_unstated(self) -> bool:
-        """Whether nobody said how the shutter works, so that it may roll."""
+        """Whether the type of shutter is unknown, so that it may be a rolling one."""
         return self.line_time is None and self.line_time_sigma > 0.0
+
+
+def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
+    """Return the accuracy of the pinhole that replaces a calibrated `lens` in the fit of streaks.
+
+    The fit has no distortion, so that the difference between lens and pinhole counts as an uncertainty.
+    """
+    middle = 0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)
+    square = math.hypot(*middle) ** 2 / lens.focal_length**2
+    return replace(
+        knowledge,
+        centre=math.hypot(knowledge.centre, math.dist(lens.centre, middle)),
+        distortion=math.hypot(knowledge.distortion, square * (lens.k1 + square * lens.k2)),
+    )

@@ -1,19 +1,26 @@
-"""The light of a long streak on the pixels about it, and how it changes with every parameter.
+"""The light of streaks and spots on the pixels, and its spot_derivatives with respect to all parameters.
 
-About a pixel the path is an arc: s along it, n across it, speed v. The light, per unit of the star's, is
+A long streak is fitted on strips: lines of pixels across its path, columns if the path runs more along rows
+than across them, rows otherwise. Ten lines form a block, over which the sensitivity to the motion is linear.
+Long paths are divided in time, and where their major axis changes; each part keeps the pixels nearest to it.
+The pixels stay fixed while the fit proceeds; only their distances from the path are updated.
+
+Near a pixel the path is an arc: s along it, n across it, speed v. The light of a star of unit light is
 
     m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
 
-with g a Gaussian of width w, k the arc's curvature, s0 and s1 where the exposure begins and ends, which a
-rolling shutter makes a matter of the pixel's row. The pixel's own square is in w, w^2 = sigma^2 + 1/12, and
-its fourth cumulant, -1/120 along each axis, in a correction of the profile across. When a parameter
+where g is a Gaussian of width w, k the curvature of the arc, and s0 and s1 the ends of the exposure, which
+depend on the pixel's row for a rolling shutter. The square pixel is included in w, w^2 = sigma^2 + 1/12, and
+its fourth cumulant, -1/120 along each axis, in a correction of the profile across the path. If a parameter
 moves the path by c(t), the light changes by
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
-where e0 and e1 are the light per px of path at the two ends: seven images serve all parameters, each block of
-pixels with its own coefficients. Where c_n changes along the path, the first moment of m about the block
-serves.
+where e0 and e1 are the light per px of path at the two ends. Seven images serve all parameters, with
+coefficients for each block; the first moment of m accounts for the change of c_n along a block.
+
+A spot, a short streak, or the slow part of a longer one is summed over instants of the exposure
+(Gauss-Legendre), each a Gaussian integrated over every pixel. The sum is exact, for a star at rest too.
 """
 
 from __future__ import annotations
@@ -28,52 +35,53 @@ from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import Float32Array
 from knightcube.vision.streaks.geometry import (
-    Motion,
-    Paths,
+    CameraMotion,
     Shutter,
-    moving,
+    StarPaths,
+    exposure_bounds,
     paths,
     positions,
     sensitivities,
-    window_times,
+    sensitivities_and_velocity,
 )
 
 LINES = 10
-"""Lines in a block."""
+"""Number of lines in a block."""
 
 STEEPEST = 0.68
-"""No path crosses its lines more obliquely: cosine to their normal, a little below that of both diagonals."""
+"""Minimum cosine between a path and the normal of its lines, slightly below that of the diagonals."""
 
-# A part of a path turns by this angle, rad, at most, so that it stays monotonic along its major axis.
-_LONGEST_TURN = 1.1
+# Largest rotation (rad) of one part of a path, for which the path is monotonic along its major axis.
+_LONGEST_ROTATION = 1.1
 _SAMPLES = 17
-# Where a path is divided it runs by so much more along the rows than across them.
+# Ratio of the velocities along rows and columns at which a path is divided. At 1, the seam could follow a
+# diagonal of pixels and lose all of them.
 _DIAGONAL = 1.03
-# Instants of a part at which its path's direction is taken.
+# Number of instants at which the direction of a part is evaluated.
 _INSTANTS = 7
+# Minimum speed, px per exposure.
 _SLOWEST = 1e-3
-# A line within reach of a part, beyond its end, may be crossed as obliquely as this.
+# Minimum cosine between a path and the normal of a line beyond the end of its part.
 _MOST_BENT = 0.5
-# How exactly, px, two parts of a straight path agree on which of them a pixel is nearest to; of a bent one
-# less exactly, by this part of the third power of the width over the square of the radius.
+# Width (px) of the seam between two parts of a straight path, and its growth for a bent path, relative to the
+# third power of the width over the square of the radius.
 _SEAM = 0.003
 _ARC = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """The pixels about the paths of `count` stars: `b` blocks of `LINES` lines of `k` pixels.
+    """The pixels near the paths of stars: b blocks of `LINES` lines of k pixels.
 
     Attributes:
-        count: stars.
-        star: (b,) which star a block is of, ascending.
-        time: (b, LINES) at which the path crosses the line, exposures.
-        corner: (b, LINES, 2) column and row of each line's first pixel; step: (b, 2) from pixel to pixel.
-        index: (b, LINES, k) into the flat frame; clipped where not `inside`.
-        inside: (b, LINES, k) whether the pixel exists and is nearest to this part of the path.
+        star: (b,) star of each block, ascending.
+        time: (b, LINES) time, in exposures, at which the path crosses the line.
+        corner: (b, LINES, 2) column and row of the first pixel of each line.
+        step: (b, 2) step from pixel to pixel.
+        index: (b, LINES, k) index into the flat frame, 0 if not `inside`.
+        inside: (b, LINES, k) whether the pixel is in the frame and nearest to this part of the path.
     """
 
-    count: int
     star: IntArray
     time: FloatArray
     corner: IntArray
@@ -82,14 +90,14 @@ class Strips:
     inside: BoolArray
 
     def rows(self, of: IntArray | slice) -> Float32Array:
-        """Return the rows (.., LINES, k) of the pixels of some blocks."""
+        """Return the rows (.., LINES, k) of the pixels of the blocks `of`."""
         along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
         return (self.corner[of, :, 1, None] + along).astype(np.float32)
 
 
 def cut_strips(
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     stars: FloatArray,
     times: FloatArray,
     width: float,
@@ -97,13 +105,18 @@ def cut_strips(
 ) -> Strips:
     """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures.
 
-    `ending` (n, 2): which of the times are ends of the path, beyond which there are pixels too; by default
-    all.
+    `ending` (n, 2) tells which times are ends of the path, beyond which pixels are included; None: all.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
         outer &= ending[part]
-    sampled, place = _extended(pinhole, motion, stars[part], (low, high), 1.45 * width + 1.0)
+    # Positions from a distance before the start of each part to the same distance beyond its end.
+    chosen, reach = stars[part], 1.45 * width + 1.0
+    begin = low - reach / _speed(paths(pinhole, motion, chosen, low))
+    end = high + reach / _speed(paths(pinhole, motion, chosen, high))
+    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
+    place = positions(pinhole, motion, np.repeat(chosen, _SAMPLES, axis=0), sampled.reshape(-1))
+    place = place.reshape(-1, _SAMPLES, 2)
     span = np.abs(place[:, -1] - place[:, 0])
     along_rows = span[:, 0] >= span[:, 1]
     major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
@@ -123,24 +136,14 @@ def cut_strips(
         _Lines(part[owner], owner, line, time, real, along_rows[owner]),
         path,
         width,
-        (low, high, outer, len(stars)),
+        (low, high, outer),
     )
-
-
-def _extended(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: tuple[FloatArray, FloatArray], reach: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return times (n, s) from `reach` px before the paths to as far beyond, and places (n, s, 2)."""
-    low, high = times
-    begin = low - reach / _speed(paths(pinhole, motion, stars, low))
-    end = high + reach / _speed(paths(pinhole, motion, stars, high))
-    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
-    there = positions(pinhole, motion, np.repeat(stars, _SAMPLES, axis=0), sampled.reshape(-1))
-    return sampled, there.reshape(-1, _SAMPLES, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
+    """Lines of pixels (b, LINES): star and part (b,) of each block, and the time of each crossing."""
+
     star: IntArray
     part: IntArray
     line: IntArray
@@ -150,13 +153,15 @@ class _Lines:
 
 
 def _parts(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return the parts' stars, start and end times, and which of those two are ends of the path (.., 2)."""
-    turned = float(np.linalg.norm(motion.whole)) + float(np.linalg.norm(motion.growth))
-    pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
+    """Return star, start and end time of each part, and whether those are ends of the path (.., 2)."""
+    turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
+    pieces = max(
+        1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
+    )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # exactly: a later test compares it
+    edges[:, -1] = times[:, 1]  # exactly, for the comparison below
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -170,11 +175,11 @@ def _parts(
 
 
 def _diagonals(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, low: FloatArray, high: FloatArray
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return which parts (n,) to divide, and when: where they run as much along the rows as across them.
+    """Return the parts to divide, and the times at which their major axis changes.
 
-    Those that keep to one axis need it not; `stars` (n, 2) and `low` to `high` (n,) are the parts'.
+    `stars` (n, 2) px and the times `low` to `high` (n,) describe the parts.
     """
     instants = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _INSTANTS)
     path = paths(pinhole, motion, np.repeat(stars, _INSTANTS, axis=0), instants.reshape(-1))
@@ -182,7 +187,6 @@ def _diagonals(
     major = way.sum(axis=1).argmax(axis=1)[:, None]
     steep = np.where(major, way[..., 1], way[..., 0]) < STEEPEST * np.hypot(way[..., 0], way[..., 1])
     divided = np.flatnonzero(steep.any(axis=1))
-    # Not just at 45 deg: the seam would be along a diagonal of pixels, of which all might be lost.
     excess = way[divided, :, 0] - _DIAGONAL * way[divided, :, 1]
     which, before = np.nonzero((excess[:, 1:] < 0.0) != (excess[:, :-1] < 0.0))
     first, last = excess[which, before], excess[which, before + 1]
@@ -192,7 +196,7 @@ def _diagonals(
 
 
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
-    """Return roughly when the paths cross `line` (b, LINES); the model corrects the rest."""
+    """Return approximate times at which the paths cross `line` (b, LINES); the model corrects them."""
     time = np.empty(line.shape)
     bounds = np.searchsorted(owner, np.arange(len(major) + 1))
     for part in range(len(major)):
@@ -205,12 +209,12 @@ def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: In
 def _pixels(
     pinhole: Pinhole,
     lines: _Lines,
-    path: Paths,
+    path: StarPaths,
     width: float,
-    parts: tuple[FloatArray, FloatArray, BoolArray, int],
+    parts: tuple[FloatArray, FloatArray, BoolArray],
 ) -> Strips:
-    """Return the strips of `lines`, whose paths are at `path` (b * LINES)."""
-    low, high, outer, count = parts
+    """Return the strips of `lines`, whose paths (b * LINES) are at `path`."""
+    low, high, outer = parts
     shape = lines.line.shape
     along = lines.along_rows[:, None]
     position, velocity = path.position.reshape(*shape, 2), path.velocity.reshape(*shape, 2)
@@ -224,14 +228,14 @@ def _pixels(
     minor = np.rint(crossing).astype(np.int64) - half
     corner = np.stack([np.where(along, lines.line, minor), np.where(along, minor, lines.line)], axis=-1)
     step = np.where(along, [[0, 1]], [[1, 0]])
-    aside, ahead = beside(corner, step, position, tangent, 2 * half + 1)
-    # Distances are wanted to a hundredth of a px.
+    aside, ahead = path_distances(corner, step, position, tangent, 2 * half + 1)
+    # An accuracy of 0.01 px suffices.
     pace, curved = speed.astype(np.float32), bend.astype(np.float32)
     ahead /= np.maximum(np.float32(1.0) - curved * aside, np.float32(0.5))
     aside -= np.float32(0.5) * curved * ahead * ahead
     foot = np.divide(ahead, pace, out=ahead)
     foot += lines.time.astype(np.float32)
-    # Between two parts a pixel may be lost, but none is counted twice.
+    # A pixel between two parts may be lost, but none is counted twice.
     seam, room = (_SEAM + _ARC * width**3 * np.square(bend)) / speed, width / speed
     start = low[lines.part, None] + np.where(outer[lines.part, :1], -room, seam)
     stop = high[lines.part, None] - np.where(outer[lines.part, 1:], -room, seam)
@@ -242,32 +246,26 @@ def _pixels(
     within &= foot < stop.astype(np.float32)
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
-    return _cropped(lines, count, pinhole.columns, within, corner, step)
-
-
-def _cropped(
-    lines: _Lines, count: int, columns: int, within: BoolArray, corner: IntArray, step: IntArray
-) -> Strips:
-    """Return the strips with the blocks and pixels that `within` (k, b, LINES) needs."""
+    # Only blocks and pixels of which some are within.
     crossed = np.flatnonzero(within.any(axis=(1, 2)))
     used = np.flatnonzero(within.any(axis=(0, 2)))
     begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
     inside = np.ascontiguousarray(within[begin:end, used].transpose(1, 2, 0))
     corner, step = corner[used] + begin * step[used, None], step[used]
-    first = corner[..., 1] * columns + corner[..., 0]
-    next_pixel = (step[:, 1] * columns + step[:, 0])[:, None, None]
+    first = corner[..., 1] * pinhole.columns + corner[..., 0]
+    next_pixel = (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
     index = first[..., None] + np.arange(end - begin) * next_pixel
     index *= inside
-    return Strips(count, lines.star[used], lines.time[used], corner, step, index, inside)
+    return Strips(lines.star[used], lines.time[used], corner, step, index, inside)
 
 
-def beside(
+def path_distances(
     corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return how far the pixels of each line (b, l) lie beside their path and ahead on it, (count, b, l) px.
+    """Return the distances (count, b, l) px of each line's pixels across the path and along it.
 
-    `corner` and `step` as of `Strips`; `position`, `tangent` (b, l, 2) of the path on the line. Pixels come
-    first: values of lines combine with all of them at the speed of long arrays.
+    `corner` and `step` are those of `Strips`; `position` and `tangent` (b, l, 2) are those of the path where
+    it crosses the line. The pixels are the first axis, for fast operations on long arrays.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
@@ -280,28 +278,30 @@ def beside(
     return aside, ahead
 
 
-def _speed(path: Paths) -> FloatArray:
+def _speed(path: StarPaths) -> FloatArray:
     return np.maximum(np.hypot(path.velocity[:, 0], path.velocity[:, 1]), _SLOWEST)
 
 
-# Gauss-Legendre nodes of a piece of the path: with one a width of the point spread it is exact to 1e-4.
+# Gauss-Legendre nodes of a piece of the path; about one per width of the point spread is exact to 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
+# Length of a piece, in widths of the point spread.
 _PIECE_WIDTHS = 8.0
-# Widths beyond a patch from which light still reaches its pixels.
+# Distance from a patch, in widths of the point spread, up to which light reaches its pixels.
 _BEYOND = 5.5
-# Instants at which a path that is slow in places is looked at to divide it.
+# Number of instants at which a path with a changing rate is evaluated to divide it.
 _SPOT_SAMPLES = 33
-_SPOT_BELL = 1.0 / math.sqrt(2.0 * math.pi)
+_BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patches:
-    """Square patches of pixels about spots.
+    """Square patches of pixels around spots.
 
     Attributes:
-        column, row: (n, p) of the pixels.
-        index: (n, p, p) into the flat frame; clipped where not `inside`.
-        inside: (n, p, p) whether the pixel exists.
+        column: (n, p) columns of the pixels.
+        row: (n, p) rows of the pixels.
+        index: (n, p, p) index into the flat frame, 0 if not `inside`.
+        inside: (n, p, p) whether the pixel is in the frame.
     """
 
     column: IntArray
@@ -311,7 +311,7 @@ class Patches:
 
 
 def cut_patches(pinhole: Pinhole, middles: FloatArray, half: int) -> Patches:
-    """Return the pixels within `half` px, each way, of `middles` (n, 2) px."""
+    """Return the pixels within `half` px of `middles` (n, 2) px in each direction."""
     corner = np.rint(middles).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
     column, row = corner[:, 0], corner[:, 1]
     inside = ((row >= 0) & (row < pinhole.rows))[:, :, None] & ((column >= 0) & (column < pinhole.columns))[
@@ -321,17 +321,27 @@ def cut_patches(pinhole: Pinhole, middles: FloatArray, half: int) -> Patches:
     return Patches(column, row, index, inside)
 
 
-def derivatives(
-    pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: FloatArray, sigma: float, patches: Patches
+def spot_derivatives(
+    pinhole: Pinhole,
+    motion: CameraMotion,
+    shutter: Shutter,
+    stars: FloatArray,
+    sigma: float,
+    patches: Patches,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the light (n, p, p) of stars (n, 2), each of light 1, and (n, 9, p, p) its derivatives.
+    """Return the light (n, p, p) of stars (n, 2) px of unit light, and its derivatives (n, 9, p, p).
 
-    By turn (3), growth (3), x, y, and `sigma` px of the point spread.
+    The parameters are rate (3), acceleration (3), x, y, and the width `sigma` (px) of the point spread.
     """
     count = len(stars)
     if not count:
         return np.empty(patches.index.shape), np.empty((0, 9, *patches.index.shape[1:]))
-    time, weight = _instants(pinhole, motion, shutter, stars, sigma, patches)
+    edges = exposure_bounds(pinhole, motion, shutter, stars)
+    if not motion.constant:
+        edges = _pieces(pinhole, motion, stars, edges, sigma, patches)
+    middle, half = 0.5 * (edges[:, 1:] + edges[:, :-1]), 0.5 * np.diff(edges)
+    time = (middle[..., None] + half[..., None] * _NODE).reshape(count, -1)
+    weight = (half[..., None] * _WEIGHT).reshape(count, -1)
     instants = time.shape[1]
     repeated = np.repeat(stars, instants, axis=0)
     place = positions(pinhole, motion, repeated, time.reshape(-1)).reshape(count, instants, 2)
@@ -349,24 +359,15 @@ def derivatives(
     return light, out
 
 
-def _instants(
-    pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: FloatArray, sigma: float, patches: Patches
-) -> tuple[FloatArray, FloatArray]:
-    """Return the times (n, m), in exposures, at which stars light their patches, and their weights (n, m)."""
-    times = window_times(pinhole, motion, shutter, stars)
-    edges = times
-    if not motion.constant:
-        edges = _pieces(pinhole, motion, stars, times, sigma, patches)
-    middle, half = 0.5 * (edges[:, 1:] + edges[:, :-1]), 0.5 * np.diff(edges)
-    time = middle[..., None] + half[..., None] * _NODE
-    weight = half[..., None] * _WEIGHT
-    return time.reshape(len(stars), -1), weight.reshape(len(stars), -1)
-
-
 def _pieces(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray, sigma: float, patches: Patches
+    pinhole: Pinhole,
+    motion: CameraMotion,
+    stars: FloatArray,
+    times: FloatArray,
+    sigma: float,
+    patches: Patches,
 ) -> FloatArray:
-    """Return times (n, p + 1) that divide the paths, as far as their light falls on the patches, evenly."""
+    """Return times (n, p + 1) that divide the paths near the patches into pieces of equal length."""
     n = len(stars)
     sampled = times[:, :1] + np.diff(times) * np.linspace(0.0, 1.0, _SPOT_SAMPLES)
     there = positions(pinhole, motion, np.repeat(stars, _SPOT_SAMPLES, axis=0), sampled.reshape(-1))
@@ -375,7 +376,7 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # A sample more on either side; a path that is never near keeps its whole.
+    # One more sample on either side; a path that is never near is kept entirely.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -386,54 +387,57 @@ def _pieces(
     out = np.empty((n, count + 1))
     for star in range(n):
         part = slice(first[star], last[star] + 1)
-        # Evenly by path, where there is one, and a little by time.
+        # The small term in time separates samples of a star at rest.
         run = way[star, part] + 1e-6 * np.arange(last[star] + 1 - first[star])
         out[star] = np.interp(run[0] + share * (run[-1] - run[0]), run, sampled[star, part])
     return out
 
 
 def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the share (n, m, p) of points (n, m) on pixels (n, p), and its change by place and sigma."""
+    """Return fractions (n, m, p) of light at `place` (n, m) on `pixels` (n, p), and two derivatives.
+
+    The derivatives are with respect to `place` and `sigma`.
+    """
     right = (pixels[:, None, :] + 0.5 - place[..., None]) / sigma
     left = right - 1.0 / sigma
-    bell_right = _SPOT_BELL * np.exp(-0.5 * right**2)
-    bell_left = _SPOT_BELL * np.exp(-0.5 * left**2)
+    bell_right = _BELL * np.exp(-0.5 * right**2)
+    bell_left = _BELL * np.exp(-0.5 * left**2)
     share = ndtr(right) - ndtr(left)
     return share, (bell_left - bell_right) / sigma, (left * bell_left - right * bell_right) / sigma
 
 
 IMAGES = 7
-"""m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, 1."""
+"""Number of images: m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, and 1."""
 
-# Blocks are drawn in groups of this many, so that their pixels stay in the processor's cache.
+# Number of blocks computed at a time, so that their pixels fit into the processor's cache.
 _AT_ONCE = 256
+# Distance from an end, in widths, beyond which its profile is 0 or 1.
 _ENDS = 5.5
-"""Widths from an end beyond which its profile is 0 or 1."""
+# Largest distance, in widths along the path, between a pixel and the crossing of its line.
 _OBLIQUE = 7.0
-"""Widths by which a pixel may lie ahead of where its line crosses the path."""
+# Time step of numerical differences, in exposures.
 _STEP = 1e-4
-_SLOWEST_LIGHT = 1e-3
-_BELL = 1.0 / math.sqrt(2.0 * math.pi)
+# Fourth cumulant (px^4) of a uniform distribution over a pixel.
 _KURTOSIS = -1.0 / 120.0
 
 
 def images(
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     shutter: Shutter,
     stars: FloatArray,
     width: float,
     strips: Strips,
     more: int = 0,
 ) -> Float32Array:
-    """Return the images (b, IMAGES + more, LINES, k) of stars (n, 2), each of light 1, on their strips.
+    """Return the images (b, IMAGES + more, LINES, k) of stars (n, 2) px of unit light on their strips.
 
-    `width` is w in px; this many `more` images are left for others to fill in.
+    `width` is w in px; `more` additional images are left uninitialised.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
     velocity = path.velocity.reshape(*shape, 2)
-    speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), _SLOWEST_LIGHT)
+    speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), _SLOWEST)
     position, acceleration = path.position.reshape(*shape, 2), path.acceleration.reshape(*shape, 2)
     lines = position, velocity / speed[..., None], speed, acceleration
     out = np.empty((len(strips.star), IMAGES + more, *strips.index.shape[1:]), dtype=np.float32)
@@ -451,9 +455,9 @@ def _draw(
     shutter: Shutter,
     width: float,
 ) -> None:
-    """Fill in the images of some blocks; `path`: position, tangent, speed and acceleration on their lines."""
+    """Compute images of some blocks; `path` has position, tangent, speed and acceleration on their lines."""
     speed, time = path[2], strips.time[part]
-    # By how much the speed along the path grows, px per exposure squared.
+    # Acceleration along the path, px per exposure^2.
     gained = np.sum(path[3] * path[1], axis=-1)
     light, aside, s = _endless(strips, part, (*path, gained), out.shape[3], width)
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
@@ -469,7 +473,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # The first moment of the light along the path, and the part that its ends cut off.
+    # First moment of the light along the path, without the part that the ends cut off.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]
@@ -480,14 +484,14 @@ def _draw(
 def _endless(
     strips: Strips, part: slice, path: tuple[FloatArray, ...], count: int, width: float
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return light of a path without ends, px beside it and px ahead on it, of some blocks' pixels.
+    """Return the light of a path without ends, and the pixels' distances (px) across it and along it.
 
-    All are (count, b, LINES), `count` pixels a line.
+    All are (count, b, LINES) for `count` pixels per line.
     """
     position, tangent, speed, acceleration, gained = path
     tx, ty = tangent[..., 0], tangent[..., 1]
     bend = (acceleration[..., 1] * tx - acceleration[..., 0] * ty) / speed**2
-    aside, ahead = beside(strips.corner[part], strips.step[part], position, tangent, count)
+    aside, ahead = path_distances(strips.corner[part], strips.step[part], position, tangent, count)
     squeeze = bend.astype(np.float32) * aside
     np.clip(squeeze, np.float32(-0.5), np.float32(0.5), out=squeeze)
     s = ahead / (np.float32(1.0) - squeeze)
@@ -498,11 +502,11 @@ def _endless(
     u *= np.float32(1.0 / width**2)
     light = np.multiply(u, np.float32(-0.5), out=ahead)
     np.exp(light, out=light)
-    # Slower stretches are brighter; inside a bend light is denser.
+    # Slow stretches are brighter, and so is the inside of a bend.
     light *= np.float32(1.0) + squeeze * (np.float32(0.5) + np.float32(0.375) * squeeze)
     light *= np.float32(1.0) - s * (gained / speed**2).astype(np.float32)
     scale = _BELL / (width * speed)
-    # The fourth powers of the tangent's components, whose squares add up to one.
+    # Sum of the fourth powers of the tangent's components.
     square = scale * (_KURTOSIS / (24.0 * width**4)) * (1.0 - 2.0 * np.square(tx * ty))
     u = (u - np.float32(6.0)) * u
     u *= square.astype(np.float32)
@@ -520,10 +524,10 @@ def _ends(
     part: slice,
     width: float,
 ) -> None:
-    """Cut the light in `out[:, 0]` at both ends of the exposure, and fill in what changes with them.
+    """Cut the light in `out[:, 0]` at both ends of the exposure, and set the images of the ends.
 
-    `along` (b, LINES, k) px from where the path is at the blocks' middle; `lines`: when it crosses each line
-    (b, LINES), when at the middle (b, 1), its speed on each, and by how much that grows.
+    `along` (b, LINES, k) px is the distance along the path from the centre of each block. `lines` has the
+    times at which the path crosses each line (b, LINES) and the centre (b, 1), and speed and acceleration.
     """
     out[:, 3:6] = 0.0
     crossing, centre, speed, gained = lines
@@ -539,7 +543,7 @@ def _ends(
         before_end = crossing[near] - end
         u += _wide((centre[near] - end) * speed[near] - 0.5 * gained[near] * before_end**2)
         if rolling:
-            # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
+            # The end depends on the row of the pixel.
             u -= shutter.delay(strips.rows(near + part.start)) * _wide(speed[near])
         u *= np.float32(sign / width)
         bell = u * u
@@ -550,7 +554,7 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # Light is denser where the star is slower: the end cuts off more of it, or less.
+        # A slower star is brighter, so that an end cuts off more or less light.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
@@ -558,32 +562,33 @@ def _ends(
 
 
 def _wide(line: FloatArray) -> Float32Array:
-    """Return a number of each line (b, l) for all its pixels."""
+    """Return values of lines (b, l) with an axis for their pixels, as float32."""
     return line[..., None].astype(np.float32)
 
 
 def coefficients(
     pinhole: Pinhole,
-    motion: Motion,
+    motion: CameraMotion,
     shutter: Shutter,
     stars: FloatArray,
     strips: Strips,
     growing: bool = True,
 ) -> FloatArray:
-    """Return (b, IMAGES, 8) which makes the images d(light)/d(turn, growth, x, y) of a star of light 1.
+    """Return coefficients (b, IMAGES, 8) of the images for the derivatives of the light of a unit star.
 
-    The columns of the growth are zero unless `growing`.
+    The parameters are rate (3), acceleration (3), x and y. The columns of the acceleration are zero unless
+    `growing`.
     """
     centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
     of_block = stars[strips.star]
-    # Each star has its two ends, or each block, where the shutter's delay differs from row to row.
+    # Each star has two ends, with a rolling shutter each block.
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:
         rows = strips.rows(slice(None))[:, LINES // 2].mean(axis=1).astype(np.float64)
         delay, ending, spread = np.asarray(shutter.delay(rows)), of_block, np.arange(len(centre))
     times = (centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5)
-    shift, side, speed = _moved(
+    shift, side, speed = _displacements(
         pinhole,
         motion,
         np.concatenate([of_block, of_block, ending, ending]),
@@ -603,12 +608,12 @@ def coefficients(
     return out
 
 
-def _moved(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool
+def _displacements(
+    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return how each parameter moves points along the path, in exposures, and across, px; and the speed."""
-    change, velocity = moving(pinhole, motion, stars, time, growing)
-    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST_LIGHT)
+    """Return displacements by each parameter along the path (exposures) and across it (px), and the speed."""
+    change, velocity = sensitivities_and_velocity(pinhole, motion, stars, time, growing)
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]
     along = change[:, 0] * tx + change[:, 1] * ty
     return along / speed[:, None], change[:, 1] * tx - change[:, 0] * ty, speed

@@ -1,4 +1,8 @@
-"""The result of a frame of streaks; loads no method: workers compute, the control process only reads."""
+"""The result of an estimate from streaks, and checks of its arguments that all estimators share.
+
+The control process reads results that workers compute, so that this module imports no estimator. One frame
+does not distinguish the rate omega from -omega; a prior, from a gyro or the last estimate, decides.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ from knightcube.vision.streaks.settings import RateModel
 
 
 class StreakStatus(Enum):
-    """Whether a frame gave a rate, or why not; the values are those of the `streak` telemetry packet."""
+    """Whether a frame gave a rate, or the reason; the values are those of the `streak` telemetry packet."""
 
     RATE = "rate"
     AMBIGUOUS = "ambiguous"
@@ -33,29 +37,38 @@ class StreakStatus(Enum):
     FROZEN = "frozen"
 
 
+REASONS = {
+    StreakStatus.FAILED: "no motion is consistent with enough of the light",
+    StreakStatus.TOO_FEW: "too few streaks are significant",
+    StreakStatus.TOO_SHORT: "the stars hardly moved",
+    StreakStatus.BLACK: "all pixels of the frame are equal",
+    StreakStatus.SATURATED: "the frame is overexposed",
+    StreakStatus.FROZEN: "the frame is the same as the previous one",
+}
+"""Reasons why a frame has no rate, in one line, for results without a more detailed reason."""
+
+
 def no_rows(*shape: int) -> Callable[[], FloatArray]:
-    """Return the default factory of a field: an empty array (0, *shape)."""
+    """Return a default factory for a field: an empty array (0, *shape)."""
     return partial(np.empty, (0, *shape))
 
 
 @dataclass(frozen=True, slots=True)
 class FrameMotion:
-    """The motion in one frame and the streaks it is from: common to both estimators.
+    """The motion in one frame and its streaks.
 
     Attributes:
-        status: `rate`: all is known; `ambiguous`: `rate` is right up to its sign, no prior could decide; any
-            other: no rate.
-        checksum: of the pixels; no two exposures of a living sensor have the same.
-        exposure: s, as given; the rate is the mean over it.
-        length: px, median of the streaks used, else of those found, else of the regions; NaN when none.
-        endpoints: (found, 2, 2) px, compensated when there is a rate; first ends are then simultaneous and,
-            when the status is `rate`, earlier.
-        used: (found,) which streaks the rate is from.
-        rate: (3,) rad/s, camera frame, mean over the exposure, of the camera with respect to the stars; None
-            when none.
-        covariance: (3, 3) rad^2/s^2 of `rate`; None when none.
-        residual: rad, rms of an endpoint; NaN when none.
-        hot_pixels: how many were repaired or left out.
+        status: `rate`: the rate is known; `ambiguous`: the rate is known up to its sign; others: no rate.
+        checksum: checksum of the pixels, which differs between any two exposures of a working sensor.
+        exposure: exposure time, s.
+        length: px, median length of the streaks used, else of the streaks or regions found; NaN without any.
+        endpoints: (found, 2, 2) px. With a rate, all first ends are simultaneous, and with status `rate` they
+            are earlier than the second ends.
+        used: (found,) which streaks determine the rate.
+        rate: (3,) rad/s, camera axes, of the camera with respect to the stars; None if unknown.
+        covariance: (3, 3) rad^2/s^2 of `rate`; None if unknown.
+        residual: rad, rms error of an endpoint; NaN if unknown.
+        hot_pixels: number of hot pixels, which are repaired or excluded.
     """
 
     status: StreakStatus
@@ -71,41 +84,43 @@ class FrameMotion:
 
     @property
     def found(self) -> int:
-        """How many streaks with two endpoints there were."""
+        """The number of streaks with two endpoints."""
         return len(self.endpoints)
 
     @property
     def used_count(self) -> int:
-        """How many streaks the rate is from."""
+        """The number of streaks that determine the rate."""
         return int(np.count_nonzero(self.used))
 
     def reversed(self) -> Self:
-        """Return the same motion in the other direction of time."""
+        """Return the motion with the opposite direction of time."""
         assert self.rate is not None
         return replace(self, rate=-self.rate, endpoints=self.endpoints[:, ::-1])
 
 
 @dataclass(frozen=True, slots=True)
 class MotionResult(FrameMotion):
-    """The motion of one exposure and the stars; the rate is that at mid-exposure.
+    """The maximum-likelihood motion of one exposure and its stars; `rate` is the mean over the exposure.
 
-    Every star found has two ends: `endpoints` (n, 2, 2). `used` (n,) are those that were fitted to their
-    pixels and determine the motion; `length` and `residual` (expected, not left over) are theirs.
+    `used` stars determine the motion; `length` and `residual` (expected error) are those of the used stars.
 
     Attributes:
-        stars: (n, 2) px at mid-exposure; `star_covariance` (n, 2, 2) px^2.
+        stars: (n, 2) px at mid-exposure.
+        star_covariance: (n, 2, 2) px^2 of `stars`.
         endpoint_covariance: (n, 2, 2, 2) px^2, star, end.
-        directions: (n, 3, 3) unit vectors at start, middle, end, camera frame.
-        flux: (n,) counts over the exposure; `significance` (n,) in its standard deviations.
-        faint_endpoints: (m, 2, 2) px, of streaks found along the motion but not fitted: to about a pixel.
-        faint_flux: (m,) counts; faint_significance (m,).
-        psf_sigma: px, fitted.
-        misfit: chi-square per degree of freedom, median of the bright stars: 1 where the rate model holds.
-        rate_model: which was fitted, `constant` or `accelerating`.
+        directions: (n, 3, 3) unit vectors at start, middle and end, camera axes.
+        flux: (n,) counts over the exposure.
+        significance: (n,) flux over its standard deviation.
+        faint_endpoints: (m, 2, 2) px, accurate to about 1 px, of streaks that were detected but not fitted.
+        faint_flux: (m,) counts.
+        faint_significance: (m,) flux over its standard deviation.
+        psf_sigma: px, fitted standard deviation of the point spread.
+        misfit: median chi-square per degree of freedom of the bright stars.
+        rate_model: the fitted model, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
-        reason: of a missing rate, in a line; empty with a rate.
-        course: the known course that the fit took for the rest of the motion; None without one.
-        line_time_sigma: s, by how much the shutter's line time may differ from the one that was fitted.
+        reason: why there is no rate, in one line; empty with a rate.
+        course: known rotation whose higher terms the fit used; None without one.
+        line_time_sigma: s, standard deviation of the shutter's line time.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -127,16 +142,17 @@ class MotionResult(FrameMotion):
 
     @property
     def start_to_end(self) -> FloatArray | None:
-        """The change of attitude over the exposure (4,), A(q) v_start = v_end; None without a rate.
+        """The quaternion (4,) of the rotation over the exposure, A(q) v_start = v_end; None without a rate.
 
-        By the mean rate where it changes: exact about a fixed axis.
+        It follows from the mean rate and is exact for a fixed axis of rotation.
         """
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
-    def late(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return by how many px (m, 2) a standard deviation of the line time displaces `chosen` (m,) stars.
+    def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
+        """Return displacements (m, 2) px of `chosen` (m,) stars by one standard deviation of the line time.
 
-        Each is exposed later by its row's distance from `middle_row`; (0, 2) where the line time is exact.
+        The delay is proportional to the distance of a star's row from `middle_row`. The array is empty (0, 2)
+        if the line time is exact.
         """
         if not self.line_time_sigma:
             return np.empty((0, 2))
@@ -145,7 +161,7 @@ class MotionResult(FrameMotion):
         return np.asarray((end - start) * delay)
 
     def reversed(self) -> Self:
-        """Return the same motion in the other direction of time; the change of the rate keeps its sign."""
+        """Return the motion with the opposite direction of time and the same acceleration."""
         return replace(
             FrameMotion.reversed(self),
             endpoint_covariance=self.endpoint_covariance[:, ::-1],
@@ -161,14 +177,12 @@ Result = TypeVar("Result", bound=FrameMotion)
 def validate(
     pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
 ) -> None:
-    """Raise FlightError for an impossible frame, exposure (s) or prior (rad/s)."""
+    """Raise FlightError for an invalid frame, exposure (s) or prior (rad/s)."""
     expected = (pinhole.rows, pinhole.columns)
     if pixels.shape != expected:
         raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
     if not np.issubdtype(pixels.dtype, np.unsignedinteger):
-        raise FlightError(
-            f"frame of {pixels.dtype}: pixels must be unsigned integers, as the camera gave them"
-        )
+        raise FlightError(f"frame of {pixels.dtype}: pass the raw counts as unsigned integers")
     if not (np.isfinite(exposure) and exposure > 0.0):
         raise FlightError(f"exposure of {exposure} s: must be finite and positive")
     if prior_rate is not None and not (np.shape(prior_rate) == (3,) and np.all(np.isfinite(prior_rate))):
@@ -180,9 +194,9 @@ def validate(
 def admit(
     pixels: Image, previous_checksum: int | None, saturation: float, saturated_fraction: float
 ) -> tuple[int, StreakStatus | None]:
-    """Return the checksum of `pixels`, and why they show no scene: black, saturated, frozen; None if they do.
+    """Return the checksum of `pixels`, and why the frame is unusable: black, saturated or frozen; else None.
 
-    Pixels equal to the previous frame's mean a frozen camera: no two exposures have the same noise.
+    A frame equal to the previous one indicates a frozen camera, because two exposures differ in their noise.
     """
     checksum = zlib.crc32(pixels.tobytes())
     state = frame_state(pixels, saturation, saturated_fraction)
@@ -192,7 +206,7 @@ def admit(
 
 
 def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float) -> Result:
-    """Return an ambiguous `result` in the direction of time that the prior gives it, where it is sure."""
+    """Return `result` with the direction of time of the prior, unchanged if the prior is too uncertain."""
     if result.rate is None or prior_rate is None:
         return result
     sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)
@@ -202,9 +216,9 @@ def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, s
 
 
 def direction_of_time(rate: FloatArray, prior_rate: FloatArray, prior_sigma: float, sigmas: float) -> int:
-    """Return the sign (+1, -1) that a prior gives `rate` (3,), or 0 when it is too weak.
+    """Return the sign (+1, -1) by which a prior orients `rate` (3,), 0 if the prior is too uncertain.
 
-    The prior's projection on the axis decides where it exceeds `sigmas` times its deviation `prior_sigma`.
+    The prior's projection on the axis must exceed `sigmas` times its standard deviation `prior_sigma`.
     """
     projection = float(rate @ prior_rate / np.linalg.norm(rate))
     if abs(projection) <= sigmas * prior_sigma:

@@ -1,8 +1,9 @@
-"""What a fit leaves over on its trusted streaks' pixels, and by how much their ends may be displaced for it.
+"""The covariance of the fitted rotation, including errors that the model does not describe.
 
-A point spread that is not the model's, wider along the streak than across it or of another shape, leaves
-light over at the ends of all streaks alike, and moves them alike. How much it moves them is not seen; were
-all that is left over a displacement, its size in px is what this module gives.
+Photon noise gives the smallest covariance. The scatter of the stars beyond their noise increases it, and so
+do errors of the camera's calibration as far as the stars do not reveal them. Two errors are common to all
+stars and cause no scatter: a point spread of another width or shape, which moves the ends of all streaks, and
+vibration of the body. The residuals at the ends and along the streaks bound both.
 """
 
 from __future__ import annotations
@@ -18,41 +19,45 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.frame import Float32Array
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
-    BentPinhole,
-    Motion,
-    Scene,
-    moving,
+    CameraMotion,
+    DistortedPinhole,
+    StreakScene,
     path_lengths,
     paths,
     positions,
+    sensitivities_and_velocity,
 )
-from knightcube.vision.streaks.joint_fit import ExposedCamera, Fit, bared_fit, refit
+from knightcube.vision.streaks.joint_fit import FitProblem, StreakFit, brightest_fit, refit
 from knightcube.vision.streaks.normal_equations import (
-    OwnEquations,
+    StarEquations,
     contradiction,
     disagreement,
     estimates_of,
-    own_equations,
-    shapes,
-    turn_covariance,
+    model_images,
+    rate_covariance,
+    star_equations,
 )
 from knightcube.vision.streaks.streak_model import LINES
 from knightcube.vision.streaks.streak_result import MotionResult
 
-# Residuals beyond this many sigmas and this part of their line's brightest pixel are another's light.
+# Residual of a pixel with light of another star: standard deviations, plus a fraction of the brightest pixel
+# of its line.
 _FOREIGN_SIGMAS = 5.0
 _FOREIGN_SHARE = 0.6
-# Pixels on which an end's displacement shows at least by this part of where it shows most.
-_SHOWN = 0.02
+# Minimum sensitivity of a pixel to a displacement, relative to the most sensitive pixel of its block.
+_LEAST_SENSITIVITY = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LeftOver:
-    """The trusted streaks' blocks of pixels, and what the model leaves over there.
+class StreakResiduals:
+    """The residuals of the trusted streaks on their blocks of pixels.
 
     Attributes:
-        star: (b,) index into the scene; time: (b, LINES) at which the path crosses the line.
-        images: (b, IMAGES, LINES, k); weight, residual: (b, LINES, k).
+        star: (b,) index of the star in the scene.
+        time: (b, LINES) time at which the path crosses the line.
+        images: (b, IMAGES, LINES, k) images of the model.
+        weight: (b, LINES, k) inverse variance, 0 for excluded pixels.
+        residual: (b, LINES, k) counts.
     """
 
     star: IntArray
@@ -62,10 +67,10 @@ class LeftOver:
     residual: Float32Array
 
 
-def left_over(camera: ExposedCamera, fit: Fit) -> LeftOver:
-    """Return what the fit leaves over on the strips of its trusted streaks."""
+def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
+    """Return the residuals of the fit on the strips of its trusted streaks."""
     scene, windows = fit.scene, fit.windows
-    images, spots, _ = shapes(camera.pinhole, camera.shutter, scene, windows)
+    images, spots, _ = model_images(camera.pinhole, camera.shutter, scene, windows)
     of_block = windows.long[windows.strips.star]
     light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
     peak = light.max(axis=2, keepdims=True, initial=0.0)
@@ -76,57 +81,55 @@ def left_over(camera: ExposedCamera, fit: Fit) -> LeftOver:
         foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
     weight[foreign] = 0.0
     chosen = np.flatnonzero(scene.trusted[of_block])
-    return LeftOver(
+    return StreakResiduals(
         of_block[chosen], windows.strips.time[chosen], images[chosen], weight[chosen], residual[chosen]
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """By how many px something would be displaced were all that is left over about it a displacement, rms.
+    """The rms displacement (px) that would explain residuals.
 
     Attributes:
-        shown: what is left over beyond chance; chance: what may be, beside noise.
+        shown: displacement beyond chance.
+        chance: upper bound, with the statistical uncertainty added.
     """
 
     shown: float
     chance: float
 
 
-def displaced_ends(left: LeftOver, scene: Scene) -> Displacement | None:
-    """Return the displacement of the ends along the paths; None where no streak shows an end."""
-    change = _light(left, scene) * (left.images[:, 3] + left.images[:, 4])
-    near = _shown(left, change)
+def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
+    """Return the displacement of the ends along the paths, None if no end is in the frame."""
+    light = scene.light[left.star, None, None].astype(np.float32)
+    change = light * (left.images[:, 3] + left.images[:, 4])
+    near = _sensitive(left, change)
     elsewhere = (left.weight > 0.0) & ~near
     squares = left.weight * left.residual * left.residual
     usual = float(np.mean(squares[elsewhere], dtype=np.float64)) if elsewhere.any() else 1.0
     return _displacement(left, squares, change, near, min(usual, 1.0))
 
 
-def displaced_sides(left: LeftOver, scene: Scene) -> Displacement | None:
-    """Return the displacement across the paths, away from their ends; None without a streak."""
-    light = _light(left, scene)
+def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
+    """Return the displacement across the paths away from their ends, None without streaks."""
+    light = scene.light[left.star, None, None].astype(np.float32)
     change = np.abs(light * left.images[:, 1])
-    along = _shown(left, change) & ~_shown(left, light * (left.images[:, 3] + left.images[:, 4]))
+    along = _sensitive(left, change) & ~_sensitive(left, light * (left.images[:, 3] + left.images[:, 4]))
     return _displacement(left, left.weight * left.residual * left.residual, change, along, 1.0)
 
 
-def _light(left: LeftOver, scene: Scene) -> Float32Array:
-    return scene.light[left.star, None, None].astype(np.float32)
-
-
-def _shown(left: LeftOver, change: Float32Array) -> BoolArray:
-    """Return on which pixels in use a `change` of the light shows."""
+def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
+    """Return which fitted pixels are sensitive to a `change` of the light."""
     most = change.max(axis=(1, 2), keepdims=True, initial=0.0)
-    return np.asarray((left.weight > 0.0) & (change > _SHOWN * most))
+    return np.asarray((left.weight > 0.0) & (change > _LEAST_SENSITIVITY * most))
 
 
 def _displacement(
-    left: LeftOver, squares: Float32Array, change: Float32Array, on: BoolArray, usual: float
+    left: StreakResiduals, squares: Float32Array, change: Float32Array, on: BoolArray, usual: float
 ) -> Displacement | None:
-    """Return the displacement that the residuals' `squares` on some pixels amount to; `usual` each by noise.
+    """Return the displacement that would explain the squared residuals `squares` on pixels `on`.
 
-    `change` is that of the light by a px.
+    `change` is the change of the light per px of displacement, `usual` the mean square due to noise.
     """
     count = int(np.count_nonzero(on))
     information = float(np.sum((left.weight * change * change)[on], dtype=np.float64))
@@ -140,26 +143,26 @@ def _displacement(
     )
 
 
-# Instants at which a path is compared with where an error puts it: the ends and between.
+# Instants at which a path is compared with its displacement by an error.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
+# Minimum speed, px per exposure.
 _SLOWEST = 1e-3
-# Turn and the star's own place among the sensitivities.
-_TURN_AND_PLACE = np.array([0, 1, 2, 6, 7])
-# Probability of a camera that is as described being taken for another.
+# Indices of rate and position among the sensitivities.
+_RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
+# Probability of a correction by chance.
 _BY_CHANCE = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Correction:
-    """What the errors of the camera's description change.
+class CalibrationCorrection:
+    """The effect of errors of the camera's calibration on the shared parameters.
 
     Attributes:
-        step: (k,) of the shared parameters, to where they are without these errors; 0 where chance explains
-            what the stars say of them.
-        added: (k, k), covariance beside that of an exact camera; described: that of the errors alone whose
-            size the description gives.
-        score: (n, k) of each star after these errors.
-        error: (m,), the likeliest errors, in standard deviations.
+        step: (k,) correction of the shared parameters; 0 if the errors are not significant.
+        added: (k, k) covariance added to that of an exact camera.
+        described: (k, k) part of it due to errors of described size.
+        score: (n, k) gradient of each star after correction.
+        error: (m,) likeliest errors, in standard deviations.
     """
 
     step: FloatArray
@@ -172,25 +175,29 @@ class Correction:
 def correct(
     information: FloatArray,
     score: FloatArray,
-    seeming: FloatArray,
+    apparent: FloatArray,
     spread: float,
     described: int,
     counted: FloatArray | None = None,
-) -> Correction | None:
-    """Return the joint solution of the shared parameters and of the camera's errors; None without one.
+) -> CalibrationCorrection | None:
+    """Return the joint solution for the shared parameters and the camera's errors, None if singular.
 
-    `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
-    (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be, those
-    first whose size is `described`; `spread` the variance of what is left over, in that of the noise;
-    `counted` (m,) what the fit knows of the errors already, beside which the correction is.
+    Args:
+        information: (n, k, k) information of each star, its own parameters eliminated.
+        score: (n, k) gradient of each star.
+        apparent: (n, k, m) apparent change of the shared parameters by m errors of one standard deviation;
+            the first errors are of described size.
+        spread: variance of the stars' scatter, relative to the noise.
+        described: number of errors of described size.
+        counted: (m,) errors already corrected in the fit, to which the result is relative.
     """
-    m = seeming.shape[2]
+    m = apparent.shape[2]
     known = information / spread
     shared = known.sum(axis=0)
-    weighted = known @ seeming
+    weighted = known @ apparent
     cross = weighted.sum(axis=0)
-    own = np.sum(seeming.swapaxes(1, 2) @ weighted, axis=0) + np.eye(m)
-    asked = np.einsum("nkm,nk->m", seeming, score) / spread
+    own = np.sum(apparent.swapaxes(1, 2) @ weighted, axis=0) + np.eye(m)
+    asked = np.einsum("nkm,nk->m", apparent, score) / spread
     if counted is not None:
         asked = asked - counted
     total = score.sum(axis=0) / spread
@@ -205,52 +212,51 @@ def correct(
         return None
     change = leading @ error
     seen = counted is not None or float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
-    left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
-    return Correction(seen * -change, added, stated, left_over, error)
+    remaining = score - np.einsum("nij,nj->ni", information, apparent @ error - change)
+    return CalibrationCorrection(seen * -change, added, stated, remaining, error)
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
-    """Return the covariance (k, k) by errors of which the stars leave the information `left` (m, m).
+    """Return the covariance (k, k) due to errors whose information from the stars is `left` (m, m).
 
-    Streaks displaced by much of their width ask for too little: a correction is known to its own size.
+    A correction is uncertain by its own size, because a large displacement of streaks is underestimated.
     """
     change = leading @ error
     return np.asarray(leading @ np.linalg.inv(left) @ leading.T + np.outer(change, change))
 
 
-def seeming_turns(camera: ExposedCamera, scene: Scene, exposure: float) -> FloatArray:
-    """Return the turn (n, 3, m), rad, that one standard deviation of each error seems to be to each star.
+def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
+    """Return the apparent rate changes (n, 3, m) rad per exposure of each star by errors of one sigma each.
 
-    Errors that cannot be, being known exactly, are left out; that of the shutter is the last. A streak shows
-    where its path lies all along and, by its ends, how far it goes: an error that only lengthens the path is
-    no other curvature.
+    Exactly known quantities are omitted; the error of the shutter is the last. A streak determines the
+    position of its path across and, by its ends, its length.
     """
-    errors = _errors(camera)
+    errors = _error_sizes(camera)
     n = len(scene.stars)
     if not errors:
         return np.empty((n, 3, 0))
     time, stars = np.repeat(_INSTANTS, n), np.tile(scene.stars, (len(_INSTANTS), 1))
-    sensitive, velocity = moving(camera.pinhole, scene.motion, stars, time, growing=False)
+    sensitive, velocity = sensitivities_and_velocity(camera.pinhole, scene.motion, stars, time, growing=False)
     place = positions(camera.pinhole, scene.motion, stars, time)
-    shift = _displacements(camera.pinhole, errors, place, velocity / exposure)
+    shift = _error_displacements(camera.pinhole, errors, place, velocity / exposure)
     speed = np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), _SLOWEST)
     tangent = velocity / speed
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     ends = np.abs(time) == 0.5
-    change, moved = (
+    change, displaced = (
         np.concatenate(
             [
                 np.einsum("pi,pij->pj", normal, of).reshape(len(_INSTANTS), n, -1),
                 np.einsum("pi,pij->pj", tangent[ends], of[ends]).reshape(2, n, -1),
             ]
         ).swapaxes(0, 1)
-        for of in (sensitive[:, :, _TURN_AND_PLACE], shift)
+        for of in (sensitive[:, :, _RATE_AND_POSITION], shift)
     )
-    return np.asarray((np.linalg.pinv(change) @ moved)[:, :3])
+    return np.asarray((np.linalg.pinv(change) @ displaced)[:, :3])
 
 
-def _errors(camera: ExposedCamera) -> dict[str, float]:
-    """Return one standard deviation of each error that can be; the shutter's is the last."""
+def _error_sizes(camera: FitProblem) -> dict[str, float]:
+    """Return the standard deviations of the uncertain quantities, the line time last."""
     known = camera.settings.knowledge
     sizes = {
         "focal length": known.focal_length,
@@ -262,10 +268,10 @@ def _errors(camera: ExposedCamera) -> dict[str, float]:
     return {error: sigma for error, sigma in sizes.items() if sigma > 0.0}
 
 
-def _displacements(
+def _error_displacements(
     pinhole: Pinhole, errors: dict[str, float], place: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return by how many px (p, 2, m) each error moves stars at `place` (p, 2), px, with `velocity`, px/s."""
+    """Return displacements (p, 2, m) px by each error, of stars at `place` (p, 2) px and `velocity` px/s."""
     away = place - np.array(pinhole.centre)
     corner = np.hypot(*pinhole.centre)
     moves = {
@@ -280,26 +286,27 @@ def _displacements(
     )
 
 
-def bent_camera(camera: ExposedCamera, error: FloatArray) -> ExposedCamera:
-    """Return the camera with a lens of these errors, in deviations and in the order of `seeming_turns`."""
-    sizes = zip(_errors(camera).items(), error, strict=False)  # the shutter's, which is none of the lens
+def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
+    """Return the camera with a lens of these errors (m,), in standard deviations, as in `apparent_rates`."""
+    sizes = zip(_error_sizes(camera).items(), error, strict=False)  # the line time is no property of the lens
     found = {name: sigma * float(by) for (name, sigma), by in sizes}
     scale, x, y, cubic = (
         found.get(name, 0.0) for name in ("focal length", "centre x", "centre y", "distortion")
     )
     pinhole = camera.pinhole
-    lens = BentPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
+    lens = DistortedPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
     return replace(camera, pinhole=lens)
 
 
+# Number of time bins over the exposure.
 _BINS = 48
-# What is common must exceed chance by this many deviations to be believed.
+# Minimum significance of a common motion, in standard deviations.
 _SIGNIFICANT = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class Shaking:
-    """What the streaks have in common beyond a smooth motion, rms; 0 where chance explains it.
+class CommonMotion:
+    """The rms motion common to all streaks beyond the smooth model; 0 if not significant.
 
     Attributes:
         across: px, displacement across the paths.
@@ -310,10 +317,15 @@ class Shaking:
     along: float = 0.0
 
 
-def find_shaking(camera: ExposedCamera, scene: Scene, left: LeftOver) -> Shaking:
-    """Return what the trusted streaks of a fit have in common; nothing where none is long."""
+def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
+    """Return the motion common to the trusted streaks, zero without long streaks.
+
+    Vibration displaces all streaks equally at each time across their paths, and changes their brightness
+    along the paths, where the motion slows down or speeds up. The residuals are averaged over the stars by
+    time. Only products of different stars are summed, so that a neighbour of one star has no effect.
+    """
     if not len(left.star):
-        return Shaking()
+        return CommonMotion()
     time, star = left.time, left.star
     stars = scene.stars[star]
     velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
@@ -328,14 +340,14 @@ def find_shaking(camera: ExposedCamera, scene: Scene, left: LeftOver) -> Shaking
         score = (light * np.sum(left.weight * left.residual * image, axis=2)).reshape(-1)
         information = (light**2 * np.sum(left.weight * image * image, axis=2)).reshape(-1)
         cell = (owner * _BINS + place)[within]
-        found.append(_common(cell, score[within, None] * way[within], information[within]))
-    return Shaking(*found)
+        found.append(_common_rms(cell, score[within, None] * way[within], information[within]))
+    return CommonMotion(*found)
 
 
-def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
-    """Return the rms of what all stars ask for in common, 0 when it may be chance.
+def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
+    """Return the rms displacement common to all stars, 0 if not significant.
 
-    `cell` (m,) numbers star and time; `score` (m, 2) and `information` (m,) of lines are summed.
+    `cell` (m,) numbers star and time bin; `score` (m, 2) and `information` (m,) of the lines are summed.
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
@@ -343,7 +355,7 @@ def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float
     own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
     own = own.reshape(-1, _BINS, 2)
     known = np.bincount(cell, information, size).reshape(-1, _BINS)
-    # A star by itself says as much as its own scatter allows: its model errors are not noise.
+    # The weight of a star is limited by its own scatter, which includes errors of the model.
     scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
     trust = 1.0 / np.maximum(scatter, 1.0)
     own, known = own * trust[:, None, None], known * trust[:, None]
@@ -356,35 +368,38 @@ def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float
     return float(np.sqrt(common / weight))
 
 
-# A rate that changes by less than this part of itself is far from rest: the pixels show how it changes.
+# Minimum relative change of the rate for a motion that begins or ends near rest.
 _NEAR_REST = 1.5
 _MOST_STARS = 10
-# The light along a path is summed in steps of this many px, from so many before the rest to so many lengths.
+# Step (px) of the light along a path, margin (px) before the rest, and length in lengths of the fitted path.
 _STEP = 0.5
 _BEFORE = 5.0
 _BEYOND = 1.9
-# Px to either side of the path that count.
+# Half width (px) of the pixels around a path.
 _ASIDE = 3
-# The motions compared: times of the shorter way over the longer one's, and lengths over that of the fit.
-# Ways nearly alike differ by a px or two of the path.
+# Reversing motions that are compared: ratio of the durations of the shorter and the longer part, and ratio of
+# the path length to the fitted one.
 _SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
 _LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
-# Part of the light by which the profile across may be wrong.
-_ROUGH = 0.05
-# No star says more than this many sigmas squared.
-_LOUDEST = 100.0
+# Relative error of the profile across a path.
+_PROFILE_ERROR = 0.05
+# Largest improvement of chi-square by one star.
+_MOST_IMPROVEMENT = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Along:
-    """A streak's light along its path, and what gives chi-square for any other light there.
+class _PathLight:
+    """Sums over the pixels of a streak from which chi-square follows for any light along its path.
+
+    The data d have weights w, and g is the point spread across the path.
 
     Attributes:
-        places: (k,) px from the rest.
-        square, cross, plain: (k,) sums of w g^2, w g d and w g over the pixels nearest to each place: data d
-            of weight w, and the point spread g across the path.
+        places: (k,) px, distances along the path from the rest.
+        square: (k,) sums of w g^2 over the pixels nearest to each place.
+        cross: (k,) sums of w g d.
+        plain: (k,) sums of w g.
         moments: sums of w, w d and w d^2 over all pixels.
-        pixels: their number.
+        pixels: number of pixels.
     """
 
     places: FloatArray
@@ -395,72 +410,72 @@ class _Along:
     pixels: int
 
 
-def turning_back(camera: ExposedCamera, scene: Scene) -> float:
-    """Return by how many sigmas squared a motion that turned back explains bright streaks better.
+def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
+    """Return the improvement of chi-square of bright streaks by a rotation that reverses in the exposure.
 
-    0 where none does. Where the rate is far from rest, or known from elsewhere, none is asked for.
+    It is 0 if no such rotation is better, or if the rate is far from zero or known from navigation. For a
+    linear rate, the light along a path is 1/sqrt(s) at s px from the rest. A rotation that reverses covers
+    the first part of the path twice, which doubles the light there. Two parts of equal length look like a
+    motion from rest, and no pixel distinguishes the two.
     """
-    motion, change = scene.motion, scene.motion.relative_growth
-    if abs(change) < _NEAR_REST or motion.shape.any():
+    motion, change = scene.motion, scene.motion.relative_acceleration
+    if abs(change) < _NEAR_REST or motion.higher_terms.any():
         return 0.0
     scene = scene.select(np.flatnonzero(scene.trusted))
     scene = scene.select(np.argsort(-scene.light, kind="stable")[:_MOST_STARS])
     first = -0.5 * np.sign(change)
     rests = positions(camera.pinhole, motion, scene.stars, np.full(len(scene.stars), first))
-    onward = Motion.steady(-np.sign(first) * motion.whole)
+    onward = CameraMotion.steady(-np.sign(first) * motion.rotation)
     share = (0.5 - 1.0 / abs(change)) / (0.5 + 1.0 / abs(change))
     better = np.zeros((len(_SHARES), len(_LENGTHS)))
     for rest, length in zip(rests, path_lengths(camera.pinhole, motion, scene.stars), strict=True):
-        streak = _along(camera, onward, rest, float(length), scene.width)
-        fitted = _misfit(streak, np.array([share]), np.array([length]), scene.width)
-        others = _misfit(streak, _SHARES, _LENGTHS * length, scene.width)
+        streak = _path_light(camera, onward, rest, float(length), scene.width)
+        fitted = _reversal_chi2(streak, np.array([share]), np.array([length]), scene.width)
+        others = _reversal_chi2(streak, _SHARES, _LENGTHS * length, scene.width)
         scale = max(1.0, float(min(others.min(), fitted.min())) / max(streak.pixels, 1))
-        better += np.clip((fitted - others) / scale, -_LOUDEST, _LOUDEST)
+        better += np.clip((fitted - others) / scale, -_MOST_IMPROVEMENT, _MOST_IMPROVEMENT)
     return max(0.0, float(better.max()))
 
 
-def _along(camera: ExposedCamera, onward: Motion, rest: FloatArray, length: float, width: float) -> _Along:
-    """Return the light along the path of a star that is at pixel `rest` (2,) first and moves `onward`."""
+def _path_light(
+    camera: FitProblem, onward: CameraMotion, rest: FloatArray, length: float, width: float
+) -> _PathLight:
+    """Return the light along the path of a star at rest at pixel `rest` (2,) that then moves `onward`."""
     frame, pinhole = camera.frame, camera.pinhole
     places = np.arange(-_BEFORE, _BEYOND * length + _BEFORE, _STEP)
     path = positions(pinhole, onward, np.repeat(rest[None], len(places), axis=0), places / length)
-    index = _pixels_near(path, pinhole.columns, pinhole.rows)
+    offset = np.arange(-_ASIDE, _ASIDE + 1)
+    x, y = (np.rint(path[:, axis]).astype(np.int64)[:, None, None] for axis in (0, 1))
+    x, y = np.broadcast_arrays(x + offset[:, None], y + offset)
+    inside = (x >= 0) & (x < pinhole.columns) & (y >= 0) & (y < pinhole.rows)
+    index = np.unique(y[inside] * pinhole.columns + x[inside])
     index = index[~frame.bad[index]]
     points = np.stack([index % pinhole.columns, index // pinhole.columns], axis=1)
     apart = np.sum((points[:, None] - path) ** 2, axis=2)
     nearest = np.argmin(apart, axis=1)
     apart = apart[np.arange(len(index)), nearest]
-    # What lies before the first place or beyond the last one is no part of the path.
+    # Pixels nearest to the first or the last place may lie beyond the path.
     kept = (apart < _ASIDE**2) & (nearest > 0) & (nearest < len(places) - 1)
     index, apart, nearest = index[kept], apart[kept], nearest[kept]
     data = frame.signal[index].astype(float)
     bright = np.maximum(data, 0.0)
-    weight = 1.0 / (frame.floor[index] + bright / frame.gain + (_ROUGH * bright) ** 2)
+    weight = 1.0 / (frame.floor[index] + bright / frame.gain + (_PROFILE_ERROR * bright) ** 2)
     across = np.exp(-0.5 * apart / width**2)
     square, cross, plain = (
         np.bincount(nearest, weight * each, len(places)).astype(float)
         for each in (across**2, across * data, across)
     )
     moments = float(np.sum(weight)), float(weight @ data), float(weight @ data**2)
-    return _Along(places, square, cross, plain, moments, len(index))
+    return _PathLight(places, square, cross, plain, moments, len(index))
 
 
-def _pixels_near(path: FloatArray, columns: int, rows: int) -> IntArray:
-    """Return the flat indices of the pixels about a path (k, 2)."""
-    offset = np.arange(-_ASIDE, _ASIDE + 1)
-    x, y = (np.rint(path[:, axis]).astype(np.int64)[:, None, None] for axis in (0, 1))
-    x, y = np.broadcast_arrays(x + offset[:, None], y + offset)
-    inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-    return np.unique(y[inside] * columns + x[inside])
+def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
+    """Return chi-square (s, l) of reversing motions with `shares` (s,) and path lengths `lengths` (l,) px.
 
-
-def _misfit(one: _Along, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
-    """Return chi-square (s, l) under motions whose ways have `shares` (s,) of time and `lengths` (l,) px.
-
-    The star's light and the sky about it are free.
+    `shares` are ratios of the durations of the two parts. Light and sky of the star are fitted.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    light = np.diff(_passed(edges / lengths[:, None], shares[:, None, None]), axis=-1)
+    light = np.diff(_light_before(edges / lengths[:, None], shares[:, None, None]), axis=-1)
     light = gaussian_filter1d(light, width / _STEP, axis=-1, mode="constant")
     square, cross, plain = light**2 @ one.square, light @ one.cross, light @ one.plain
     weight, first, second = one.moments
@@ -469,109 +484,116 @@ def _misfit(one: _Along, shares: FloatArray, lengths: FloatArray, width: float) 
     return np.asarray(second - explained)
 
 
-def _passed(place: FloatArray, share: FloatArray) -> FloatArray:
-    """Return what part of the light lies before `place`, in lengths from the rest.
+def _light_before(place: FloatArray, share: FloatArray) -> FloatArray:
+    """Return the fraction of the light before `place`, in path lengths from the rest.
 
-    A negative `share` is of a motion that begins after the rest.
+    A negative `share` stands for a motion that begins after the rest.
     """
     root, turned = np.sqrt(np.clip(place, 0.0, 1.0)), np.maximum(share, 0.0)
     whole = np.maximum(root, -share) + np.minimum(root, turned) + np.minimum(share, 0.0)
     return np.asarray(whole / (1.0 + share))
 
 
-# Rounds of conjugate gradients for the covariance.
+# Maximum number of conjugate-gradient steps for the covariance.
 _CONJUGATE = 12
-# Up to this number, stars hardly contradict each other: their variance counts by the factor.
+# Number of stars up to which they hardly contradict each other, and the factor on their variance.
 _UNCHECKED = (2, 4.0)
-# Fitted and described point spread are the same when their variances differ by this part.
+# Relative difference of variances up to which fitted and described point spread are equal.
 _SAME_SPREAD = 0.05
-# Ends are uncertain by this part of the square root of the difference of the variances;
+# Uncertainty of the ends, relative to the root of the difference of the variances.
 _END_SHARE = 0.6
-# where streaks show them, at most by this floor, px, and by these shares of the displacement that the light
-# left over about them amounts to: beyond chance, and with it.
+# Uncertainty of the ends by their residuals: minimum (px), and factors on the displacement shown and on its
+# upper bound.
 _END_FLOOR = 0.12
 _END_SHOWN = 1.5
 _END_CHANCE = 0.5
-# Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
-_END_SHAKING = 25.0
-# The lens is corrected so often at most, as long as an error of it is more than this part of its deviation,
-# where it leaves the turn uncertain by this part of it, unless the stars show it.
+# Uncertainty of the ends (px) per px, or per relative brightness, of common motion.
+_END_COMMON = 25.0
+# Maximum number of corrections of the lens, error (standard deviations) at which they stop, and relative
+# uncertainty of the rotation that makes them worthwhile if the stars do not show an error.
 _MOST_LENSES = 3
 _SMALL_ERROR = 0.2
-_WORTH = 0.002
-# A covariance beyond this many times that of noise is by errors of the model: three deviations.
+_WORTHWHILE = 0.002
+# Ratio of the covariance to that of noise above which errors of the model cause it (three sigma).
 _BEYOND_NOISE = 9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Claim:
-    """What is known of the turn.
+class RotationUncertainty:
+    """The rotation over the exposure and its uncertainty.
 
     Attributes:
-        turn: (3,) rad, corrected for the camera's errors where the stars show them.
+        rotation: (3,) rad, corrected for errors of the calibration that the stars show.
         covariance: (3, 3) rad^2.
-        doubt: share of the turn to which errors of the model leave it uncertain, as a vector: common to all
-            stars or not. A shutter that nobody described is not counted: the covariance says all of it.
-        shaking: of the body.
-        aside: px across the streaks, what the model leaves over there as a displacement.
+        model_error: uncertainty due to errors of the model, relative to the rotation; that of an undescribed
+            shutter is only in the covariance.
+        common_motion: motion common to all streaks.
+        aside: px, displacement across the streaks that would explain the residuals.
     """
 
-    turn: FloatArray
+    rotation: FloatArray
     covariance: FloatArray
-    doubt: float
-    shaking: Shaking
+    model_error: float
+    common_motion: CommonMotion
     aside: float
 
 
-def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
-    """Return what the `whole` fit may claim of its turn; `result` has its stars.
+def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
+    """Return the rotation of the `whole` fit with its uncertainty; `result` has the stars of the fit.
 
-    Where stars are hidden in the streaks, the turn is that of the brightest, fitted with those.
+    If stars are hidden in the streaks, the rotation is that of the brightest streaks with all hidden stars.
     """
-    camera, whole, lens = _straightened(camera, whole, result.exposure)
-    bared = bared_fit(camera, whole)
-    last = whole if bared is None else bared
+    camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
+    brightest = brightest_fit(camera, whole)
+    last = whole if brightest is None else brightest
     scene, settings = last.scene, camera.settings
-    exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
+    exact = rate_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = last.solution.covariance[:3, :3] if exact is None else exact
-    if bared is not None:
-        lens = _with_lens(camera, bared, result.exposure, lens.counted)
-    turn = scene.motion.whole + lens.step
-    # What made others disagree is as likely to hide, less of it, in the light of those that agree.
+    if brightest is not None:
+        lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
+    rotation = scene.motion.rotation + lens.step
+    # The cause of rejected stars may affect the others too, to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
-    asked = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
-    spread = max(result.misfit, lens.spread, 1.0) * max(asked / max(agreed, 1), 1.0)
+    judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
+    spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)
     if agreed <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
-    left = left_over(camera, whole)
-    shaking = find_shaking(camera, whole.scene, left)
+    residuals = residuals_of_fit(camera, whole)
+    common_motion = find_common_motion(camera, whole.scene, residuals)
     end = np.hypot(
-        _spread_doubt(left, whole.scene, settings.psf_sigma, result.misfit),
-        _END_SHAKING * max(shaking.across, shaking.along),
+        _end_uncertainty(residuals, whole.scene, settings.psf_sigma, result.misfit),
+        _END_COMMON * max(common_motion.across, common_motion.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
-    # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
-    # to and fro, as pixels are left out and taken in, is known no better than that.
-    covariance = noise * spread * (1.0 + last.restless**2)
-    longer = ends**2 * float(turn @ turn)
-    # Ends that are alike uncertain make the turn longer or shorter; the covariance leaves room for its axis.
+    # A fit that did not settle is uncertain by its last step.
+    covariance = noise * spread * (1.0 + last.last_step**2)
+    # A common error of the ends changes the length of the rotation; the axis gets the same uncertainty.
+    longer = ends**2 * float(rotation @ rotation)
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
-    return Claim(
-        turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking, _aside(left, whole.scene)
+    sides = side_displacement(residuals, whole.scene)
+    return RotationUncertainty(
+        rotation,
+        covariance,
+        float(np.sqrt(unmodelled / (rotation @ rotation))),
+        common_motion,
+        0.0 if sides is None else sides.shown,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Lens:
-    """What errors of the camera's description make of the turn.
+class _LensEffect:
+    """The effect of calibration errors on the rotation; see `CalibrationCorrection`.
 
     Attributes:
-        step: (3,), its correction; added, described: (3, 3), as of `Correction`.
-        spread: of the stars, in that of the noise.
-        error: (m,) as of `Correction`, beside those that the fit knew, `counted` (m,), None without; seen:
-            whether the stars show them.
+        step: (3,) rad, correction of the rotation.
+        added: (3, 3) rad^2, covariance added.
+        described: (3, 3) rad^2, part of it due to errors of described size.
+        spread: variance of the stars' scatter, relative to the noise.
+        error: (m,) errors relative to `counted`, in standard deviations.
+        counted: (m,) errors already corrected in the fit; None without any.
+        seen: whether the errors are significant.
     """
 
     step: FloatArray
@@ -583,88 +605,87 @@ class _Lens:
     seen: bool
 
 
-def _straightened(camera: ExposedCamera, whole: Fit, exposure: float) -> tuple[ExposedCamera, Fit, _Lens]:
-    """Return camera and fit with the likeliest errors of the lens, and what is left of them in the turn.
+def _corrected_lens(
+    camera: FitProblem, whole: StreakFit, exposure: float
+) -> tuple[FitProblem, StreakFit, _LensEffect]:
+    """Return camera and fit with the likeliest errors of the lens corrected, and their remaining effect.
 
-    Streaks that are displaced by much of their width ask for too small a correction: the fit goes on through
-    the lens that they ask for, until they ask no more. It is worth its time where the stars show that the
-    lens is another, and where not to know it is most of the doubt.
+    Large displacements of streaks are underestimated, so that the fit is repeated with the corrected lens
+    until the correction is small. This is done if the stars show an error, or if the lens contributes most of
+    the uncertainty.
     """
-    first = lens = _with_lens(camera, whole, exposure, None)
-    if not lens.seen and np.trace(lens.described) < _WORTH**2 * np.sum(whole.scene.motion.whole**2):
+    first = lens = _lens_effect(camera, whole, exposure, None)
+    if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):
         return camera, whole, lens
     through, fit, error = camera, whole, np.zeros(len(lens.error))
     for _ in range(_MOST_LENSES):
         if not np.any(np.abs(lens.error) > _SMALL_ERROR) or camera.work.exhausted:
             break
         error = error + lens.error
-        through = bent_camera(replace(camera, growing=bool(whole.free[3])), error)
+        through = distorted_camera(replace(camera, growing=bool(whole.free[3])), error)
         again = refit(through, fit)
         if again is None:
             return camera, whole, first
         fit = again
-        lens = _with_lens(through, fit, exposure, error)
+        lens = _lens_effect(through, fit, exposure, error)
     return through, fit, lens
 
 
-def _with_lens(camera: ExposedCamera, last: Fit, exposure: float, counted: FloatArray | None) -> _Lens:
-    """Return what errors of the camera's description make of the turn, beside those `counted` (m,)."""
+def _lens_effect(
+    camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
+) -> _LensEffect:
+    """Return the effect of calibration errors on the rotation beyond the errors `counted` (m,)."""
     nothing = np.zeros((3, 3))
-    equations = own_equations(last.evaluation, last.free)
+    equations = star_equations(last.evaluation, last.free)
     if equations is None:
-        return _Lens(np.zeros(3), nothing, nothing, 1.0, np.zeros(0), counted, False)
+        return _LensEffect(np.zeros(3), nothing, nothing, 1.0, np.zeros(0), counted, False)
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
-    equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
-    seeming = seeming_turns(camera, scene, exposure)
-    spread = _spread(equations, scene)
-    exact = _Lens(np.zeros(3), nothing, nothing, spread, np.zeros(0), counted, False)
-    if not seeming.shape[2]:
+    equations = StarEquations(equations.kept, equations.information[trusted], equations.score[trusted])
+    apparent = apparent_rates(camera, scene, exposure)
+    spread = _scatter(equations, scene)
+    exact = _LensEffect(np.zeros(3), nothing, nothing, spread, np.zeros(0), counted, False)
+    if not apparent.shape[2]:
         return exact
-    described = seeming.shape[2] - int(camera.settings.shutter_unstated)
-    shared = np.zeros((len(trusted), len(equations.kept), seeming.shape[2]))
-    shared[:, :3] = seeming
+    described = apparent.shape[2] - int(camera.settings.shutter_unstated)
+    shared = np.zeros((len(trusted), len(equations.kept), apparent.shape[2]))
+    shared[:, :3] = apparent
     corrected, before = None, 1.0
-    # The part of the disagreement that the camera's errors explain is not counted as noise.
+    # Scatter that calibration errors explain is not counted as noise.
     for _ in range(2):
         corrected = correct(equations.information, equations.score, shared, before, described, counted)
         if corrected is None:
             return exact
         left = replace(equations, score=corrected.score)
-        before = max(1.0, min(spread, _spread(left, scene)))
+        before = max(1.0, min(spread, _scatter(left, scene)))
     assert corrected is not None
     added, stated = corrected.added[:3, :3], corrected.described[:3, :3]
     seen = bool(corrected.step.any())
-    return _Lens(
+    return _LensEffect(
         corrected.step[:3], added, stated, before if seen else spread, corrected.error, counted, seen
     )
 
 
-def _spread(equations: OwnEquations, scene: Scene) -> float:
-    """Return by how much the stars contradict each other, in the variance of their noise."""
+def _scatter(equations: StarEquations, scene: StreakScene) -> float:
+    """Return the variance of the stars' scatter, relative to their noise."""
     everyone: BoolArray = np.ones(len(scene.light), dtype=np.bool_)
     return max(disagreement(estimates_of(equations, scene), everyone), contradiction(equations))
 
 
-def _spread_doubt(left: LeftOver, scene: Scene, sigma: float, misfit: float) -> float:
-    """Return by how many px the ends of streaks are uncertain by a point spread other than `sigma` px.
+def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
+    """Return the uncertainty (px) of the ends due to a point spread of another width than `sigma` px.
 
-    Where the fit leaves nothing over about the ends the point spread is as wide along the streaks as across
-    them, and of the model's shape, however wide. What is left over there may be another shape, or the light
-    of a body that shakes too fast to be seen, whose ends are farther off than they seem.
+    Without residuals at the ends, the point spread has the same width along and across the streaks and the
+    shape of the model. Residuals indicate another shape, or a vibration too fast to be resolved, which shifts
+    the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
     if beyond <= 0.0:
         return 0.0
     another = _END_SHARE * float(np.sqrt(beyond)) * max(misfit, 1.0)
-    ends = displaced_ends(left, scene)
+    ends = end_displacement(left, scene)
     if ends is None:
         return another
     seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
     return min(another, float(np.hypot(_END_FLOOR, seen)))
-
-
-def _aside(left: LeftOver, scene: Scene) -> float:
-    sides = displaced_sides(left, scene)
-    return 0.0 if sides is None else sides.shown

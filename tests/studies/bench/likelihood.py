@@ -22,7 +22,7 @@ from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_motion
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.geometry import Motion, positions
+from knightcube.vision.streaks.geometry import CameraMotion, positions
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import render
@@ -85,7 +85,7 @@ def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[f
     """
     out = []
     bright = scene.stars[:_BRIGHT]
-    motion = Motion.steady(scene.rate * scene.exposure)
+    motion = CameraMotion.steady(scene.rate * scene.exposure)
     ended = np.zeros(len(bright), dtype=np.bool_)
     for end in (-0.5, 0.5):
         there = positions(CAMERA.pinhole, motion, bright, np.full(len(bright), end))

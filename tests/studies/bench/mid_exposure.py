@@ -31,7 +31,7 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, solve_motion
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
@@ -163,7 +163,7 @@ def across_bound(scene: Scene, camera: StarCameraModel) -> float:
         np.any([pinhole.contains(place) for place in (scene.start, scene.middle, scene.end)], axis=0)
     )
     brightest = seen[np.argsort(-scene.electrons[seen], kind="stable")][:_STARS]
-    motion = Motion.steady(scene.rate * scene.exposure)
+    motion = CameraMotion.steady(scene.rate * scene.exposure)
     floor = noise_floor(camera, scene.exposure)
     total = np.zeros((_SHARED + 3, _SHARED + 3))
     change = _by_attitude(pinhole.unit_vectors(scene.middle[brightest]), pinhole)

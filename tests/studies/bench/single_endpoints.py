@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.geometry import Motion, paths, sensitivities
+from knightcube.vision.streaks.geometry import CameraMotion, paths, sensitivities
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import turn_of
@@ -97,7 +97,7 @@ def _end_errors(
     camera: StarCameraModel,
 ) -> FloatArray:
     """Return rows of error along (outward), across, and their joint bounds, px, of every end found."""
-    pinhole, motion = camera.pinhole, Motion.steady(turn)
+    pinhole, motion = camera.pinhole, CameraMotion.steady(turn)
     covariances = _joint_bounds(places, motion, electrons, floor, camera)
     rows = []
     for number, place in enumerate(places):
@@ -116,7 +116,7 @@ def _end_errors(
 
 
 def _joint_bounds(
-    places: FloatArray, motion: Motion, electrons: float, floor: float, camera: StarCameraModel
+    places: FloatArray, motion: CameraMotion, electrons: float, floor: float, camera: StarCameraModel
 ) -> FloatArray:
     """Return the least covariances (n, 2, 2, 2) px^2 of both ends of stars that are fitted together."""
     pinhole = camera.pinhole

@@ -32,7 +32,7 @@ from knightcube.vision.frame_job import run as look
 from knightcube.vision.objects.settings import MeasuredObjects, ObjectMeasurementSettings
 from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -197,7 +197,7 @@ class _Frame:
         light = float(CAMERA.electrons([magnitude], EXPOSURE)[0])
         floor = CAMERA.read_noise**2 + CAMERA.dark_current * EXPOSURE + CAMERA.gain**2 / 12.0
         pinhole: Pinhole = CAMERA.pinhole
-        relative = Motion.steady((self.turn - own) * EXPOSURE)
+        relative = CameraMotion.steady((self.turn - own) * EXPOSURE)
         known = star_information(pinhole, relative, place, light, CAMERA.psf_sigma, floor)
         return math.sqrt(0.5 * float(np.trace(np.linalg.inv(known[4:, 4:])[:2, :2])))
 

@@ -12,7 +12,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, m
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.support.streak_bound import rate_bound, star_information
 
@@ -55,7 +55,7 @@ class SkyFrame:
         """
         camera = self.camera
         floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
-        motion = Motion.steady(self.rate * self.exposure)
+        motion = CameraMotion.steady(self.rate * self.exposure)
         total = np.zeros((3, 3))
         for star, light in zip(self.stars[:most], self.electrons[:most], strict=True):
             # After the turn and the point spread: x, y, electrons, background.

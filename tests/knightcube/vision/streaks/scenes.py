@@ -8,7 +8,7 @@ import numpy as np
 
 from knightcube.astro import catalogue, quaternion
 from knightcube.astro.arrays import FloatArray, Image
-from knightcube.vision.streaks.geometry import Motion, paths
+from knightcube.vision.streaks.geometry import CameraMotion, paths
 from sim_hal.star_camera import StarCameraModel, render
 from tests.support.streak_bound import RateBound, rate_bound
 
@@ -94,7 +94,10 @@ def taken(
     places, magnitudes = camera.pinhole.project(seen[front]), stars.magnitude[front]
     samples = np.linspace(-0.5, 0.5, 9)
     along = paths(
-        camera.pinhole, Motion(turn, growth), np.repeat(places, 9, axis=0), np.tile(samples, len(places))
+        camera.pinhole,
+        CameraMotion(turn, growth),
+        np.repeat(places, 9, axis=0),
+        np.tile(samples, len(places)),
     )
     visible = camera.pinhole.contains(along.position.reshape(-1, 9, 2)).mean(axis=1) > 0.3
     electrons = camera.electrons(magnitudes[visible], exposure)

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.quaternion import attitude_matrix
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import FlightError
-from knightcube.vision.streaks.estimate import estimate_motion
+from knightcube.vision.camera.lens import CameraKnowledge, Lens
+from knightcube.vision.streaks.estimate import estimate_motion, estimate_rate
 from knightcube.vision.streaks.faint_stars import find_faint, frame_angles, sharper_widths
-from knightcube.vision.streaks.frame import expose_frame
-from knightcube.vision.streaks.geometry import Course, Motion, in_chains
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Course, chained_stars
 from knightcube.vision.streaks.joint_fit import true_ends, unbroken
-from knightcube.vision.streaks.settings import LikelihoodSettings
+from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
 from tests.flight.loop.passing import passed
@@ -286,10 +287,10 @@ def test_nonsense_is_refused() -> None:
 
 
 def _share_of_true_ends(scene: Scene, turn: FloatArray) -> float:
-    frame = expose_frame(scene.pixels, SATURATION, 1.0)
+    frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     times = np.tile([-0.5, 0.5], (12, 1))
     light = scene.electrons[:12]
-    motion = Motion.steady(turn)
+    motion = CameraMotion.steady(turn)
     return float(np.nanmean(true_ends(frame, CAMERA.pinhole, motion, scene.stars[:12], light, times)))
 
 
@@ -306,8 +307,8 @@ def test_light_lies_all_along_the_true_path_and_not_along_one_too_long(
     factor: float, least: float, most: float
 ) -> None:
     scene = real_sky(33, np.radians(70.0), 200.0, 0.2)
-    frame = expose_frame(scene.pixels, SATURATION, 1.0)
-    times, motion = np.tile([-0.5, 0.5], (12, 1)), Motion.steady(factor * scene.rate * scene.exposure)
+    frame = reduce_frame(scene.pixels, SATURATION, 1.0)
+    times, motion = np.tile([-0.5, 0.5], (12, 1)), CameraMotion.steady(factor * scene.rate * scene.exposure)
     whole = unbroken(frame, CAMERA.pinhole, motion, scene.stars[:12], factor * scene.electrons[:12], times)
     assert len(whole) >= 8
     assert least <= np.mean(whole) <= most
@@ -318,7 +319,7 @@ def test_the_light_of_the_whole_frame_tells_the_angle_about_a_roughly_known_axis
     theta: float, length: float
 ) -> None:
     scene = real_sky(34, np.radians(theta), length, 0.2)
-    frame = expose_frame(scene.pixels, SATURATION, 1.0)
+    frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     turn = scene.rate * scene.exposure
     told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2)
     assert abs(told[0] / np.linalg.norm(turn) - 1.0) < 0.08
@@ -335,24 +336,27 @@ def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
 def test_hardly_any_streak_is_found_where_there_is_only_noise_near_the_axis_too() -> None:
     """Close samples on slow circles share pixels: their noise does not average out."""
     noise = np.random.default_rng(5).normal(500.0, 10.5, (1024, 1024))
-    frame = expose_frame(np.rint(noise).astype(np.uint16), SATURATION, 1.0)
+    frame = reduce_frame(np.rint(noise).astype(np.uint16), SATURATION, 1.0)
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     turn = 0.2 * np.array([np.sin(0.1), 0.0, np.cos(0.1)])
-    found = find_faint(frame, nothing, CAMERA.pinhole, Motion.steady(turn), 6.0, 200)
+    found = find_faint(frame, nothing, CAMERA.pinhole, CameraMotion.steady(turn), 6.0, 200)
     assert len(found.light) <= 1
 
 
 def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:
     scene = real_sky(32, np.radians(45.0), 120.0, 0.2, faintest=5.5)
-    frame = expose_frame(scene.pixels, SATURATION, 1.0)
+    frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     turn = scene.rate * scene.exposure
     whole, pieces = (
-        find_faint(frame, nothing, CAMERA.pinhole, Motion.steady(part * turn), 8.0, 200)
+        find_faint(frame, nothing, CAMERA.pinhole, CameraMotion.steady(part * turn), 8.0, 200)
         for part in (1.0, 0.4)
     )
-    in_whole = in_chains(CAMERA.pinhole, Motion.steady(turn), whole.stars[:20], whole.light[:20])
-    in_pieces = in_chains(CAMERA.pinhole, Motion.steady(0.4 * turn), pieces.stars, pieces.light)
+    pinhole = CAMERA.pinhole
+    in_whole = chained_stars(pinhole, CameraMotion.steady(turn), whole.stars[:20], whole.light[:20], 20)
+    in_pieces = chained_stars(
+        pinhole, CameraMotion.steady(0.4 * turn), pieces.stars, pieces.light, len(pieces.stars)
+    )
     assert np.mean(in_whole) < 0.3
     assert np.mean(in_pieces[:20]) > 0.6
 
@@ -412,3 +416,48 @@ def test_the_rate_reaches_the_bound_where_the_sky_holds_no_hidden_light() -> Non
         error = found.rate - scene.rate
         ratios.append(float(error @ np.linalg.solve(scene.bound().covariance, error)) / 3.0)
     assert np.sqrt(np.mean(ratios)) < 1.35
+
+
+def test_one_call_gives_rate_covariance_and_rotation_of_an_image() -> None:
+    scene = real_sky(60, 1.1, 60.0, 0.5)
+    found = estimate_rate(scene.pixels, CAMERA.pinhole, scene.exposure, prior_rate=scene.rate)
+    assert found.status is StreakStatus.RATE
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert found.start_to_end is not None
+    assert _squared(found.rate - scene.rate, found.covariance) < 16.3
+    assert found.start_to_end == pytest.approx(from_rotation_vector(found.rate * scene.exposure))
+    assert found.reason == ""
+
+
+def test_one_call_names_the_reason_for_a_missing_rate() -> None:
+    found = estimate_rate(np.zeros((1024, 1024), np.uint16), CAMERA.pinhole, 1.0)
+    assert found.rate is None
+    assert found.reason == "all pixels of the frame are equal"
+    noise = np.random.default_rng(3).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
+    found = estimate_rate(noise, CAMERA.pinhole, 1.0)
+    assert (found.rate, found.reason) == (None, "too few streaks are significant")
+
+
+def test_a_calibrated_lens_widens_the_covariance_by_what_the_pinhole_lacks() -> None:
+    scene = real_sky(60, 1.1, 60.0, 0.5)
+    pinhole = CAMERA.pinhole
+    centre = (pinhole.centre[0] + 20.0, pinhole.centre[1])
+    lens = Lens(pinhole.columns, pinhole.rows, pinhole.focal_length, centre)
+    settings = LikelihoodSettings(saturation=SATURATION, worst_uncertainty=1.0)
+    sizes = []
+    for camera in (pinhole, lens):
+        found = estimate_rate(scene.pixels, camera, scene.exposure, prior_rate=scene.rate, settings=settings)
+        assert found.covariance is not None
+        sizes.append(float(np.trace(found.covariance)))
+    assert sizes[1] > sizes[0]
+
+
+def test_the_knowledge_of_a_pinhole_adds_the_offset_and_the_distortion_of_the_lens() -> None:
+    knowledge = CameraKnowledge(0.001, 3.0, 0.004, None)
+    lens = Lens(1001, 601, 1000.0, (504.0, 300.0), 0.01, 0.02)
+    found = knowledge_of_pinhole(knowledge, lens)
+    square = (500.0**2 + 300.0**2) / 1000.0**2
+    assert found.focal_length == 0.001
+    assert found.centre == pytest.approx(5.0)
+    assert found.distortion == pytest.approx(np.hypot(0.004, square * (0.01 + square * 0.02)))

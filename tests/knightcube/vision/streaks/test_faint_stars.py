@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks.faint_stars import polar_grid, running_sums, totals
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.faint_stars import cumulative_sums, polar_grid, running_sums
+from knightcube.vision.streaks.geometry import CameraMotion
 from tests.knightcube.vision.streaks.scenes import CAMERA, turn_of
 
 _CASES = [(90.0, 100.0), (30.0, 60.0), (12.0, 60.0), (6.0, 150.0), (0.0, 40.0)]
@@ -15,7 +15,7 @@ _CASES = [(90.0, 100.0), (30.0, 60.0), (12.0, 60.0), (6.0, 150.0), (0.0, 40.0)]
 @pytest.mark.parametrize(("theta", "length"), _CASES)
 def test_running_sums_are_those_of_every_sample_of_every_circle(theta: float, length: float) -> None:
     pinhole = CAMERA.pinhole
-    grid = polar_grid(pinhole, Motion.steady(turn_of(np.radians(theta), length, 0.7)), 3)
+    grid = polar_grid(pinhole, CameraMotion.steady(turn_of(np.radians(theta), length, 0.7)), 3)
     rows, columns = np.indices((len(grid.polar), len(grid.azimuth)))
     row, column = (each.reshape(-1).astype(float) for each in (rows, columns))
     place = np.rint(grid.pixels(pinhole, row, column)).reshape(*rows.shape, 2)
@@ -37,5 +37,5 @@ def test_running_sums_are_those_of_every_sample_of_every_circle(theta: float, le
     assert np.max(np.abs(held.count - count)) <= 2
     expected = (samples[:, wrapped] * on_grid).sum(axis=2)
     assert np.corrcoef(held.light.reshape(-1), expected.reshape(-1))[0, 1] > 0.9999
-    whole = totals(light.reshape(-1), pinhole, grid)[:, -1]
+    whole = cumulative_sums(light.reshape(-1), pinhole, grid)[:, -1]
     np.testing.assert_allclose(whole, samples.sum(axis=1), rtol=0.02, atol=100.0)

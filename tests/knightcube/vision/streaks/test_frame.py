@@ -13,32 +13,29 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.frame import (
     Binning,
-    Blobs,
-    ExposedFrame,
-    expose_frame,
-    find_blobs,
-    seen_sigma,
+    BrightRegions,
+    ReducedFrame,
+    find_bright_regions,
+    measured_psf_sigma,
+    reduce_frame,
     without_glare,
     without_mosaic,
 )
-from knightcube.vision.streaks.geometry import Motion
-from knightcube.vision.streaks.geometry import Scene as FittedScene
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
-from knightcube.vision.streaks.uncertainty import LeftOver, displaced_ends, displaced_sides
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky
 
 _SHAPE = (60, 90)
 _LEAST = 12
 
 
-def _frame(mask: np.ndarray) -> ExposedFrame:
+def _frame(mask: np.ndarray) -> ReducedFrame:
     """Return a frame whose 3 x 3 sums exceed the threshold where `mask` (rows, columns) says."""
     light = np.where(mask, 100.0, 0.0).astype(np.float32).reshape(-1)
     light += mask.reshape(-1) * np.arange(mask.size, dtype=np.float32) % 7
     nothing = np.zeros(mask.size, dtype=np.bool_)
     counts = np.zeros(mask.size, dtype=np.uint16)
-    return ExposedFrame(_SHAPE, light, light, np.ones_like(light), counts, 4095.0, nothing, 1.0, 0)
+    return ReducedFrame(_SHAPE, light, light, np.ones_like(light), counts, 4095.0, nothing, 1.0, 0)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
@@ -50,7 +47,7 @@ def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
     labels, _ = ndimage.label(mask, structure=np.ones((3, 3), dtype=np.int64))
     area = np.bincount(labels.reshape(-1))[1:]
     frame = _frame(mask)
-    found = find_blobs(frame, 4.5, 10_000)
+    found = find_bright_regions(frame, 4.5, 10_000)
     assert len(found) == np.count_nonzero(area >= _LEAST)
     for region in range(len(found)):
         mine = found.owner == region
@@ -62,7 +59,7 @@ def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
 
 def test_a_frame_without_light_has_no_regions() -> None:
     """None at all, and nothing is raised."""
-    assert len(find_blobs(_frame(np.zeros(_SHAPE, dtype=np.bool_)), 4.5, 48)) == 0
+    assert len(find_bright_regions(_frame(np.zeros(_SHAPE, dtype=np.bool_)), 4.5, 48)) == 0
 
 
 @pytest.mark.parametrize(
@@ -124,9 +121,9 @@ def test_a_summed_row_takes_as_many_times_as_long_to_the_next_whether_it_is_stat
 _HONEST = 16.3
 
 
-def _read(scene: Scene, pixels: Image | None = None) -> tuple[ExposedFrame, Blobs]:
-    frame = expose_frame(scene.pixels if pixels is None else pixels, SATURATION, 1.0)
-    return frame, find_blobs(frame, 4.5, 48)
+def _read(scene: Scene, pixels: Image | None = None) -> tuple[ReducedFrame, BrightRegions]:
+    frame = reduce_frame(scene.pixels if pixels is None else pixels, SATURATION, 1.0)
+    return frame, find_bright_regions(frame, 4.5, 48)
 
 
 def _found(scene: Scene, pixels: Image | None = None, psf_sigma: float = 1.0) -> MotionResult:
@@ -148,15 +145,15 @@ def test_the_frame_shows_its_point_spread_also_along_bent_streaks(
     sigma: float, theta: float, length: float
 ) -> None:
     scene = real_sky(2, theta, length, 1.0, replace(CAMERA, psf_sigma=sigma))
-    seen = seen_sigma(*_read(scene))
+    seen = measured_psf_sigma(*_read(scene))
     assert seen is not None
     assert seen == pytest.approx(sigma, rel=0.2, abs=0.15)
 
 
 def test_without_regions_no_point_spread_is_seen() -> None:
     dark = np.random.default_rng(1).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
-    frame = expose_frame(dark, SATURATION, 1.0)
-    assert seen_sigma(frame, find_blobs(frame, 4.5, 48)) is None
+    frame = reduce_frame(dark, SATURATION, 1.0)
+    assert measured_psf_sigma(frame, find_bright_regions(frame, 4.5, 48)) is None
 
 
 @pytest.mark.parametrize(("true", "described"), [(1.0, 2.0), (2.0, 1.0), (3.0, 1.0)])
@@ -168,41 +165,6 @@ def test_a_gaussian_of_another_width_than_described_gives_a_rate_within_its_clai
     found = _found(scene, psf_sigma=described)
     assert _nees(found, scene) < _HONEST
     assert found.psf_sigma == pytest.approx(true, rel=0.1)
-
-
-def _left(residual: float, noise: float, shift: str) -> tuple[LeftOver, FittedScene]:
-    """Return what ends, or sides, displaced by `residual` px leave over on blocks of pixels, and `noise`."""
-    rng = np.random.default_rng(3)
-    images = np.zeros((40, 7, 10, 9), dtype=np.float32)
-    ends, sides = slice(0, 20), slice(20, 40)
-    images[ends, 3] = rng.uniform(0.1, 0.4, (20, 10, 9))
-    images[sides, 1] = rng.uniform(-0.4, 0.4, (20, 10, 9))
-    change = 500.0 * (images[:, 3] if shift == "ends" else images[:, 1])
-    left = residual * change + rng.normal(0.0, 20.0 * noise, change.shape)
-    weight = np.full(change.shape, 20.0**-2, dtype=np.float32)
-    everyone = np.ones(1, dtype=np.bool_)
-    scene = FittedScene(
-        Motion.steady(np.zeros(3)), 1.04, np.zeros((1, 2)), np.array([500.0]), np.zeros(1), everyone
-    )
-    star, time = np.zeros(40, dtype=np.int64), np.zeros((40, 10))
-    return LeftOver(star, time, images, weight, left.astype(np.float32)), scene
-
-
-@pytest.mark.parametrize(("shift", "measured"), [("ends", displaced_ends), ("sides", displaced_sides)])
-def test_what_is_left_over_is_measured_as_a_displacement(shift: str, measured: object) -> None:
-    assert callable(measured)
-    displaced = measured(*_left(0.5, 1.0, shift))
-    assert displaced.shown == pytest.approx(0.5, rel=0.1)
-    assert displaced.chance >= displaced.shown
-    by_chance = measured(*_left(0.0, 1.0, shift))
-    assert by_chance.shown == 0.0
-    assert 0.0 < by_chance.chance < 0.15
-
-
-def test_streaks_without_ends_in_the_frame_show_no_displacement_of_theirs() -> None:
-    left, scene = _left(0.5, 1.0, "sides")
-    left.images[:, 3] = 0.0
-    assert displaced_ends(left, scene) is None
 
 
 def test_a_bright_limb_is_left_out_and_the_stars_beside_it_give_the_rate() -> None:

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.vision.streaks.geometry import BentPinhole, Motion, paths, positions, sensitivities
+from knightcube.vision.streaks.geometry import CameraMotion, DistortedPinhole, paths, positions, sensitivities
 
-_LENS = BentPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
-_MOTION = Motion(np.array([0.03, 0.05, 0.1]), np.array([0.003, -0.002, 0.01]))
+_LENS = DistortedPinhole(1024, 1024, 2903.0, (3.0, -2.0), 0.002, 0.01)
+_MOTION = CameraMotion(np.array([0.03, 0.05, 0.1]), np.array([0.003, -0.002, 0.01]))
 _RNG = np.random.default_rng(1)
 _STARS, _TIME = _RNG.uniform(50.0, 970.0, (20, 2)), _RNG.uniform(-0.5, 0.5, 20)
 
 
 def test_a_corner_is_displaced_by_its_share_the_axis_by_the_shift_and_back() -> None:
     corner = np.array([[0.0, 0.0]])
-    lens = BentPinhole(1024, 1024, 2903.0, (0.0, 0.0), 0.0, 0.01)
-    assert lens.bent(corner)[0] == pytest.approx([-5.115, -5.115])
-    assert _LENS.bent(np.array([_LENS.centre]))[0] == pytest.approx([514.5, 509.5])
-    assert _LENS.straight(_LENS.bent(_STARS)) == pytest.approx(_STARS, abs=1e-6)
+    lens = DistortedPinhole(1024, 1024, 2903.0, (0.0, 0.0), 0.0, 0.01)
+    assert lens.distorted(corner)[0] == pytest.approx([-5.115, -5.115])
+    assert _LENS.distorted(np.array([_LENS.centre]))[0] == pytest.approx([514.5, 509.5])
+    assert _LENS.undistorted(_LENS.distorted(_STARS)) == pytest.approx(_STARS, abs=1e-6)
 
 
 def test_a_star_is_named_by_its_pixel_in_the_lens_picture() -> None:
@@ -47,7 +47,7 @@ def test_sensitivities_are_those_of_the_places(parameter: int) -> None:
 
     def moved(way: float) -> FloatArray:
         by = way * change
-        motion = replace(_MOTION, turn=_MOTION.turn + by[:3], growth=_MOTION.growth + by[3:6])
+        motion = replace(_MOTION, rate=_MOTION.rate + by[:3], acceleration=_MOTION.acceleration + by[3:6])
         return positions(_LENS, motion, _STARS + by[6:], _TIME)
 
     expected = (moved(1.0) - moved(-1.0)) / (2.0 * change[parameter])

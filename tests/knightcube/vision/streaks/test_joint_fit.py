@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from knightcube.vision.streaks import joint_fit
-from knightcube.vision.streaks.frame import expose_frame
-from knightcube.vision.streaks.geometry import Motion, Scene, Shutter, positions
-from knightcube.vision.streaks.joint_fit import ExposedCamera, find_edges, stretched
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, positions
+from knightcube.vision.streaks.joint_fit import FitProblem, find_edges, stretched
 from knightcube.vision.streaks.normal_equations import window_areas
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
@@ -18,16 +18,16 @@ from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
 _STARS = 16
 
 
-def _seen(theta: float, length: float, turned: float) -> tuple[ExposedCamera, Scene, Motion]:
+def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, StreakScene, CameraMotion]:
     """Return a frame, its brightest stars under `turned` times the true motion, and that motion."""
     sky = real_sky(21, np.radians(theta), length, 0.2)
-    frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
+    camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
     order = np.argsort(-sky.electrons, kind="stable")[:_STARS]
-    true = Motion.steady(sky.rate * sky.exposure)
-    motion = Motion.steady(turned * true.turn)
+    true = CameraMotion.steady(sky.rate * sky.exposure)
+    motion = CameraMotion.steady(turned * true.rate)
     light, everyone = sky.electrons[order] / CAMERA.gain, np.ones(_STARS, dtype=np.bool_)
-    return camera, Scene(motion, 1.04, sky.stars[order], light, np.zeros(_STARS), everyone), true
+    return camera, StreakScene(motion, 1.04, sky.stars[order], light, np.zeros(_STARS), everyone), true
 
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 120.0), (60.0, 300.0), (20.0, 300.0)])
@@ -47,7 +47,7 @@ def test_a_motion_of_the_wrong_length_is_stretched_to_the_right_one(
     camera, scene, true = _seen(theta, length, turned)
     mended = stretched(camera, scene)
     assert mended is not None
-    assert np.linalg.norm(mended.motion.turn - true.turn) < 0.006 * np.linalg.norm(true.turn)
+    assert np.linalg.norm(mended.motion.rate - true.rate) < 0.006 * np.linalg.norm(true.rate)
     assert stretched(camera, mended) is None
 
 
@@ -55,7 +55,7 @@ def test_stars_of_which_one_end_was_right_are_put_back_between_their_ends() -> N
     """A turn 4 % too long, each star's beginning where it should be: its middle is 6 px ahead."""
     camera, scene, true = _seen(90.0, 300.0, 1.0)
     ahead = positions(camera.pinhole, true, scene.stars, np.full(_STARS, 0.02))
-    off = replace(scene, motion=Motion.steady(1.04 * true.turn), stars=ahead)
+    off = replace(scene, motion=CameraMotion.steady(1.04 * true.rate), stars=ahead)
     assert float(np.median(np.linalg.norm(ahead - scene.stars, axis=1))) > 5.0
     mended = stretched(camera, off)
     assert mended is not None
@@ -67,17 +67,17 @@ _TRUSTED = 12
 _ROOM = 20
 
 
-def _taken(theta: float, length: float) -> tuple[ExposedCamera, Scene]:
+def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
     """Return a frame and its brightest stars as they are, the first of them with a say."""
     sky = real_sky(7, np.radians(theta), length, 1.0)
-    frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
+    frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
+    camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
     order = np.argsort(-sky.electrons, kind="stable")[:_CROWD]
     width = float(np.sqrt(CAMERA.psf_sigma**2 + 1.0 / 12.0))
     trusted = np.arange(len(order)) < _TRUSTED
-    motion = Motion.steady(sky.rate * sky.exposure)
+    motion = CameraMotion.steady(sky.rate * sky.exposure)
     light = sky.electrons[order] / CAMERA.gain
-    return camera, Scene(motion, width, sky.stars[order], light, np.zeros(len(order)), trusted)
+    return camera, StreakScene(motion, width, sky.stars[order], light, np.zeros(len(order)), trusted)
 
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (60.0, 400.0), (30.0, 400.0), (3.0, 250.0)])
@@ -100,7 +100,7 @@ def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPat
     assert len(done.scene.light) == _ROOM
     apart = np.linalg.norm(done.scene.stars[:, None] - scene.stars[:_ROOM], axis=2).min(axis=0)
     assert np.median(apart) < 1.0
-    error = (done.scene.motion.turn - scene.motion.turn)[:3]
+    error = (done.scene.motion.rate - scene.motion.rate)[:3]
     assert error @ np.linalg.solve(done.solution.covariance[:3, :3], error) < 25.0
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.vision.streaks.normal_equations import OwnEquations, contradiction
+from knightcube.vision.streaks.normal_equations import StarEquations, contradiction
 
 _STARS = 400
 _KEPT = np.array([0, 1, 2, 6])
 
 
-def _drawn(noise: float, blind: bool = False) -> OwnEquations:
+def _drawn(noise: float, blind: bool = False) -> StarEquations:
     """Return what stars of very unequal light say whose scores scatter by `noise` times their own noise.
 
     A star that is `blind` knows nothing of two directions of its own.
@@ -24,7 +24,7 @@ def _drawn(noise: float, blind: bool = False) -> OwnEquations:
     step = np.array([1e-3, -2e-3, 0.0, 0.1])
     information = change @ change.swapaxes(1, 2)
     drawn = noise * rng.normal(size=(_STARS, change.shape[2], 1))
-    return OwnEquations(_KEPT, information, information @ step + (change @ drawn)[..., 0])
+    return StarEquations(_KEPT, information, information @ step + (change @ drawn)[..., 0])
 
 
 @pytest.mark.parametrize("blind", [False, True])
@@ -36,4 +36,4 @@ def test_a_chi_square_of_a_degree_of_freedom(noise: float, blind: bool) -> None:
 
 def test_one_star_contradicts_nobody() -> None:
     many = _drawn(3.0)
-    assert contradiction(OwnEquations(_KEPT, many.information[:1], many.score[:1])) == 1.0
+    assert contradiction(StarEquations(_KEPT, many.information[:1], many.score[:1])) == 1.0

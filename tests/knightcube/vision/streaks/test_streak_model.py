@@ -8,8 +8,15 @@ import pytest
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.frame import expose_frame
-from knightcube.vision.streaks.geometry import Motion, Scene, Shutter, moving, paths, sensitivities
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import (
+    CameraMotion,
+    Shutter,
+    StreakScene,
+    paths,
+    sensitivities,
+    sensitivities_and_velocity,
+)
 from knightcube.vision.streaks.normal_equations import cut_windows, light_of
 from knightcube.vision.streaks.streak_model import cut_strips
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
@@ -23,14 +30,16 @@ _CASES = [
 ]
 
 
-def _brute(motion: Motion, star: FloatArray, sigma: float) -> FloatArray:
+def _brute(motion: CameraMotion, star: FloatArray, sigma: float) -> FloatArray:
     count = 2000
     time = (np.arange(count) + 0.5) / count - 0.5
     where = paths(_PINHOLE, motion, np.tile(star, (count, 1)), time).position
     return integrated_by_brute_force((320, 320), where, 1.0, sigma)
 
 
-def _modelled(motion: Motion, star: FloatArray, sigma: float) -> tuple[BoolArray, FloatArray, FloatArray]:
+def _modelled(
+    motion: CameraMotion, star: FloatArray, sigma: float
+) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return which pixels are covered, the light, and (9, ...) its derivatives: geometry (8), width."""
     stars, width = star[None], float(np.sqrt(sigma**2 + 1.0 / 12.0))
     strips = cut_strips(_PINHOLE, motion, stars, np.array([[-0.5, 0.5]]), 5.0 * width)
@@ -51,7 +60,7 @@ def test_the_light_is_that_of_brute_force(
     turn: list[float], star: list[float], sigma: float, allowed: float
 ) -> None:
     """Within a thousandth of the peak at 1 px: far below the noise of any pixel that is not saturated."""
-    motion = Motion.steady(np.array(turn))
+    motion = CameraMotion.steady(np.array(turn))
     truth = _brute(motion, np.array(star), sigma)
     covered, light, _ = _modelled(motion, np.array(star), sigma)
     assert truth[~covered].sum() < 1e-2 * truth.sum()
@@ -63,13 +72,13 @@ def test_the_light_is_that_of_brute_force(
 def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, length: float) -> None:
     """From rest the light piles up where the star is slow: a patch serves there, strips beyond."""
     turn = np.array([0.4, 0.9, 0.1]) * length / _PINHOLE.focal_length
-    motion, star = Motion(turn, growth * turn), np.array([160.3, 155.2])
+    motion, star = CameraMotion(turn, growth * turn), np.array([160.3, 155.2])
     truth = _brute(motion, star, 1.0).reshape(-1)
     noise = np.random.default_rng(1).normal(100.0, 3.0, (320, 320)).astype(np.uint16)
-    scene = Scene(
+    scene = StreakScene(
         motion, float(np.sqrt(13.0 / 12.0)), star[None], np.ones(1), np.zeros(1), np.ones(1, dtype=np.bool_)
     )
-    windows = cut_windows(expose_frame(noise, 65535.0, 1.0), _PINHOLE, Shutter(), scene, 5.0)
+    windows = cut_windows(reduce_frame(noise, 65535.0, 1.0), _PINHOLE, Shutter(), scene, 5.0)
     light = np.zeros(320 * 320)
     light[windows.pixels] = light_of(_PINHOLE, Shutter(), scene, windows)
     covered = np.bincount(windows.pixels, minlength=320 * 320) > 0
@@ -80,13 +89,13 @@ def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, 
 @pytest.mark.parametrize(("turn", "star"), _CASES)
 def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[float]) -> None:
     """Within 2 %: they set the covariance and the speed of convergence, not where it converges to."""
-    motion, place = Motion.steady(np.array(turn)), np.array(star)
+    motion, place = CameraMotion.steady(np.array(turn)), np.array(star)
     covered, _, changes = _modelled(motion, place, 1.0)
     for k in range(5):
         step = np.zeros(5)
         step[k] = 1e-5 if k < 3 else 1e-2
-        up = _brute(Motion.steady(motion.turn + step[:3]), place + step[3:], 1.0)
-        down = _brute(Motion.steady(motion.turn - step[:3]), place - step[3:], 1.0)
+        up = _brute(CameraMotion.steady(motion.rate + step[:3]), place + step[3:], 1.0)
+        down = _brute(CameraMotion.steady(motion.rate - step[:3]), place - step[3:], 1.0)
         truth = ((up - down) / (2.0 * step[k]))[covered]
         found = changes[k if k < 3 else k + 3][covered]
         assert np.linalg.norm(found - truth) < 0.02 * np.linalg.norm(truth)
@@ -94,7 +103,7 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
 
 def test_a_path_reaches_beyond_both_its_ends_whatever_its_times() -> None:
     """A rolling shutter's times are any numbers: the pixels about the last instant are as many as before."""
-    motion, star = Motion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
+    motion, star = CameraMotion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
     rng = np.random.default_rng(11)
     for begin, end in np.sort(rng.uniform(-0.55, 0.55, (200, 2)), axis=1):
         if end - begin < 0.2:
@@ -109,7 +118,7 @@ def test_a_path_reaches_beyond_both_its_ends_whatever_its_times() -> None:
 @pytest.mark.parametrize("turn", [0.9, 2.5])
 def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they_need_be(turn: float) -> None:
     """Through several diagonals: against the distance of every pixel from a path of hundreds of instants."""
-    motion, star, width = Motion.steady(np.array([0.0, 0.02, turn])), np.array([231.3, 214.6]), 3.7
+    motion, star, width = CameraMotion.steady(np.array([0.0, 0.02, turn])), np.array([231.3, 214.6]), 3.7
     strips = cut_strips(_PINHOLE, motion, star[None], np.array([[-0.5, 0.5]]), width)
     times = np.bincount(strips.index[strips.inside], minlength=320 * 320).reshape(320, 320)
     time = np.linspace(-0.5, 0.5, 600)
@@ -126,20 +135,20 @@ def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they
 
 def test_a_short_bent_streak_is_summed_exactly() -> None:
     """Five px from the axis at a radian: no line at all."""
-    motion, star = Motion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])
+    motion, star = CameraMotion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])
     patches = streak_model.cut_patches(_PINHOLE, star[None], 10)
-    light, _ = streak_model.derivatives(_PINHOLE, motion, Shutter(), star[None], 1.0, patches)
+    light, _ = streak_model.spot_derivatives(_PINHOLE, motion, Shutter(), star[None], 1.0, patches)
     truth = _brute(motion, star, 1.0).reshape(-1)[patches.index[0]]
     assert np.abs(light[0] - truth).max() < 2e-4 * truth.max()
 
 
 def test_sensitivities_are_finite_differences_of_the_path() -> None:
-    motion = Motion(np.array([0.1, -0.2, 0.3]), np.array([0.02, 0.03, -0.05]))
+    motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array([0.02, 0.03, -0.05]))
     stars, time = np.array([[100.0, 250.0], [280.0, 40.0]]), np.array([-0.4, 0.3])
     found = sensitivities(_PINHOLE, motion, stars, time)
 
     def position(change: FloatArray) -> FloatArray:
-        moved = Motion(motion.turn + change[:3], motion.growth + change[3:6])
+        moved = CameraMotion(motion.rate + change[:3], motion.acceleration + change[3:6])
         return paths(_PINHOLE, moved, stars + change[6:], time).position
 
     for k, step in enumerate(1e-6 * np.eye(8)):
@@ -151,19 +160,19 @@ def test_sensitivities_are_finite_differences_of_the_path() -> None:
 @pytest.mark.parametrize("growth", [[0.0, 0.0, 0.0], [0.02, 0.03, -0.05]])
 def test_velocities_beside_sensitivities_are_those_of_the_paths(growth: list[float]) -> None:
     """At constant rate and at one that changes: each has its own formula, from the flow and from the turn."""
-    motion = Motion(np.array([0.1, -0.2, 0.3]), np.array(growth))
+    motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array(growth))
     stars, time = np.array([[100.0, 250.0], [280.0, 40.0]]), np.array([-0.4, 0.3])
-    _, velocity = moving(_PINHOLE, motion, stars, time)
+    _, velocity = sensitivities_and_velocity(_PINHOLE, motion, stars, time)
     assert np.allclose(velocity, paths(_PINHOLE, motion, stars, time).velocity, rtol=1e-9)
 
 
 def test_the_turn_of_a_rate_that_changes_is_that_of_many_small_turns() -> None:
     """The Magnus terms against 4000 steps of constant rate."""
-    motion = Motion(np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.15, 0.1]))
+    motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.15, 0.1]))
     vector = np.array([0.02, -0.03, 1.0])
     steps = 4000
     for k in range(steps):
-        rate = motion.turn + motion.growth * (k + 0.5) / (2 * steps)
+        rate = motion.rate + motion.acceleration * (k + 0.5) / (2 * steps)
         step = rate / (2 * steps)
         angle = np.linalg.norm(step)
         axis = step / angle

@@ -12,11 +12,17 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
 from knightcube.vision.camera.lens import EXACT, UNSTATED, CameraKnowledge
 from knightcube.vision.streaks.estimate import estimate_motion
-from knightcube.vision.streaks.frame import expose_frame
-from knightcube.vision.streaks.geometry import Motion, Scene, Shutter, sensitivities
-from knightcube.vision.streaks.joint_fit import ExposedCamera, bared_fit
+from knightcube.vision.streaks.frame import reduce_frame
+from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, sensitivities
+from knightcube.vision.streaks.joint_fit import FitProblem, brightest_fit
 from knightcube.vision.streaks.settings import LikelihoodSettings
-from knightcube.vision.streaks.uncertainty import correct, seeming_turns
+from knightcube.vision.streaks.uncertainty import (
+    StreakResiduals,
+    apparent_rates,
+    correct,
+    end_displacement,
+    side_displacement,
+)
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky, turn_of
 from tests.support.scenes import FIELD, RandomSlew
@@ -29,15 +35,15 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))
-    scene = Scene(Motion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
-    frame = expose_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge), 1.0)
+    scene = StreakScene(CameraMotion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
+    frame = reduce_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
+    camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge), 1.0)
     half = np.full(len(stars), 0.5)
     opening = (
         sensitivities(CAMERA.pinhole, scene.motion, stars, half)
         - sensitivities(CAMERA.pinhole, scene.motion, stars, -half)
     )[:, :, :3]
-    return seeming_turns(camera, scene, 0.2), opening.swapaxes(1, 2) @ opening
+    return apparent_rates(camera, scene, 0.2), opening.swapaxes(1, 2) @ opening
 
 
 def _together(seeming: FloatArray, information: FloatArray) -> FloatArray:
@@ -123,7 +129,7 @@ def test_what_is_not_known_of_the_camera_widens_the_claim_and_leaves_the_rate() 
     assert same == pytest.approx(rate)
     assert np.all(np.linalg.eigvalsh(usual - exact) > -1e-18)
     assert np.trace(usual) > 1.5 * np.trace(exact)
-    _, doubted = found(knowledge=EXACT, psf_sigma=0.95, worst_doubt=0.1)
+    _, doubted = found(knowledge=EXACT, psf_sigma=0.95, worst_uncertainty=0.1)
     assert np.trace(doubted) > 10.0 * np.trace(exact)
 
 
@@ -132,7 +138,7 @@ def test_short_streaks_of_another_point_spread_are_refused_with_a_reason() -> No
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
     assert result.rate is None
-    assert "point spread, 1.4" in result.reason
+    assert "point spread is 1.4" in result.reason
 
 
 def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
@@ -160,9 +166,9 @@ def test_what_is_hidden_in_streaks_does_not_move_their_ends(monkeypatch: pytest.
     errors = []
     for run in (21, 67, 96):
         scene, _ = RandomSlew.drawn(1999, run).exposed(camera)
-        for bared in (bared_fit, lambda *_: None):
+        for fitted in (brightest_fit, lambda *_: None):
             with monkeypatch.context() as patch:
-                patch.setattr("knightcube.vision.streaks.uncertainty.bared_fit", bared)
+                patch.setattr("knightcube.vision.streaks.uncertainty.brightest_fit", fitted)
                 found = estimate_motion(
                     scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0
                 )
@@ -174,3 +180,38 @@ def test_what_is_hidden_in_streaks_does_not_move_their_ends(monkeypatch: pytest.
     after, before = np.array(errors[::2]), np.array(errors[1::2])
     assert after[:, 0].mean() < 0.5 * before[:, 0].mean()
     assert after[:, 1].max() < chi2.isf(1e-3, 3)
+
+
+def _left(residual: float, noise: float, shift: str) -> tuple[StreakResiduals, StreakScene]:
+    """Return residuals of ends or sides displaced by `residual` px on blocks of pixels, with `noise`."""
+    rng = np.random.default_rng(3)
+    images = np.zeros((40, 7, 10, 9), dtype=np.float32)
+    ends, sides = slice(0, 20), slice(20, 40)
+    images[ends, 3] = rng.uniform(0.1, 0.4, (20, 10, 9))
+    images[sides, 1] = rng.uniform(-0.4, 0.4, (20, 10, 9))
+    change = 500.0 * (images[:, 3] if shift == "ends" else images[:, 1])
+    left = residual * change + rng.normal(0.0, 20.0 * noise, change.shape)
+    weight = np.full(change.shape, 20.0**-2, dtype=np.float32)
+    everyone = np.ones(1, dtype=np.bool_)
+    scene = StreakScene(
+        CameraMotion.steady(np.zeros(3)), 1.04, np.zeros((1, 2)), np.array([500.0]), np.zeros(1), everyone
+    )
+    star, time = np.zeros(40, dtype=np.int64), np.zeros((40, 10))
+    return StreakResiduals(star, time, images, weight, left.astype(np.float32)), scene
+
+
+@pytest.mark.parametrize(("shift", "measured"), [("ends", end_displacement), ("sides", side_displacement)])
+def test_residuals_are_measured_as_a_displacement(shift: str, measured: object) -> None:
+    assert callable(measured)
+    displaced = measured(*_left(0.5, 1.0, shift))
+    assert displaced.shown == pytest.approx(0.5, rel=0.1)
+    assert displaced.chance >= displaced.shown
+    by_chance = measured(*_left(0.0, 1.0, shift))
+    assert by_chance.shown == 0.0
+    assert 0.0 < by_chance.chance < 0.15
+
+
+def test_streaks_without_ends_in_the_frame_have_no_displacement_of_ends() -> None:
+    left, scene = _left(0.5, 1.0, "sides")
+    left.images[:, 3] = 0.0
+    assert end_displacement(left, scene) is None

@@ -26,7 +26,7 @@ from knightcube.vision.startracker.detection import (
     survey,
 )
 from knightcube.vision.startracker.detection.survey import Method
-from knightcube.vision.streaks.geometry import Motion
+from knightcube.vision.streaks.geometry import CameraMotion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.knightcube.vision.streaks.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
@@ -74,7 +74,7 @@ def test_the_bench_s_bound_is_that_of_the_streak_s_room_at_length_zero() -> None
     camera = StarCameraModel(bits=16, full_well=1e6)
     place, electrons = np.array([500.3, 480.8]), 5000.0
     floor = camera.read_noise**2 + camera.dark_current * 0.2 + 1.0 / 12.0
-    still_camera = Motion.steady(np.zeros(3))
+    still_camera = CameraMotion.steady(np.zeros(3))
     whole = star_information(camera.pinhole, still_camera, place, electrons, camera.psf_sigma, floor)
     expected = np.linalg.inv(whole[3:, 3:])[1:3, 1:3]
     assert point_bound(camera, place, electrons) == pytest.approx(expected, rel=0.01, abs=1e-8)
