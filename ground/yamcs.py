@@ -22,8 +22,7 @@ from flight.link.files.transfer import FOREIGN, SATELLITE
 from flight.link.files.units import DOWN, PACKET_VERSION, SEGMENT_BYTES, UP
 from flight.link.process.station import host_port
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
-from ground.link.gateway import ADDRESS
-from ground.link.token_file import token_path
+from ground.link.gateway import ADDRESS, token_path
 from ground.xtce import EPOCH, SPACE, document
 from knightcube.errors import UsageError
 

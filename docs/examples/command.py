@@ -11,7 +11,7 @@ from pathlib import Path
 from flight.link.commands import CommandPacker, Note
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import to_text
-from ground.commands.command import exchange
+from ground.link.commanding import exchange
 from ground.telemetry import decode, read_run
 
 CONFIG = Path("config/step_demo.yaml")

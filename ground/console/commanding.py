@@ -1,63 +1,97 @@
-"""Commands out of the page's forms: values by the command table, sent, and what became of them."""
+"""Commands of the console: from the page's forms, over a socket or a link, or to a flight of its own."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.commands import LAYOUTS, LOAD_PARAMETERS, CommandError
+from flight.link.commands import LAYOUTS, LOAD_PARAMETERS, CommandError, CommandPacker, Ping
 from flight.link.process import directives
+from flight.link.process.commanding import Report, Stage
+from flight.link.process.directives import LIST
+from flight.link.process.downlink import LIVE
 from flight.link.telemetry.definitions import PARAMETER_FIELDS as PARAMETERS
-from flight.link.telemetry.definitions import Field, crc_of
-from flight.link.telemetry.packets import Layout, Packer, TelemetryError
-from ground.commands.command import exchange
-from ground.console.instant import values
-from ground.telemetry import decode
+from flight.link.telemetry.definitions import VERIFICATION, Field, crc_of
+from flight.link.telemetry.log import find_segments
+from flight.link.telemetry.packets import Layout, Packer, PacketArray, TelemetryError
+from flight.schema.document import read_text
+from flight.schema.reader import parse
+from flight.schema.sections import Commands
+from ground.console.history import values
+from ground.link.commanding import exchange, obeyed
+from ground.link.terminal import Terminal, report_of
+from ground.telemetry import decode, scan
 from knightcube.errors import FlightError, UsageError
 
 Object = dict[str, Any]
 Send = Callable[[bytes], Object]
-"""Sends a command packet and returns what became of it: `obeyed`, `text`. Raises FlightError."""
+"""Sends a command packet and returns the answer with `obeyed` and `text`. Raises FlightError."""
 _TIMEOUT_S = 3.0
+"""Time to wait for the answer of a socket (s)."""
+_LISTEN_S = 0.02
+"""Time for which a link is read at once (s)."""
+_PING_AFTER_S = 2.0
+"""Time without telemetry (s) before a ping, because the link forgets a UDP sender after a minute."""
+_ANSWER_S = 5.0
+"""Time to wait for the report on a command over the link (s)."""
+_KEPT_REPORTS = 64
+_SPI = 1
+_START_S, _END_S = 60.0, 15.0
+"""Time to wait for the start and the end of the console's own flight (s)."""
+_FRAMES = 60
+"""Camera frames that the console's own flight keeps for the page."""
+_CAMERA = re.compile(r"(?m)^(camera:[^\n]*)$(?!(?:\n[ #][^\n]*)*?\n  keep_frames:)(?=\n  )")
+"""First line of a section `camera` without the key `keep_frames`."""
 
 
 def by_socket(to: str) -> Send:
-    """Return what sends to a flight's own socket, or to its HOST:PORT."""
+    """Return a function that sends commands to a flight's own socket or to its HOST:PORT."""
 
     def send(packet: bytes) -> Object:
         answers = decode(exchange(to, packet, _TIMEOUT_S))["command"]
         if not len(answers):
-            raise FlightError(f"{to}: the answer holds no report of the command")
+            raise FlightError(f"{to}: the answer has no report on the command")
         return values(answers[-1])
 
     return send
 
 
-class Commanding:
-    """Packs what the page's forms hold; `send` is None where this console only looks."""
+class CommandForms:
+    """Packs the values of the page's forms into commands and sends them."""
 
     def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
-        """`layouts` are the commands that `send` takes: by a link also those of the link itself."""
+        """Accept the commands of `layouts`; without `send` the console is read-only."""
         self._send = send
         self.layouts = layouts
         self._packer = Packer(dict(layouts))
 
     @property
     def possible(self) -> bool:
-        """Whether there is a way to the flight."""
+        """Whether commands can be sent."""
         return self._send is not None
 
-    def words(self, name: str, given: Object) -> str:
-        """Return a command in words, for its confirmation. Raises UsageError for values that are none."""
-        return _words(self._pack(name, given))
+    def text(self, name: str, given: Object) -> str:
+        """Return a command as text for its confirmation. Raises UsageError for invalid values."""
+        return _text_of(self._pack(name, given))
 
     def obey(self, name: str, given: Object) -> Object:
-        """Send a command; return the flight's answer. Raises UsageError for values, else FlightError."""
+        """Send a command and return the answer. Raises FlightError, UsageError for invalid values."""
         if self._send is None:
-            raise UsageError("this console only looks: start it with --to or --link to command")
+            raise UsageError("this console is read-only: start it with --to or --link to send commands")
         return self._send(self._pack(name, given))
 
     def _pack(self, name: str, given: Object) -> bytes:
@@ -68,29 +102,26 @@ class Commanding:
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
         if name == LOAD_PARAMETERS.name and not given.get("crc"):
-            given = {**given, "crc": _crc(given)}
+            # The operator does not have to compute the CRC of the parameters.
+            parameters = [float(_value(name, field, given.get(field.name))) for field in PARAMETERS]
+            given = {**given, "crc": crc_of(parameters)}
         fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
-            _words(data)
+            _text_of(data)
         except (TelemetryError, CommandError) as error:
             raise UsageError(str(error)) from error
         return data
 
 
-def _words(data: bytes) -> str:
-    """Return the words of a command's packet. Raises CommandError for values that are none."""
+def _text_of(data: bytes) -> str:
+    """Return the text of a command's packet. Raises CommandError for invalid values."""
     directive = directives.unpack(data)
     return commands.unpack(data).text if directive is None else str(directive)
 
 
-def _crc(given: Object) -> int:
-    """Return the CRC of the parameters in a form, which no operator reckons by hand."""
-    return crc_of([float(_value(LOAD_PARAMETERS.name, field, given.get(field.name))) for field in PARAMETERS])
-
-
 def _value(name: str, field: Field, given: Any) -> Any:
-    """Return a field's value; empty numbers are NaN where the field can hold that. Raises UsageError."""
+    """Return a field's value. Empty numbers are NaN in fields that can hold it. Raises UsageError."""
     if field.count > 1:
         items = list(given) if isinstance(given, list) else [given] if given is not None else []
         return [_number(name, field, item) for item in [*items, *[None] * field.count][: field.count]]
@@ -106,4 +137,99 @@ def _number(name: str, field: Field, given: Any) -> float | int:
     try:
         return float(given) if real else int(given)
     except (TypeError, ValueError) as error:
-        raise UsageError(f"{name}: {field.name} = {given!r} is no number: {field.meaning}") from error
+        raise UsageError(f"{name}: {field.name} = {given!r} is not a number: {field.meaning}") from error
+
+
+class LinkFeed:
+    """Live telemetry and commands over a link. One thread calls `new`, others may call `send`.
+
+    Playback is not shown, because its packets are older than the live ones.
+    """
+
+    def __init__(self, terminal: Terminal) -> None:
+        self._terminal = terminal
+        self._lock = threading.Lock()
+        self._packer = CommandPacker()
+        self._reports: dict[int, list[Report]] = {}
+        self._received = time.monotonic()
+        self._asked = -np.inf
+
+    @property
+    def silence(self) -> float:
+        """Time without telemetry, s."""
+        return time.monotonic() - self._received
+
+    def new(self) -> dict[str, PacketArray]:
+        """Return the packets by name received since the last call. Raises FlightError."""
+        with self._lock:
+            now = time.monotonic()
+            if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
+                self._asked = now
+                self._terminal.send(self._packer.pack(Ping(), utc_ns()), _SPI)
+            live = [packet for channel, packet in self._terminal.packets(_LISTEN_S) if channel == LIVE]
+        if live:
+            self._received = time.monotonic()
+        found = scan(b"".join(live)).packets
+        for row in found[VERIFICATION.name]:
+            report = report_of(row.tobytes())
+            if report.spi == _SPI:
+                self._reports.setdefault(report.counter, []).append(report)
+        while len(self._reports) > _KEPT_REPORTS:
+            del self._reports[next(iter(self._reports))]
+        return found
+
+    def send(self, packet: bytes) -> Object:
+        """Send a command and return its state after acceptance. Raises FlightError without a report."""
+        with self._lock:
+            counter = self._terminal.send(packet, _SPI)
+        until = time.monotonic() + _ANSWER_S
+        while time.monotonic() < until:
+            reports = list(self._reports.get(counter, ()))
+            if reports and reports[-1].stage is not Stage.ACCEPTED:
+                # A list has one report per line, after that of its acceptance.
+                listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
+                text = "; ".join(report.text for report in listed)
+                return {"obeyed": int(obeyed(reports)), "text": text, "counter": counter}
+            time.sleep(0.02)
+        raise FlightError(f"no answer over the link within {_ANSWER_S:g} s")
+
+    def close(self) -> None:
+        """Store the counters and close the line."""
+        self._terminal.close()
+
+
+@contextlib.contextmanager
+def flying(config: Path, out: Path) -> Iterator[str]:
+    """Fly a simulated configuration into `out` in real time and yield its command socket.
+
+    The flight ends with the context. Raises FlightError if it does not start.
+    """
+    text = read_text(config)
+    parsed = parse(text, str(config))
+    if parsed.simulation is None:
+        raise UsageError(f"{config}: flies real devices; start the flight separately and give its run folder")
+    with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
+        socket = f"{place}/commands"
+        if parsed.commands != Commands():
+            raise UsageError(f"{config}: has `commands`; start the flight separately and give --to")
+        own = Path(place) / config.name
+        text = _CAMERA.sub(rf"\1\n  keep_frames: {_FRAMES}", text)
+        own.write_text(f"{text}\ncommands: {{socket: {socket}}}\n", encoding="utf-8")
+        words = [sys.executable, "-m", "flight", "run", str(own), "--realtime", "--out", str(out)]
+        flight = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        try:
+            until = time.monotonic() + _START_S
+            while not (out.is_dir() and find_segments(out, "flight")):
+                if flight.poll() is not None:
+                    raise FlightError(f"the flight did not start: {flight.communicate()[1].strip()}")
+                if time.monotonic() > until:
+                    raise FlightError(f"{out}: no flight log after {_START_S:g} s")
+                time.sleep(0.05)
+            yield socket
+        finally:
+            flight.send_signal(signal.SIGTERM)
+            try:
+                flight.communicate(timeout=_END_S)
+            except subprocess.TimeoutExpired:
+                flight.kill()
+                flight.communicate()

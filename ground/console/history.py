@@ -1,31 +1,41 @@
-"""The packets of a flight by name, in files that go with the console; asked by time.
+"""History of a flight for the page: all packets by time, and the state at the time that a reader looks at.
 
-Hours of a 40 Hz flight do not fit into the memory that a ground computer spares, so the packets lie in a
-temporary folder, and only their times stay in memory (8 bytes each).
+A flight of hours at 40 Hz does not fit into the memory of a ground computer. The packets are therefore in a
+temporary folder, and only their times are in memory, with 8 bytes each.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray
+from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
+from ground.watch import printable
 from knightcube.astro.arrays import FloatArray
 
+Object = dict[str, Any]
+LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
+"""Packets that the page lists one by one; of the others it shows the newest."""
+MAX_SPEED = 1000.0
+"""Highest speed of a replay."""
+_MAX_LISTED = 500
 _FIRST_CAPACITY = 1024
 
 
 class History:
-    """Owns the files. Use as a context manager: leaving removes them."""
+    """Packets of a flight by name and time. A context manager, which removes its files at the end."""
 
     def __init__(self) -> None:
-        """Begin empty."""
+        """Make a folder for the packets."""
         self._folder = tempfile.TemporaryDirectory(prefix="knightcube-console-")
         self._tracks = {name: _Track(layout, Path(self._folder.name)) for name, layout in LAYOUTS.items()}
 
@@ -40,20 +50,20 @@ class History:
         self._folder.cleanup()
 
     def append(self, packets: Mapping[str, PacketArray]) -> None:
-        """Keep packets, those of a name in order of arrival."""
+        """Append packets in order of arrival."""
         for name, rows in packets.items():
             if len(rows):
                 self._tracks[name].append(rows)
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """The times of the first and the newest packet, ns; (0, 0) without any."""
+        """Times of the first and the newest packet, ns; (0, 0) without packets."""
         times = [track.times for track in self._tracks.values() if len(track.times)]
         first, last = min((t[0] for t in times), default=0), max((t[-1] for t in times), default=0)
         return int(first), int(last)
 
     def count(self, name: str, until_ns: int) -> int:
-        """Return how many packets of a name came until a time."""
+        """Return the number of packets of a name up to a time."""
         return int(np.searchsorted(self._tracks[name].times, until_ns, side="right"))
 
     def rows(self, name: str, first: int, stop: int) -> PacketArray:
@@ -63,34 +73,32 @@ class History:
     def series(
         self, name: str, field: str, component: int, span_ns: tuple[int, int], points: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Return times (n,) s and values (n,) of a field, or of one component of an array, in a span of time.
+        """Return times (n,), s, and values (n,) of a field, or of one component of it, in a time span.
 
-        At most `points` values: of more, the least and the greatest of each stretch in their order, so that
-        no peak is lost. NaN stands only where a whole stretch has no number.
+        A series of more than `points` values is reduced to the minimum and maximum of each interval, in their
+        order, so that no peak is lost. A value is NaN only if its whole interval has no number.
         """
         first, stop = (self.count(name, time) for time in (span_ns[0] - 1, span_ns[1]))
         rows = self.rows(name, first, stop)
         values = rows[field].astype(float)
         values = values[:, component] if values.ndim > 1 else values
         times = rows["time_ns"].astype(float) * 1e-9
-        return (times, values) if len(times) <= points else _extremes(times, values, max(points // 2, 1))
-
-
-def _extremes(times: FloatArray, values: FloatArray, stretches: int) -> tuple[FloatArray, FloatArray]:
-    """Return of each stretch its least and greatest value at their own times, in the order of time."""
-    begins = np.linspace(0, len(values), stretches, endpoint=False).astype(np.intp)
-    sizes = np.diff(np.append(begins, len(values)))
-    table = np.full((stretches, int(sizes.max())), np.nan)
-    inside = np.arange(table.shape[1]) < sizes[:, None]
-    table[inside] = values
-    least = np.argmin(np.where(np.isnan(table), np.inf, table), axis=1)
-    greatest = np.argmax(np.where(np.isnan(table), -np.inf, table), axis=1)
-    chosen = begins[:, None] + np.sort(np.stack([least, greatest], axis=1), axis=1)
-    return times[chosen].ravel(), values[chosen].ravel()
+        if len(times) <= points:
+            return times, values
+        intervals = max(points // 2, 1)
+        begins = np.linspace(0, len(values), intervals, endpoint=False).astype(np.intp)
+        sizes = np.diff(np.append(begins, len(values)))
+        table = np.full((intervals, int(sizes.max())), np.nan)
+        inside = np.arange(table.shape[1]) < sizes[:, None]
+        table[inside] = values
+        lowest = np.argmin(np.where(np.isnan(table), np.inf, table), axis=1)
+        highest = np.argmax(np.where(np.isnan(table), -np.inf, table), axis=1)
+        chosen = begins[:, None] + np.sort(np.stack([lowest, highest], axis=1), axis=1)
+        return times[chosen].ravel(), values[chosen].ravel()
 
 
 class _Track:
-    """The packets of one name: their bytes in a file, their times in memory."""
+    """Packets of one name: their bytes in a file, their times in memory."""
 
     def __init__(self, layout: Layout, folder: Path) -> None:
         self._layout = layout
@@ -100,7 +108,7 @@ class _Track:
 
     @property
     def times(self) -> npt.NDArray[np.int64]:
-        """Times in ns that never fall: a search needs their order even where a log is damaged."""
+        """Times, ns, which never decrease: a search needs their order even in a damaged log."""
         return self._kept[: self._count]
 
     def append(self, rows: PacketArray) -> None:
@@ -123,3 +131,91 @@ class _Track:
         with self._path.open("rb") as file:
             file.seek(first * self._layout.length)
             return self._layout.array(file.read((stop - first) * self._layout.length))
+
+
+@dataclass(slots=True)
+class PageCursor:
+    """Time that one reader of the page looks at: the newest packet, or a replay.
+
+    Attributes:
+        live: whether the newest packet is shown.
+        speed: mission time per time of the reader; 0 while paused.
+    """
+
+    live: bool = True
+    speed: float = 1.0
+    _time: float = 0.0
+    _since: float = 0.0
+
+    def obey(self, text: str, now: float) -> bool:
+        """Process a message {"live": true} or {"at": s, "speed": x} and return whether the time jumped.
+
+        `now` is the reader's clock, s. Other messages are ignored.
+        """
+        try:
+            message = json.loads(text)
+            if message.get("live"):
+                jumped = not self.live
+                self.live, self.speed = True, 1.0
+                return jumped
+            at, speed = float(message["at"]), float(message["speed"])
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return False
+        if not (math.isfinite(at) and 0.0 <= speed <= MAX_SPEED):
+            return False
+        self.live, self.speed, self._time, self._since = False, speed, at, now
+        return True
+
+    def at_ns(self, span_ns: tuple[int, int], now: float) -> int:
+        """Return the time to show, ns, within the span of the history; a replay stops at its end."""
+        if self.live:
+            return span_ns[1]
+        moved = self._time + self.speed * (now - self._since)
+        return min(max(round(moved * 1e9), span_ns[0]), span_ns[1])
+
+
+class PageState:
+    """State of a flight at a time, as the changes since the last state that a reader received."""
+
+    def __init__(self, history: History) -> None:
+        self._history = history
+        self._shown: dict[str, int] = {}
+
+    def reset(self) -> None:
+        """Start again with a complete state, after a jump in time."""
+        self._shown.clear()
+
+    def at(self, time_ns: int, names: Mapping[str, Any]) -> Object:
+        """Return the new packets up to a time: the newest of each name, and lists of those in `LISTED`."""
+        newest: Object = {}
+        again = not self._shown
+        listed: dict[str, list[Object]] = {}
+        for name in names:
+            stop = self._history.count(name, time_ns)
+            shown = self._shown.get(name, 0)
+            if stop == shown:
+                continue
+            first = max(shown, stop - _MAX_LISTED) if name in LISTED else stop - 1
+            rows = [values(row) for row in self._history.rows(name, first, stop)]
+            newest[name] = rows[-1] if rows else None
+            if name in LISTED:
+                listed[name] = rows
+            self._shown[name] = stop
+        return {"newest": newest, "listed": listed, "again": again}
+
+
+def values(row: Any) -> Object:
+    """Return the fields of a packet for JSON: printable texts, and null for NaN and infinity."""
+    return {name: _plain(row[name].tolist()) for name in row.dtype.names}
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case bytes():
+            return printable(to_text(value))
+        case list():
+            return [_plain(item) for item in value]
+        case float() if not math.isfinite(value):
+            return None
+        case _:
+            return value

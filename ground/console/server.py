@@ -1,12 +1,22 @@
-"""Serves the page, the telemetry of one flight, and the commands of the page's forms; on loopback only."""
+"""Server of the page: telemetry of one flight and commands from the page's forms, on loopback only.
+
+Only the browser that opened an address with a token may use the console. A token is good for one browser: the
+first request with it gets a cookie, and the token is replaced, so that an address that another user of the
+machine finds later, for example in the list of processes, is useless. Host and Origin are checked as well,
+because a name rebound to loopback (DNS rebinding) and a page of another origin reach the console through the
+operator's own browser.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
 import json
+import re
+import secrets
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,28 +26,27 @@ from aiohttp import WSMsgType, web
 
 from flight.link.telemetry.definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
-from ground.console.access import Access, foreign
-from ground.console.commanding import Commanding
-from ground.console.cursor import Cursor
-from ground.console.history import History
-from ground.console.instant import Instant
-from ground.console.kept_frames import FrameFolder
-from ground.console.surroundings import Surroundings
+from ground.console.commanding import CommandForms
+from ground.console.history import History, PageCursor, PageState
+from ground.console.surroundings import FlightSurroundings, FrameFolder
 from ground.documentation import command_table, database
 from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 NO_ACCESS = "open the newest address that `flight console` printed: the page needs the token in it"
-_LOOK_S = 0.1
-_MOST_POINTS = 4000
+_READ_S = 0.1
+"""Time between two reads of new packets (s)."""
+_MAX_POINTS = 4000
+_RANDOM_BYTES = 32
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 _OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
-"""Packets that come also while the flight itself is silent."""
+"""Packets of the link process, which are received even if the flight itself is silent."""
 _T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _HEADERS = {
-    # Nothing is fetched from anywhere else, whatever a log or a reply holds; no other page frames this one.
+    # No content of a log or an answer makes the browser load from elsewhere; no other page frames this one.
     "Content-Security-Policy": "default-src 'self'; connect-src 'self'; img-src 'self' data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'self'",
     "X-Content-Type-Options": "nosniff",
@@ -46,38 +55,49 @@ _HEADERS = {
 }
 
 
-class Feed(Protocol):
-    """Where packets come from: `ground.watch.tail.LogTail`, or `ground.console.link_feed.LinkFeed`."""
+class PacketFeed(Protocol):
+    """Source of packets: `ground.watch.LogTail` or `ground.console.commanding.LinkFeed`."""
 
     @property
     def silence(self) -> float:
-        """How long nothing has come, s."""
+        """Time without new packets, s."""
 
     def new(self) -> dict[str, PacketArray]:
-        """Return the packets by name that came since the last call. Raises FlightError."""
+        """Return the new packets by name since the last call. Raises FlightError."""
 
 
 @dataclass(slots=True)
 class Console:
-    """One flight on the page: its telemetry, the packets so far, its surroundings, a way to command it.
+    """One flight on the page.
 
-    `settled_ns` is the newest time of which all packets have come: what the page shows live.
+    Attributes:
+        name: name of the flight on the page.
+        feed: source of its packets.
+        history: packets received so far.
+        surroundings: orbit and devices.
+        forms: commands from the page.
+        utc_ns: UTC at mission time zero, ns, None until it is known.
+        flight_received: monotonic time of the last packet of the flight itself, s.
+        frames: kept camera frames.
+        trouble: reason why the last read failed, empty if it did not.
+        settled_ns: newest time of which all packets were received, which the page shows live.
+        sockets: open WebSockets.
     """
 
     name: str
-    feed: Feed
+    feed: PacketFeed
     history: History
-    surroundings: Surroundings
-    commanding: Commanding
+    surroundings: FlightSurroundings
+    forms: CommandForms
     utc_ns: int | None = None
-    flight_heard: float = field(default_factory=time.monotonic)
+    flight_received: float = field(default_factory=time.monotonic)
     frames: FrameFolder = field(default_factory=lambda: FrameFolder(None))
     trouble: str = ""
     settled_ns: int = 0
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
-    def look(self) -> None:
-        """Take in what has come since the last look; trouble is shown, and the next look tries again."""
+    def read(self) -> None:
+        """Read the new packets. A failure is stored in `trouble`, and the next read tries again."""
         try:
             packets = self.feed.new()
         except FlightError as error:
@@ -86,39 +106,82 @@ class Console:
         self.trouble = ""
         newest_ns = self.history.span_ns[1]
         self.history.append(packets)
-        # The packets of an instant may come in two looks: what the look before had is whole now.
+        # The packets of one time may be in two reads: those of the previous read are complete now.
         more = newest_ns > 0 and any(len(rows) for rows in packets.values())
         self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
-            self.flight_heard = time.monotonic()
+            self.flight_received = time.monotonic()
         if len(packets["run"]):
             self.utc_ns = int(packets["run"]["utc_ns"][-1])
 
 
+class Access:
+    """Token of the next browser and cookies of the sessions."""
+
+    def __init__(self, announce: Callable[[str], object]) -> None:
+        """Make a token; `announce` receives each token that replaces a used one."""
+        self._announce = announce
+        self._sessions: list[str] = []
+        self.token = secrets.token_urlsafe(_RANDOM_BYTES)
+
+    def open_session(self, token: str) -> str | None:
+        """Return the cookie of a new session for the current token, or None for any other text."""
+        if not _equal(token, self.token):
+            return None
+        self._sessions.append(secrets.token_urlsafe(_RANDOM_BYTES))
+        self.token = secrets.token_urlsafe(_RANDOM_BYTES)
+        self._announce(self.token)
+        return self._sessions[-1]
+
+    def admits(self, cookie: str) -> bool:
+        """Return whether a cookie belongs to a session."""
+        return any([_equal(cookie, session) for session in self._sessions])
+
+
+def _equal(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode(errors="replace"), other.encode())
+
+
+def refusal(headers: Mapping[str, str], origin_required: bool) -> str:
+    """Return why a request is not from the console's own page, or an empty text if it is.
+
+    Browsers state the origin of each POST and each WebSocket, so these must have one (`origin_required`).
+    """
+    host, origin = headers.get("Host", ""), headers.get("Origin")
+    if not _OWN_HOST.fullmatch(host):
+        return "this console answers on loopback only"
+    if origin is None:
+        if not origin_required:
+            return ""
+        return "this console answers its own page only: the request states no Origin"
+    return "" if origin == f"http://{host}" else "this console answers its own page only"
+
+
 def application(console: Console, access: Access) -> web.Application:
-    """Return the application; `console` must have looked once."""
+    """Return the web application; `console` must have been read once."""
 
     @web.middleware
     async def only_own_page(request: web.Request, handler: _Handler) -> web.StreamResponse:
-        """Refuse a request of another page, and one without a session."""
+        """Refuse requests from other pages and requests without a session."""
         socket = request.headers.get("Upgrade", "").lower() == "websocket"
-        if reason := foreign(request.headers, socket or request.method not in ("GET", "HEAD")):
+        if reason := refusal(request.headers, socket or request.method not in ("GET", "HEAD")):
             raise web.HTTPForbidden(text=reason)
-        name = _cookie_name(request)
+        # Browsers share cookies between the ports of a host.
+        name = "knightcube-console-" + (request.headers["Host"].partition(":")[2] or "80")
         if access.admits(request.cookies.get(name, "")):
             return await handler(request)
         token = request.query.get("token", "") if (request.method, request.path) == ("GET", "/") else ""
-        session = access.exchange(token)
+        session = access.open_session(token)
         if session is None:
             if request.path.startswith("/api/"):
                 return web.json_response({"error": NO_ACCESS}, status=401)
             raise web.HTTPUnauthorized(text=NO_ACCESS)
-        # No redirect: behind a link on another site, a browser would not send the cookie with it.
+        # After a link on another site, a browser would not send the cookie with a redirect.
         response = await handler(request)
         response.set_cookie(name, session, httponly=True, samesite="Strict")
         return response
 
-    app = web.Application(middlewares=[only_own_page, _errors_in_words])
+    app = web.Application(middlewares=[only_own_page, _errors_as_json])
     app.on_response_prepare.append(_add_headers)
     pages = _Pages(console)
     app.add_routes(
@@ -135,40 +198,35 @@ def application(console: Console, access: Access) -> web.Application:
             web.static("/page", PAGE),
         ]
     )
-    app.cleanup_ctx.append(lambda _: _looking(console))
-    app.on_shutdown.append(lambda _: _goodbye(console))
+    app.cleanup_ctx.append(lambda _: _reading(console))
+    app.on_shutdown.append(lambda _: _close_sockets(console))
     return app
 
 
-async def _looking(console: Console) -> AsyncIterator[None]:
-    async def look() -> None:
+async def _reading(console: Console) -> AsyncIterator[None]:
+    async def read() -> None:
         while True:
-            await asyncio.to_thread(console.look)
-            await asyncio.sleep(_LOOK_S)
+            await asyncio.to_thread(console.read)
+            await asyncio.sleep(_READ_S)
 
-    task = asyncio.create_task(look())
+    task = asyncio.create_task(read())
     yield
     task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await task
 
 
-async def _goodbye(console: Console) -> None:
+async def _close_sockets(console: Console) -> None:
     for line in list(console.sockets):
-        await line.close(message=b"the console was ended")
+        await line.close(message=b"the console has ended")
 
 
 async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(_HEADERS)
 
 
-def _cookie_name(request: web.Request) -> str:
-    """Return the cookie's name: browsers share cookies between the ports of a host."""
-    return "knightcube-console-" + (request.headers["Host"].partition(":")[2] or "80")
-
-
 @web.middleware
-async def _errors_in_words(request: web.Request, handler: _Handler) -> web.StreamResponse:
+async def _errors_as_json(request: web.Request, handler: _Handler) -> web.StreamResponse:
     try:
         return await handler(request)
     except (FlightError, TelemetryError) as error:
@@ -177,24 +235,24 @@ async def _errors_in_words(request: web.Request, handler: _Handler) -> web.Strea
 
 
 class _Pages:
-    """The answers to the page's requests."""
+    """Answers to the requests of the page."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        # One thread for pictures: each thread that makes one holds on to the memory of it.
+        # One thread for pictures, because each thread keeps the memory of the largest one.
         self._drawing = ThreadPoolExecutor(1)
 
     async def index(self, _: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
 
     async def table(self, _: web.Request) -> web.StreamResponse:
-        """Answer with the telemetry and the commands as the tables define them."""
+        """Answer with the definitions of telemetry and commands."""
         console = self._console
         return web.json_response(
             {
                 "packets": database()["packets"],
-                "commands": command_table(console.commanding.layouts),
-                "commanding": console.commanding.possible,
+                "commands": command_table(console.forms.layouts),
+                "commanding": console.forms.possible,
                 "name": console.name,
                 "camera": console.surroundings.camera,
                 "coil_dipole": console.surroundings.coil_dipole,
@@ -211,9 +269,9 @@ class _Pages:
         component = _whole(request, "component", 0)
         columns = LAYOUTS[name].dtype[column]
         if columns.kind == "S" or not 0 <= component < max(columns.shape or (1,)):
-            raise UsageError(f"{name}.{column}[{component}]: no such number")
+            raise UsageError(f"{name}.{column}[{component}]: no such component")
         span = (int(_real(request, "from") * 1e9), int(_real(request, "to") * 1e9))
-        points = min(max(_whole(request, "points", 1000), 2), _MOST_POINTS)
+        points = min(max(_whole(request, "points", 1000), 2), _MAX_POINTS)
         times, values = await asyncio.to_thread(
             self._console.history.series, name, column, component, span, points
         )
@@ -221,60 +279,60 @@ class _Pages:
         return web.json_response({"times": times.tolist(), "values": finite})
 
     async def track(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the ground track about a time: ?at= (s)."""
+        """Answer with the ground track around a time: ?at= (s)."""
         utc = self._utc(_real(request, "at"))
         track = [] if utc is None else await asyncio.to_thread(self._console.surroundings.track, utc)
         return web.json_response({"track": track})
 
     async def frame(self, request: web.Request) -> web.StreamResponse:
-        """Answer with what was found in a frame that was kept: ?sequence=; null where it was not."""
+        """Answer with the results of a kept frame: ?sequence=; null if it was not kept."""
         sequence = _whole(request, "sequence", 0)
         facts = await self._drawn(self._console.frames.facts, sequence)
         return web.json_response(facts)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
-        """Answer with the picture of a frame that was kept: ?sequence=."""
+        """Answer with the picture of a kept frame: ?sequence=."""
         found = await self._drawn(self._console.frames.picture, _whole(request, "sequence", 0))
         if found is None:
-            raise web.HTTPNotFound(text="that frame was not kept")
+            raise web.HTTPNotFound(text="this frame was not kept")
         return web.Response(body=found, content_type="image/png")
 
     async def _drawn(self, make: Callable[[int], _T], sequence: int) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._drawing, make, sequence)
 
     async def words(self, request: web.Request) -> web.StreamResponse:
-        """Answer with a command in words, before it is sent."""
+        """Answer with the text of a command before it is sent."""
         name, given = await _command_of(request)
-        return web.json_response({"words": self._console.commanding.words(name, given)})
+        return web.json_response({"words": self._console.forms.text(name, given)})
 
     async def command(self, request: web.Request) -> web.StreamResponse:
-        """Send a command."""
+        """Send a command and answer with its result."""
         name, given = await _command_of(request)
-        return web.json_response(await asyncio.to_thread(self._console.commanding.obey, name, given))
+        return web.json_response(await asyncio.to_thread(self._console.forms.obey, name, given))
 
     async def live(self, request: web.Request) -> web.StreamResponse:
-        """Push the state of the flight at the time that the reader's cursor shows."""
+        """Push the state of the flight at the time of the reader's cursor."""
         line = web.WebSocketResponse(heartbeat=10.0, max_msg_size=4096)
         await line.prepare(request)
         self._console.sockets.add(line)
-        cursor, instant = Cursor(), Instant(self._console.history)
-        pushing = asyncio.create_task(self._push(line, cursor, instant))
+        cursor, state = PageCursor(), PageState(self._console.history)
+        pushing = asyncio.create_task(self._push(line, cursor, state))
         try:
             async for message in line:
                 if message.type is WSMsgType.TEXT and cursor.obey(message.data, time.monotonic()):
-                    instant.forget()
+                    state.reset()
         finally:
             pushing.cancel()
             self._console.sockets.discard(line)
         return line
 
-    async def _push(self, line: web.WebSocketResponse, cursor: Cursor, instant: Instant) -> None:
+    async def _push(self, line: web.WebSocketResponse, cursor: PageCursor, state: PageState) -> None:
         with contextlib.suppress(ConnectionError):
             while not line.closed:
-                await line.send_str(json.dumps(self._state(cursor, instant)))
+                await line.send_str(json.dumps(self._message(cursor, state)))
                 await asyncio.sleep(PUSH_S)
 
-    def _state(self, cursor: Cursor, instant: Instant) -> dict[str, Any]:
+    def _message(self, cursor: PageCursor, state: PageState) -> dict[str, Any]:
         console = self._console
         span = console.history.span_ns[0], console.settled_ns
         at_ns = cursor.at_ns(span, time.monotonic())
@@ -285,11 +343,11 @@ class _Pages:
             "live": cursor.live,
             "speed": cursor.speed,
             "silence": console.feed.silence,
-            "flight_silence": time.monotonic() - console.flight_heard,
+            "flight_silence": time.monotonic() - console.flight_received,
             "trouble": console.trouble,
             "utc_ns": utc,
             "surroundings": None if utc is None else console.surroundings.at(utc),
-            **instant.at(at_ns, LAYOUTS),
+            **state.at(at_ns, LAYOUTS),
         }
 
     def _utc(self, seconds: float) -> int | None:
@@ -314,8 +372,8 @@ def _real(request: web.Request, name: str) -> float:
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not abs(value) < 1e9:  # s of mission time: 30 years; NaN compares false
-        raise UsageError(f"{name} = {text!r}: give seconds of mission time")
+    if not abs(value) < 1e9:  # mission time of 30 years, s; false for NaN
+        raise UsageError(f"{name} = {text!r}: give the mission time in seconds")
     return value
 
 

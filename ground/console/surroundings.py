@@ -1,37 +1,44 @@
-"""Where a satellite was: its place over the ground, the Sun and the day's side, from its two-line elements.
-
-On a testbed, and without elements in the run's configuration, nothing is known.
-"""
+"""Surroundings of a flight for the page: orbit, Sun and magnetic field, and the frames of its camera."""
 
 from __future__ import annotations
 
 import math
+import struct
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from flight.schema.reader import load
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.geomagnetism import GeomagneticError, field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
 from knightcube.errors import FlightError
+from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
 _UNIX_EPOCH = 2_440_587.5
-_TRACK_STEP, _TRACK_HALF = 60.0, 5700.0  # s: a revolution of a low orbit before and after
+_TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
+"""Step of the ground track, and its time before and after now, one revolution in low orbit (s)."""
+_MAX_SIDE = 640
+"""Largest side of a picture on the page (px)."""
+_DARK, _BRIGHT = 50.0, 99.9
+"""Percentiles of the pixels that are shown as black and white."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """Of one flight.
+class FlightSurroundings:
+    """Orbit and devices from the configuration of a flight.
 
     Attributes:
-        camera: the star camera's turn into the body (4,) and its field of view, rad.
-        coil_dipole: of a coil at the limit of its current, A m^2.
+        elements: two-line elements; None on a testbed and if the configuration has none.
+        camera: mounting (4,) of the star camera, body into camera, and its field of view, rad.
+        coil_dipole: dipole of a coil at its current limit, A m^2.
     """
 
     elements: TwoLineElements | None
@@ -39,46 +46,53 @@ class Surroundings:
     coil_dipole: float | None = None
 
     @classmethod
-    def of(cls, path: Path) -> Surroundings:
-        """Return those of a configuration; nothing is known without one that can be read."""
+    def of(cls, path: Path) -> FlightSurroundings:
+        """Return the surroundings of a configuration, or `UNKNOWN` if it cannot be read."""
         try:
             config: Any = load(path)
         except FlightError:
-            return NOWHERE
-        lines = getattr(config, "elements", None)
-        camera = getattr(config, "camera", None)
-        sight = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
-        return cls(TwoLineElements(*lines) if lines else None, sight, _coil_dipole(config))
+            return UNKNOWN
+        lines, camera, dipole = getattr(config, "elements", None), getattr(config, "camera", None), None
+        view = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
+        if (craft := getattr(config, "craft", None)) is not None:
+            dipole = float(craft.dipole_per_ampere * config.coils.current_limit)
+        elif (plant := getattr(config, "plant", None)) is not None:
+            dipole = float(plant.coil_turns * plant.coil_area * config.coils.current_limit)
+        return cls(TwoLineElements(*lines) if lines else None, view, dipole)
 
     def at(self, utc_ns: int) -> Object | None:
-        """Return place, directions (3,), ICRS, and the points below satellite and Sun, deg."""
+        """Return position, ICRS directions (3,), and the points below satellite and Sun, deg."""
         state = self._state(_julian_date(utc_ns))
         if state is None:
             return None
-        sun_place = -earth_from_sun(float(terrestrial_time(state.julian_date)))[0]
-        place = self._below(state)
+        sun_position = -earth_from_sun(float(terrestrial_time(state.julian_date)))[0]
+        latitude, longitude, height = _below(state)
         to_ground = celestial_to_terrestrial(state.julian_date)
-        sun_ground = to_ground @ (sun_place / np.linalg.norm(sun_place))
+        sun_ground = to_ground @ (sun_position / np.linalg.norm(sun_position))
+        try:
+            magnetic = field(state.julian_date, state.position).tolist()
+        except GeomagneticError:
+            magnetic = None
         return {
-            "latitude": place[0],
-            "longitude": place[1],
-            "altitude_km": place[2] * 1e-3,
+            "latitude": latitude,
+            "longitude": longitude,
+            "altitude_km": height * 1e-3,
             "sun_latitude": math.degrees(math.asin(sun_ground[2])),
             "sun_longitude": math.degrees(math.atan2(sun_ground[1], sun_ground[0])),
-            "sunlit": float(sunlit_share(state.position[None], sun_place[None])[0]),
-            "sun": _direction(sun_place - state.position),
+            "sunlit": float(sunlit_share(state.position[None], sun_position[None])[0]),
+            "sun": _direction(sun_position - state.position),
             "nadir": _direction(-state.position),
             "velocity": _direction(state.velocity),
-            "field_t": _field(state),
+            "field_t": magnetic,
         }
 
     def track(self, utc_ns: int) -> list[list[float]]:
-        """Return the ground track [[latitude, longitude], ...] deg, a revolution before and after."""
+        """Return the ground track [[latitude, longitude], ...], deg, one revolution before and after."""
         if self.elements is None:
             return []
         dates = _julian_date(utc_ns) + np.arange(-_TRACK_HALF, _TRACK_HALF, _TRACK_STEP) / DAY
         states = [self._state(float(date)) for date in dates]
-        return [list(self._below(state)[:2]) for state in states if state is not None]
+        return [list(_below(state)[:2]) for state in states if state is not None]
 
     def _state(self, date: float) -> OrbitState | None:
         try:
@@ -86,26 +100,19 @@ class Surroundings:
         except OrbitError:
             return None
 
-    def _below(self, state: OrbitState) -> tuple[float, float, float]:
-        longitude, latitude, height = geodetic(celestial_to_terrestrial(state.julian_date) @ state.position)
-        return math.degrees(float(latitude)), math.degrees(float(longitude)), float(height)
 
-
-def _coil_dipole(config: Any) -> float | None:
-    """Return the largest dipole of a coil of either body's configuration, A m^2."""
-    if (craft := getattr(config, "craft", None)) is not None:
-        return float(craft.dipole_per_ampere * config.coils.current_limit)
-    if (plant := getattr(config, "plant", None)) is not None:
-        return float(plant.coil_turns * plant.coil_area * config.coils.current_limit)
-    return None
-
-
-NOWHERE = Surroundings(None, None)
-"""Nothing is known."""
+UNKNOWN = FlightSurroundings(None, None)
+"""Surroundings without a configuration."""
 
 
 def _julian_date(utc_ns: int) -> float:
     return _UNIX_EPOCH + utc_ns * 1e-9 / DAY
+
+
+def _below(state: OrbitState) -> tuple[float, float, float]:
+    """Return latitude, deg, longitude, deg, and height, m, of a satellite."""
+    longitude, latitude, height = geodetic(celestial_to_terrestrial(state.julian_date) @ state.position)
+    return math.degrees(float(latitude)), math.degrees(float(longitude)), float(height)
 
 
 def _direction(vector: FloatArray) -> list[float]:
@@ -113,9 +120,76 @@ def _direction(vector: FloatArray) -> list[float]:
     return unit
 
 
-def _field(state: OrbitState) -> list[float] | None:
-    try:
-        found: list[float] = field(state.julian_date, state.position).tolist()
-    except GeomagneticError:
-        return None
-    return found
+class FrameFolder:
+    """Folder of kept camera frames; `None` means that the flight has none."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+
+    def facts(self, sequence: int) -> Object | None:
+        """Return the results of a frame with its `columns` and `rows`, or None if it was not kept."""
+        data = self._read(sequence)
+        if data is None:
+            return None
+        try:
+            rows, columns = pixels_of(data).shape
+            return {**facts_of(data), "columns": columns, "rows": rows}
+        except ValueError:
+            return None
+
+    def picture(self, sequence: int) -> bytes | None:
+        """Return a frame as PNG, binned to the size of the page and stretched, or None if it was not kept."""
+        data = self._read(sequence)
+        if data is None:
+            return None
+        try:
+            return png(stretched(binned(pixels_of(data))))
+        except ValueError:
+            return None
+
+    def _read(self, sequence: int) -> bytes | None:
+        if self._folder is None:
+            return None
+        try:
+            return (self._folder / f"frame-{sequence:08d}.pgm").read_bytes()
+        except OSError:
+            return None
+
+
+def pixels_of(data: bytes) -> Image:
+    """Return a view of the pixels (rows, columns) of a kept frame. Raises ValueError for another file."""
+    parts = data.split(b"\n", 4)
+    if len(parts) != 5 or parts[0] != b"P5":
+        raise ValueError("not a kept frame")
+    columns, rows = (int(word) for word in parts[2].split())
+    kind = np.dtype(">u2") if int(parts[3]) > 255 else np.dtype(np.uint8)
+    if columns < 1 or rows < 1 or len(parts[4]) != rows * columns * kind.itemsize:
+        raise ValueError(f"{len(parts[4])} bytes are not a frame of {columns} x {rows} pixels")
+    return np.frombuffer(parts[4], kind).reshape(rows, columns)
+
+
+def binned(pixels: Image) -> Image:
+    """Return the means of squares of pixels, so that both sides fit on the page."""
+    step = -(-max(pixels.shape) // _MAX_SIDE)
+    rows, columns = (side // step for side in pixels.shape)
+    squares = pixels[: rows * step, : columns * step].reshape(rows, step, columns, step)
+    return np.asarray(squares.mean(axis=(1, 3), dtype=np.float32))
+
+
+def stretched(pixels: Image) -> npt.NDArray[np.uint8]:
+    """Return the pixels as grey levels on a nonlinear scale on which faint stars are visible."""
+    dark, bright = np.percentile(pixels, [_DARK, _BRIGHT])
+    scale = max(float(bright - dark), 1e-9)
+    levels = np.arcsinh(10.0 * np.clip((pixels - dark) / scale, 0.0, 1.0)) / np.arcsinh(10.0)
+    return np.asarray(np.round(255.0 * levels), dtype=np.uint8)
+
+
+def png(levels: npt.NDArray[np.uint8]) -> bytes:
+    """Return grey levels (rows, columns) as the bytes of a PNG (ISO/IEC 15948) with 8 bits."""
+    rows, columns = levels.shape
+    lines = np.hstack([np.zeros((rows, 1), np.uint8), levels]).tobytes()
+    head = struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, body in ((b"IHDR", head), (b"IDAT", zlib.compress(lines, 6)), (b"IEND", b"")):
+        data += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    return data

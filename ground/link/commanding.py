@@ -1,48 +1,153 @@
-"""Sends a command by the link and shows what becomes of it; changes the keys of both ends."""
+"""Commands to a flight, over its socket or its link: verification, key changes and file transfers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import argparse
+import hashlib
+import os
+import socket
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
-from flight.link.frames import TELECOMMAND_MASK
+from flight.link.files.store import Store
+from flight.link.files.transfer import CRC32, GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
+from flight.link.files.units import DOWN, UP, PduError, UnitPacker, is_unit, unit_of
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER, TELECOMMAND_MASK
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage
-from flight.link.process.directives import NewKey
-from flight.link.security import COMMAND_SPIS, NEXT, Association, Sealer, Vault, new_key
-from ground.link.terminal import Terminal
+from flight.link.process.directives import Directive, NewKey
+from flight.link.security import COMMAND_SPIS, NEXT, OVERHEAD_BYTES, Association, Sealer, Vault, new_key
+from flight.link.telemetry.definitions import TRANSFER, VERIFICATION
+from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, LONGEST_PACKET, to_text
+from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, open_terminal, report_of
 from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
+_BLOCK = 64
+"""Counters reserved at once; a command of another process in between discards the remaining ones."""
+_REPEAT_NS = 5_000_000_000
+"""Time after which an unanswered command is sent again (ns)."""
+_BURST_S = 0.05
+"""Time over which unused transmission rate accumulates (s)."""
+_FRAME_BYTES = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + CRC_BYTES
+_VERIFICATION = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
+_TRANSFER = LAYOUTS[TRANSFER.name]
+
+
+def exchange(to: str, data: bytes, timeout: float) -> bytes:
+    """Send a packet to a flight's UNIX socket or UDP address HOST:PORT and return the answer.
+
+    Raises FlightError without an answer within `timeout` s, UsageError for an invalid address or timeout.
+    """
+    if not 0.0 < timeout < float("inf"):
+        raise UsageError(f"--timeout {timeout}: must be a positive number of seconds")
+    host, _, port = to.rpartition(":")
+    if host and port.isdigit() and not Path(to).exists():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            return _ask(line, (host, int(port)), data, timeout, to)
+    # A service (`deploy/knightcube.service`) has its own temporary files: our socket must be beside its own.
+    beside = Path(to).absolute().parent
+    place = beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
+    with (
+        tempfile.TemporaryDirectory(prefix="knightcube-", dir=place) as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
+    ):
+        own = os.path.join(folder, "answer")
+        os.chmod(folder, 0o711)  # the flight, which is another user, must reach our socket to answer
+        line.bind(own)
+        os.chmod(own, 0o777)
+        return _ask(line, to, data, timeout, to)
+
+
+def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeout: float, to: str) -> bytes:
+    line.settimeout(timeout)
+    try:
+        line.sendto(data, address)
+    except OSError as error:
+        raise FlightError(f"{to}: no flight listens there: {error.strerror or error}") from error
+    except OverflowError as error:
+        raise UsageError(f"{to}: {error}") from error
+    try:
+        return line.recv(LONGEST_PACKET)
+    except OSError as error:
+        raise FlightError(f"{to}: no answer within {timeout:g} s") from error
+
+
+def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:
+    """Add `--link` to the ways to a flight, and its settings to the parser."""
+    way.add_argument(
+        "--link",
+        metavar="ADDRESS",
+        help="link of the flight: HOST:PORT (UDP), tcp:HOST:PORT or /dev/FILE@BAUD",
+    )
+    parser.add_argument("--keys", type=Path, metavar="FOLDER", help="keys of the ground, needed with --link")
+    parser.add_argument(
+        "--spacecraft",
+        type=int,
+        default=DEFAULTS.spacecraft,
+        metavar="N",
+        help="spacecraft identifier of the link (default %(default)s)",
+    )
+    parser.add_argument(
+        "--frame-bytes",
+        type=int,
+        default=DEFAULTS.frame_bytes,
+        metavar="N",
+        help="length of the link's telemetry frames (default %(default)s)",
+    )
+
+
+def terminal_of(options: argparse.Namespace) -> Terminal:
+    """Return the terminal for the link options. Raises UsageError, FlightError."""
+    if options.keys is None:
+        raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
+    settings = TerminalSettings(options.spacecraft, options.frame_bytes)
+    return open_terminal(options.link, options.keys, settings)
 
 
 def obeyed(reports: list[Report]) -> bool:
-    """Return whether a command with these reports was obeyed, as far as it is known."""
+    """Return whether a command with these reports was obeyed, as far as they show."""
     return bool(reports) and reports[-1].stage in {Stage.STARTED, Stage.COMPLETED}
 
 
+def failed(reports: list[Report]) -> str:
+    """Return the reason why a command failed; empty if it has not failed."""
+    bad = (report.text for report in reports if report.stage in {Stage.REFUSED, Stage.FAILED})
+    return next(bad, "")
+
+
 def command(terminal: Terminal, packet: bytes, spi: int, seconds: float, show: Show) -> list[Report]:
-    """Send a command; return its reports, each shown as it comes. Raises FlightError without any."""
-    counter = terminal.send(packet, spi)
-    return _shown(terminal.follow(counter, spi, seconds), show, seconds)
+    """Send a command, pass its reports to `show` and return them. Raises FlightError without a report."""
+    found = []
+    for report in terminal.follow(terminal.send(packet, spi), spi, seconds):
+        show(report)
+        found.append(report)
+    if not found:
+        raise FlightError(f"no answer over the link within {seconds:g} s")
+    return found
 
 
 def change_key(
     terminal: Terminal, vault: Vault, changed: int, spi: int, seconds: float, show: Show
 ) -> list[Report]:
-    """Change the key of SPI `changed` by a command under the key of `spi`.
+    """Change the key of SPI `changed` with a command under the key of `spi`.
 
-    The new key is on the ground's disk before it is sent, and takes the old one's place when the satellite
-    has it. Where that stayed unknown the next call asks first, by a ping under the new key.
-    Raises FlightError without an answer.
+    The new key is stored on the ground before it is sent, and replaces the old one when the satellite has it.
+    If the result of an earlier change is unknown, a ping under its new key is sent first. Raises FlightError
+    without an answer.
     """
     old, name = vault.read(changed), f"{changed}-{NEXT}"
     if old is None:
-        raise UsageError(f"both copies of SPI {changed} are lost here too: make new keys")
+        raise UsageError(f"both copies of SPI {changed} are lost on the ground too: make new keys")
     following = vault.read(name)
     if following is not None and changed in COMMAND_SPIS:
-        reports = _try(terminal, Sealer(vault, name, TELECOMMAND_MASK), changed, seconds)
+        sealer = Sealer(vault, name, TELECOMMAND_MASK)
+        counter = terminal.send_by(sealer, CommandPacker().pack(Ping(), utc_ns()))
+        reports = list(terminal.follow(counter, changed, seconds))
         if obeyed(reports):
             _promote(vault, changed)
             return reports
@@ -54,16 +159,11 @@ def change_key(
     reports = command(terminal, packet, spi, seconds, show)
     if obeyed(reports) and changed in COMMAND_SPIS:
         _promote(vault, changed)
-    return reports  # a new key of telemetry takes its place with the first frame under it
-
-
-def _try(terminal: Terminal, sealer: Sealer, spi: int, seconds: float) -> list[Report]:
-    counter = terminal.send_by(sealer, CommandPacker().pack(Ping(), utc_ns()))
-    return list(terminal.follow(counter, spi, seconds))
+    return reports  # a new telemetry key replaces the old one with the first frame under it
 
 
 def _promote(vault: Vault, spi: int) -> None:
-    """Put the next key in the old one's place."""
+    """Replace the current key by the next one."""
     with vault.locked():
         following = vault.read(f"{spi}-{NEXT}")
         if following is not None:
@@ -71,11 +171,92 @@ def _promote(vault: Vault, spi: int) -> None:
             vault.remove(f"{spi}-{NEXT}")
 
 
-def _shown(reports: Iterator[Report], show: Show, seconds: float) -> list[Report]:
-    found = []
-    for report in reports:
-        show(report)
-        found.append(report)
-    if not found:
-        raise FlightError(f"no answer by the link within {seconds:g} s")
-    return found
+class FileSession:
+    """File commands and transfers over one terminal, for use by one thread.
+
+    Received data is on disk at any moment, so that the next session continues an interrupted transfer.
+
+    Attributes:
+        entity: the ground's CFDP entity.
+        received: folder of the received files.
+        received_ns: time of the last received packet, ns.
+    """
+
+    def __init__(self, terminal: Terminal, store: Store, spi: int, rate: float, now_ns: int) -> None:
+        """Send at most `rate` bytes/s of frames. Raises FlightError."""
+        self._terminal = terminal
+        self._rate = rate
+        self._sealer = terminal.sealer(spi, _BLOCK)
+        self._units = UnitPacker(UP)
+        self.entity = Entity(GROUND, store, lambda _: "", LONGEST_FILE, now_ns)
+        self.received = store.received
+        self.received_ns = now_ns
+        self._texts: dict[tuple[int, int], str] = {}
+        self._asked: tuple[Directive, int] | None = None
+        self._counters: set[int] = set()
+        self._reports: deque[Report] = deque()
+        self._credit, self._credit_ns = 0.0, now_ns
+
+    def ask(self, directive: Directive, now_ns: int) -> None:
+        """Send a command, and repeat it until it is answered."""
+        self._asked = (directive, now_ns + _REPEAT_NS)
+        self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
+
+    def put(self, path: Path, name: str, now_ns: int) -> Progress:
+        """Begin to send a file up, or continue it. Raises FlightError."""
+        return self.entity.send(path, name, SATELLITE, CRC32, utc_ns(), now_ns, NOBODY)
+
+    def take(self, packets: Iterable[tuple[int, bytes]], now_ns: int) -> None:
+        """Process received telemetry, given as virtual channels and packets."""
+        for _, packet in packets:
+            self.received_ns = now_ns
+            if is_unit(packet, DOWN):
+                try:
+                    self.entity.take(unit_of(packet), now_ns)
+                except PduError:  # of a satellite with another release, whose units are not known here
+                    continue
+            elif packet[:2] == _VERIFICATION:
+                report = report_of(packet)
+                if report.counter in self._counters:
+                    if report.stage is not Stage.ACCEPTED:
+                        self._asked = None
+                    self._reports.append(report)
+            elif packet[:2] == _TRANSFER.identifier.to_bytes(2, "big"):
+                (row,) = _TRANSFER.array(packet)
+                self._texts[int(row["source"]), int(row["number"])] = to_text(row["text"])
+
+    def transmit(self, now_ns: int) -> None:
+        """Send due commands and units within the rate. Raises FlightError."""
+        if self._asked is not None and now_ns >= self._asked[1]:
+            self.ask(self._asked[0], now_ns)
+        self._credit += self._rate * (now_ns - self._credit_ns) * 1e-9
+        self._credit = min(self._credit, max(self._rate * _BURST_S, 2.0 * LONGEST_FRAME))
+        self._credit_ns = now_ns
+        while self._credit > 0.0 and (unit := self.entity.unit(now_ns)) is not None:
+            packet = self._units.pack(unit, utc_ns())
+            self._terminal.send_by(self._sealer, packet)
+            self._credit -= len(packet) + _FRAME_BYTES
+        self.entity.keep(now_ns)
+
+    def reports(self) -> list[Report]:
+        """Return the reports on the commands since the last call."""
+        found = list(self._reports)
+        self._reports.clear()
+        return found
+
+    def reason_of(self, progress: Progress) -> str:
+        """Return the reason why a transfer ended, as reported by the satellite if it refused it."""
+        return self._texts.get((progress.source, progress.number), "") or progress.said
+
+    def close(self, now_ns: int) -> None:
+        """Store the received data."""
+        self.entity.close(now_ns)
+
+
+def sha256_of(path: Path) -> bytes:
+    """Return the SHA-256 of a file. Raises FlightError."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+    except OSError as error:
+        raise FlightError(f"{path}: {error.strerror or error}") from error

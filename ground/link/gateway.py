@@ -1,53 +1,190 @@
-"""Plain packets for a ground station that holds no keys: protected frames end here, in both directions.
+"""Plain packets for a ground station without keys: the gateway adds and removes the protection.
 
-A connection must begin with the gateway's token (`ground.link.command_stream`); a web page, which can open
-connections to loopback too, does not know it. After the token the connection gets every telemetry packet,
-live and played back, as a stream. A command packet that it sends, or a packet with a unit of a file's
-transfer, gets its time and CRC and goes up in a protected frame. Its sequence count stays: by it the packets
-`verification` name the command.
+A connection must begin with the token of the gateway, which a web page, although it can connect to loopback,
+does not know. After the token the connection receives every telemetry packet, live and played back, as a
+stream. A command packet that it sends, or a packet with a unit of a file transfer, gets its time and CRC and
+is sent in a protected frame. Its sequence count is kept, because the packets `verification` identify a
+command by it.
 """
 
 from __future__ import annotations
 
+import hmac
+import os
+import secrets
 import select
 import socket
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from ipaddress import IPv4Address
+from pathlib import Path
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
+from flight.link.files.units import PACKET_VERSION, UP
+from flight.link.frames import LONGEST_FRAME, TELECOMMAND_HEADER
 from flight.link.process.station import host_port
+from flight.link.security import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import VERIFICATION
-from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
-from ground.link.command_stream import CommandStream, StreamError
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, SECONDARY_BYTES, crc16
 from ground.link.terminal import Terminal, report_of
-from knightcube.errors import UsageError
+from ground.xtce import TELECOMMANDS
+from knightcube.errors import FlightError, UsageError
 
 ADDRESS = "127.0.0.1:5013"
 
 _VERIFIED = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
-_UNSENT = 1 << 22
+_MAX_UNSENT = 1 << 22
+"""Unsent bytes above which a connection is closed."""
 _SPI, _BLOCK = 1, 64
-"""Counters are reserved by so many: a file is thousands of frames, a reservation two writes to the disk."""
-_PIECE = 1 << 16
-_AGAIN_S = 20.0
-"""Between the gateway's own pings: by UDP the link forgets a sender after a minute."""
+"""Counters reserved at once: a reservation takes two disk writes, and a file thousands of frames."""
+_READ_BYTES = 1 << 16
+_PING_PERIOD_S = 20.0
+"""Time between the gateway's own pings (s), because the link forgets a UDP sender after a minute."""
 _TOKEN_S = 5.0
 """Time (s) after which a connection without the token is closed."""
 _MOST_WITHOUT_TOKEN = 16
 """Maximum number of connections without the token; one more closes the oldest of them."""
 _REPORT_S = 1.0
 """Minimum time (s) between two reports about connections without the token."""
+_TOKEN_CHARACTERS = b"0123456789abcdef"
+_TOKEN_BYTES = 32
+_CHECKED_BYTES = HEADER_BYTES + 1
+"""Length of the primary header and the version of the packet's definition."""
+_UNSEGMENTED = 0b11
+_LONGEST_PACKET = LONGEST_FRAME - TELECOMMAND_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
+_SHORTEST_UNIT = HEADER_BYTES + SECONDARY_BYTES + 1 + CRC_BYTES
+
+
+class StreamError(FlightError):
+    """A byte that is neither of the token nor of a command packet."""
+
+
+@dataclass(frozen=True, slots=True)
+class _HeaderForm:
+    """Header of one packet type: first 16 bits, limits of the packet's length, version."""
+
+    identifier: bytes
+    shortest: int
+    longest: int
+    version: int
+
+    def begins(self, header: bytes) -> bool:
+        """Return whether a packet of this type can begin with these bytes."""
+        if header[:2] != self.identifier[: len(header)]:
+            return False
+        if len(header) > 2 and header[2] >> 6 != _UNSEGMENTED:
+            return False
+        if len(header) > 4:
+            low, high = (bound - HEADER_BYTES - 1 for bound in (self.shortest, self.longest))
+            stated = header[4:HEADER_BYTES]
+            if not low.to_bytes(2, "big")[: len(stated)] <= stated <= high.to_bytes(2, "big")[: len(stated)]:
+                return False
+        return len(header) <= HEADER_BYTES or header[HEADER_BYTES] == self.version
+
+
+_HEADER_FORMS = (
+    *(
+        _HeaderForm(layout.identifier.to_bytes(2, "big"), layout.length, layout.length, layout.packet.version)
+        for layout in TELECOMMANDS.values()
+    ),
+    _HeaderForm(UP.to_bytes(2, "big"), _SHORTEST_UNIT, _LONGEST_PACKET, PACKET_VERSION),
+)
+
+
+def new_token() -> str:
+    """Return a random token: 64 hexadecimal digits."""
+    return secrets.token_hex(_TOKEN_BYTES)
+
+
+class CommandStream:
+    """Splits the bytes of a connection into command packets and checks each byte as it arrives.
+
+    The first byte that cannot belong to the token or a command packet at its position ends the connection, so
+    that another protocol, such as HTTP from a web page, is refused at its first byte. The token is compared
+    in constant time when all of it has arrived: a connection that was closed at the first wrong character
+    would reveal the token one character after another.
+
+    Attributes:
+        authenticated: whether the token has arrived.
+    """
+
+    def __init__(self, token: str) -> None:
+        """Expect a line with the token before the packets."""
+        self._line = token.encode("ascii") + b"\n"
+        self._arrived = bytearray()
+        self.authenticated = False
+
+    def packets(self, data: bytes) -> Iterator[bytes]:
+        """Yield the command packets completed by `data`. Raises StreamError at a wrong byte."""
+        self._arrived += data
+        if not self.authenticated and not self._take_token():
+            return
+        while (length := self._checked_length()) is not None and len(self._arrived) >= length:
+            packet = bytes(self._arrived[:length])
+            del self._arrived[:length]
+            yield packet
+
+    def _take_token(self) -> bool:
+        """Return whether the line with the token is complete, and remove it."""
+        size = len(self._line)
+        line = bytes(self._arrived[:size])
+        if any(byte not in _TOKEN_CHARACTERS for byte in line[: size - 1]):
+            raise StreamError("its first bytes are not the token")
+        if len(line) < size:
+            return False
+        if not hmac.compare_digest(line, self._line):
+            raise StreamError("its first bytes are not the token")
+        del self._arrived[:size]
+        self.authenticated = True
+        return True
+
+    def _checked_length(self) -> int | None:
+        """Return the length of the next packet, or None while its header is incomplete."""
+        header = bytes(self._arrived[:_CHECKED_BYTES])
+        for end in range(1, len(header) + 1):
+            if not any(form.begins(header[:end]) for form in _HEADER_FORMS):
+                raise StreamError(f"no command packet has 0x{header[end - 1]:02x} as its byte {end}")
+        if len(header) < _CHECKED_BYTES:
+            return None
+        return HEADER_BYTES + 1 + int.from_bytes(header[4:HEADER_BYTES], "big")
+
+
+def token_path(keys: Path, port: int) -> Path:
+    """Return the file with the token of the gateway with these keys and this port, for local programs."""
+    return keys / f"gateway-{port}.token"
+
+
+@contextmanager
+def token_file(path: Path, token: str) -> Iterator[None]:
+    """Write a token to a file that only its user can read, and remove the file at the end.
+
+    The stale file of a gateway that was killed is replaced. Raises FlightError if the file cannot be written.
+    """
+    new = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        new.unlink(missing_ok=True)
+        file = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(file, "w", encoding="ascii") as out:
+            out.write(f"{token}\n")
+        new.replace(path)
+    except OSError as error:
+        raise FlightError(f"{path}: the token cannot be written: {error.strerror or error}") from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink()
 
 
 @dataclass(slots=True)
-class _Connection:
-    """What has arrived on a connection, and what is to be sent; `opened` by the monotonic clock, s."""
+class _StationConnection:
+    """State of a connection, with its unsent bytes and its opening time on the monotonic clock, s."""
 
     stream: CommandStream
     opened: float
@@ -55,19 +192,18 @@ class _Connection:
 
 
 class Gateway:
-    """Carries packets between a terminal and the connections of a listener. For one thread.
+    """Relays packets between a terminal and the connections of a listener, for use by one thread.
 
     Attributes:
-        down: telemetry packets handed over.
-        up: commands sent.
-        refused: connections that were closed because they did not send the token, or sent a byte that no
-            command packet has.
+        down: number of telemetry packets relayed.
+        up: number of commands sent.
+        refused: number of connections closed because they did not send the token, or sent an invalid byte.
     """
 
     def __init__(
         self, terminal: Terminal, address: str, token: str, complain: Callable[[str], object]
     ) -> None:
-        """Listen on HOST:PORT of loopback; `complain` gets each refusal in words. Raises UsageError."""
+        """Listen on HOST:PORT of loopback; `complain` receives each refusal. Raises UsageError."""
         self._terminal = terminal
         self._token = token
         self._reported = -_REPORT_S
@@ -76,7 +212,7 @@ class Gateway:
         self._packer = CommandPacker()
         self._asked_at: float | None = None
         self._own: set[int] = set()
-        self._connections: dict[socket.socket, _Connection] = {}
+        self._connections: dict[socket.socket, _StationConnection] = {}
         self.down = self.up = self.refused = 0
         try:
             host, port = host_port(address)
@@ -84,22 +220,22 @@ class Gateway:
                 raise UsageError(f"{address}: plain packets are served on loopback only: give 127.0.0.1:PORT")
             self._listener = socket.create_server((host, port))
         except (OSError, OverflowError, ValueError) as error:
-            raise UsageError(f"{address}: cannot be listened to: {error}") from error
+            raise UsageError(f"{address}: cannot listen there: {error}") from error
         self._listener.setblocking(False)
 
     @property
     def port(self) -> int:
-        """The port that is bound."""
+        """Port of the listener."""
         return int(self._listener.getsockname()[1])
 
     def run(self, ended: Callable[[], bool]) -> None:
-        """Carry until `ended` returns true. Raises FlightError where the line to the satellite is gone."""
+        """Relay until `ended` returns true. Raises FlightError if the line to the satellite was closed."""
         while not ended():
             self.turn(0.2)
 
     def turn(self, seconds: float) -> None:
-        """Carry what there is, or comes within a time."""
-        if self._asked_at is None or time.monotonic() - self._asked_at > _AGAIN_S:
+        """Relay what is received within `seconds`."""
+        if self._asked_at is None or time.monotonic() - self._asked_at > _PING_PERIOD_S:
             self._asked_at = time.monotonic()
             self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
         waiting = [line for line, connection in self._connections.items() if connection.unsent]
@@ -126,7 +262,7 @@ class Gateway:
 
     def _hand_over(self, packet: bytes) -> None:
         if packet[:2] == _VERIFIED and report_of(packet).counter in self._own:
-            return  # of our own ping, which no ground station has sent
+            return  # the report on a ping of the gateway itself
         self.down += 1
         for line, connection in list(self._connections.items()):
             if connection.stream.authenticated:
@@ -141,13 +277,13 @@ class Gateway:
             pass
         except OSError:
             self._drop(line)
-        if len(unsent) > _UNSENT:
-            self._complain("a ground station does not read: disconnected")
+        if len(unsent) > _MAX_UNSENT:
+            self._complain("a ground station does not read its packets: disconnected")
             self._drop(line)
 
     def _receive(self, line: socket.socket) -> None:
         try:
-            data = line.recv(_PIECE)
+            data = line.recv(_READ_BYTES)
         except BlockingIOError:
             return
         except OSError:
@@ -170,15 +306,15 @@ class Gateway:
         line.setblocking(False)
         strangers = self._without_token()
         if len(strangers) >= _MOST_WITHOUT_TOKEN:
-            self._refuse(strangers[0][0], f"{len(strangers)} others have not sent the token either")
-        self._connections[line] = _Connection(CommandStream(self._token), time.monotonic())
+            self._refuse(strangers[0][0], f"{len(strangers)} connections have not sent the token")
+        self._connections[line] = _StationConnection(CommandStream(self._token), time.monotonic())
 
-    def _without_token(self) -> list[tuple[socket.socket, _Connection]]:
-        """Return the connections that have not sent the token, the oldest first."""
+    def _without_token(self) -> list[tuple[socket.socket, _StationConnection]]:
+        """Return the connections that have not sent the token, oldest first."""
         return [(line, one) for line, one in self._connections.items() if not one.stream.authenticated]
 
     def _refuse(self, line: socket.socket, reason: str) -> None:
-        """Close a connection, count it and report why; a flood of strangers is reported once a second."""
+        """Close and count a connection and report why; connections without token at most once a second."""
         self.refused += 1
         now = time.monotonic()
         if self._connections[line].stream.authenticated or now - self._reported > _REPORT_S:

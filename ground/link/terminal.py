@@ -1,4 +1,4 @@
-"""The ground's end of a link: sends protected commands, receives telemetry and what became of a command."""
+"""The ground's end of a link: keys, protected commands up, telemetry and the reports on commands down."""
 
 from __future__ import annotations
 
@@ -28,36 +28,71 @@ from flight.link.frames import (
 )
 from flight.link.process.commanding import Report, Request, Stage
 from flight.link.process.station import host_port
-from flight.link.security import OVERHEAD_BYTES, TELEMETRY_SPIS, Gate, RefusedError, Sealer, Vault
+from flight.link.security import (
+    COMMAND_SPIS,
+    COPIES,
+    OVERHEAD_BYTES,
+    TELEMETRY_SPIS,
+    Association,
+    Gate,
+    RefusedError,
+    Sealer,
+    Vault,
+    new_key,
+)
 from flight.link.telemetry.definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from flight.schema.sections import Link
 from knightcube.errors import FlightError, UsageError
 
 DEFAULTS = Link(keys="-")
-"""Spacecraft and length of frames where nobody says otherwise."""
+"""Default spacecraft identifier and frame length."""
 
 _STORE_EVERY = 256
+"""Telemetry frames between two writes of the anti-replay counters."""
 _ANY_AHEAD = 2**63
-_PIECE = 1 << 16
+"""Width of the anti-replay window, which accepts any gap after lost telemetry."""
+_READ_BYTES = 1 << 16
+
+
+def make_keys(folder: Path) -> list[Path]:
+    """Make new keys in a new folder and return its subfolders for the satellite and the ground.
+
+    Raises UsageError if the folder exists or cannot be written.
+    """
+    keys = {spi: new_key() for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+    try:
+        folder.mkdir(mode=0o700, parents=True)
+    except FileExistsError as error:
+        raise UsageError(f"{folder} exists: keys are never overwritten, give another folder") from error
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be made: {error.strerror or error}") from error
+    ends = [folder / end for end in ("satellite", "ground")]
+    for end in ends:
+        end.mkdir(mode=0o700)
+        vault = Vault(end)
+        for spi, key in keys.items():
+            if vault.write(Association(spi, 1, 0, key)) != len(COPIES):
+                raise UsageError(f"{end}: keys cannot be written")
+    return ends
 
 
 @dataclass(frozen=True, slots=True)
 class TerminalSettings:
-    """What both ends must agree on: spacecraft identifier, bytes of each telemetry frame."""
+    """Spacecraft identifier and length of telemetry frames, which must be the same at both ends."""
 
     spacecraft: int = DEFAULTS.spacecraft
     frame_bytes: int = DEFAULTS.frame_bytes
 
 
 class GroundLine(Protocol):
-    """A way to the satellite."""
+    """A line to the satellite."""
 
     def fileno(self) -> int:
-        """Return the descriptor to wait for."""
+        """Return the file descriptor for `select`."""
 
     def receive(self) -> list[bytes]:
-        """Return the frames that came. Raises FlightError where the line is gone."""
+        """Return the received frames. Raises FlightError if the line was closed."""
 
     def send(self, frame: bytes) -> None:
         """Send a frame. Raises FlightError."""
@@ -67,15 +102,14 @@ class GroundLine(Protocol):
 
 
 class Terminal:
-    """The ground's end. For one thread.
+    """The ground's end of a link, for use by one thread.
 
     Attributes:
-        lost_frames: telemetry frames that the counts say are missing.
-        gate: which telemetry frames were let in, and why others were not.
+        gate: authentication of the telemetry frames, with the counts of refused ones.
     """
 
     def __init__(self, line: GroundLine, vault: Vault, settings: TerminalSettings) -> None:
-        """Take an open line and the ground's keys."""
+        """Use an open line and the ground's keys."""
         self._line = line
         self._vault = vault
         self._settings = settings
@@ -86,24 +120,24 @@ class Terminal:
 
     @property
     def lost_frames(self) -> int:
-        """Frames that are missing between those that came."""
+        """Number of missing telemetry frames according to their counts."""
         return sum(channel.lost_frames for channel in self._channels.values())
 
     def fileno(self) -> int:
-        """Return the line's descriptor, to wait for."""
+        """Return the line's file descriptor for `select`."""
         return self._line.fileno()
 
     def send(self, packet: bytes, spi: int = 1) -> int:
-        """Send a command packet; return the counter of its frame. Raises FlightError."""
+        """Send a command packet and return the counter of its frame. Raises FlightError."""
         sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, TELECOMMAND_MASK))
         return self.send_by(sealer, packet)
 
     def sealer(self, spi: int, block: int) -> Sealer:
-        """Return what protects frames to be sent by `send_by`, with `block` counters reserved at once."""
+        """Return a sealer for `send_by`, which reserves `block` counters at once."""
         return Sealer(self._vault, spi, TELECOMMAND_MASK, block)
 
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
-        """Send a command packet under the key of a sealer."""
+        """Send a command packet with a sealer's key and return the counter of its frame."""
         header = TelecommandHeader(self._settings.spacecraft, 0, self._sequence)
         length = TELECOMMAND_HEADER.size + OVERHEAD_BYTES + len(packet) + CRC_BYTES
         body, counter = sealer.seal(header.pack(length), packet)
@@ -112,19 +146,26 @@ class Terminal:
         return counter
 
     def packets(self, seconds: float) -> Iterator[tuple[int, bytes]]:
-        """Yield virtual channel and packet of all telemetry that comes within a time, as it comes."""
+        """Yield virtual channel and packet of all telemetry received within `seconds`."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             if select.select([self._line], [], [], left)[0]:
                 yield from self.take()
 
     def take(self) -> Iterator[tuple[int, bytes]]:
-        """Yield virtual channel and packet of the telemetry that has come."""
+        """Yield virtual channel and packet of the telemetry received since the last call."""
         for frame in self._line.receive():
-            yield from self._open(frame)
+            try:
+                admitted = self.gate.admit(frame)
+            except RefusedError:  # counted by the gate
+                continue
+            channel = admitted.header[1] >> 1 & 7
+            assembler = self._channels.setdefault(channel, PacketAssembler())
+            for packet in assembler.add(admitted.header, admitted.data):
+                yield channel, packet
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
-        """Yield the reports on a command until its last, or until the time is over."""
+        """Yield the reports on a command until the final one, for at most `seconds`."""
         identifier = LAYOUTS[VERIFICATION.name].identifier.to_bytes(2, "big")
         for _, packet in self.packets(seconds):
             if packet[:2] != identifier:
@@ -144,19 +185,9 @@ class Terminal:
         header, protected, _ = open_telemetry(frame, self._settings.spacecraft)
         return header, protected
 
-    def _open(self, frame: bytes) -> Iterator[tuple[int, bytes]]:
-        try:
-            admitted = self.gate.admit(frame)
-        except RefusedError:  # counted by the gate
-            return
-        channel = admitted.header[1] >> 1 & 7
-        assembler = self._channels.setdefault(channel, PacketAssembler())
-        for packet in assembler.add(admitted.header, admitted.data):
-            yield channel, packet
-
 
 def report_of(packet: bytes) -> Report:
-    """Return what a verification packet reports."""
+    """Return the report in a verification packet."""
     (row,) = LAYOUTS[VERIFICATION.name].array(packet)
     stage = Stage(int(row["stage"]))
     name, text = to_text(row["name"]), to_text(row["text"])
@@ -165,10 +196,10 @@ def report_of(packet: bytes) -> Report:
 
 
 class UdpGround:
-    """A frame in each datagram, to and from one address."""
+    """UDP line with one frame per datagram."""
 
     def __init__(self, address: str, listen: str | None = None) -> None:
-        """Send to HOST:PORT; `listen` is the own address where telemetry is sent to. Raises FlightError."""
+        """Send to HOST:PORT and receive at `listen`, by default any free port. Raises FlightError."""
         self._address = host_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
@@ -177,11 +208,11 @@ class UdpGround:
             self._socket.bind(("", 0) if listen is None else host_port(listen))
 
     def fileno(self) -> int:
-        """Return the socket's descriptor."""
+        """Return the socket's file descriptor."""
         return self._socket.fileno()
 
     def receive(self) -> list[bytes]:
-        """Return the datagrams that came."""
+        """Return the received datagrams."""
         found: list[bytes] = []
         with contextlib.suppress(OSError):
             while len(found) < 1024:
@@ -199,29 +230,29 @@ class UdpGround:
 
 
 class StreamGround:
-    """Marked frames in a stream: TCP, or a serial line."""
+    """Stream of frames with sync markers, over TCP or a serial line."""
 
     def __init__(self, name: str, file: int, frame_bytes: int, close: Callable[[], object]) -> None:
-        """Take an open descriptor."""
+        """Use an open file descriptor."""
         self._name = name
         self._file = file
         self._stream: FrameStream = telemetry_stream(frame_bytes)
         self._close = close
 
     def fileno(self) -> int:
-        """Return the descriptor."""
+        """Return the file descriptor."""
         return self._file
 
     def receive(self) -> list[bytes]:
-        """Return the frames that came. Raises FlightError at the stream's end."""
+        """Return the received frames. Raises FlightError at the end of the stream."""
         with _reaching(self._name):
-            data = os.read(self._file, _PIECE)
+            data = os.read(self._file, _READ_BYTES)
         if not data:
             raise FlightError(f"{self._name}: the line was closed")
         return self._stream.add(data)
 
     def send(self, frame: bytes) -> None:
-        """Send a marked frame."""
+        """Send a frame after its sync marker."""
         data = SYNC + frame
         with _reaching(self._name):
             while data:
@@ -238,24 +269,23 @@ def open_terminal(
     """Open HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD. Raises UsageError, FlightError."""
     settings = settings or TerminalSettings()
     vault = Vault(keys)
+    line: GroundLine
     try:
-        line = _open_line(address, settings.frame_bytes, listen)
+        with _reaching(address):
+            if address.startswith("tcp:"):
+                connection = socket.create_connection(host_port(address.removeprefix("tcp:")), timeout=5.0)
+                connection.setblocking(True)
+                close = connection.close
+                line = StreamGround(address, connection.fileno(), settings.frame_bytes, close)
+            elif address.startswith("/"):
+                device, _, baud = address.partition("@")
+                port = serial.Serial(device, int(baud), exclusive=True)
+                line = StreamGround(address, port.fileno(), settings.frame_bytes, port.close)
+            else:
+                line = UdpGround(address, listen)
     except ValueError as error:
         raise UsageError(f"{address}: give HOST:PORT, tcp:HOST:PORT or /dev/FILE@BAUD") from error
     return Terminal(line, vault, settings)
-
-
-def _open_line(address: str, frame_bytes: int, listen: str | None) -> GroundLine:
-    with _reaching(address):
-        if address.startswith("tcp:"):
-            connection = socket.create_connection(host_port(address.removeprefix("tcp:")), timeout=5.0)
-            connection.setblocking(True)
-            return StreamGround(address, connection.fileno(), frame_bytes, connection.close)
-        if address.startswith("/"):
-            device, _, baud = address.partition("@")
-            port = serial.Serial(device, int(baud), exclusive=True)
-            return StreamGround(address, port.fileno(), frame_bytes, port.close)
-    return UdpGround(address, listen)
 
 
 @contextlib.contextmanager

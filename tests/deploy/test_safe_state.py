@@ -17,7 +17,7 @@ from flight.link.commands import ChangeMode, Clear, Command, CommandPacker, Ping
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LAYOUTS, to_text
-from ground.commands.command import exchange
+from ground.link.commanding import exchange
 from ground.telemetry import decode
 from tests.deploy.scripts import DEPLOY, script
 

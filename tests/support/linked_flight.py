@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 
 _START_S, _END_S = 120.0, 30.0
 _RATE = 1_000_000

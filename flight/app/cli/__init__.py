@@ -72,7 +72,7 @@ COMMANDS = {
 """What a board has; the packages of `GROUP` add theirs."""
 
 GROUP = "knightcube.commands"
-"""Entry points: each a table like `COMMANDS` in the package whose modules bear the commands' names."""
+"""Entry points: tables with the purpose and the MODULE:FUNCTION of each command of a package."""
 
 PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
 """How this was started: by its console script or as a module."""
@@ -132,24 +132,25 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, (purpose, module) in _available(words).items():
+    for name, (purpose, target) in _available(words).items():
         command = commands.add_parser(name, help=purpose)
         if words[:1] == [name]:
-            importlib.import_module(module).configure(command)
+            module, _, function = target.partition(":")
+            getattr(importlib.import_module(module), function)(command)
     return parser
 
 
 def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return purpose and module of each command; the start of a flight does not search for other packages."""
-    own = {name: (purpose, f"{__name__}.{name}") for name, purpose in COMMANDS.items()}
+    """Return purpose and MODULE:FUNCTION of each command; other packages are not searched for `own` ones."""
+    own = {name: (purpose, f"{__name__}.{name}:configure") for name, purpose in COMMANDS.items()}
     if words and words[0] in own:
         return own
     others: dict[str, tuple[str, str]] = {}
     for found in metadata.entry_points(group=GROUP):
         if importlib.util.find_spec(found.module.partition(".")[0]) is None:
             continue  # on a board: the installer leaves the ground package out
-        table: dict[str, str] = found.load()
-        others |= {name: (purpose, f"{found.module}.{name}") for name, purpose in table.items()}
+        table: dict[str, tuple[str, str]] = found.load()
+        others |= {name: (purpose, f"{found.module}.{target}") for name, (purpose, target) in table.items()}
     return own | others
 
 

@@ -35,7 +35,7 @@ from flight.link.commands import (
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from ground.commands.command import exchange
+from ground.link.commanding import exchange
 from knightcube.errors import FlightError, UsageError
 
 

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from flight.link.commands import CommandPacker, Point, unpack
-from ground.commands import command
+from flight.link.commands import Point, unpack
+from ground.commands import satellite
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
@@ -25,9 +25,9 @@ BEGUN = np.array([0.5, -0.5, 0.1, 0.7]) / np.linalg.norm([0.5, -0.5, 0.1, 0.7])
 def turned_by(words: list[str]) -> FloatArray:
     """Return the matrix (3, 3), ICRS into body, at `TIME`, of a command that went through its packet."""
     parser = argparse.ArgumentParser()
-    command.configure(parser)
+    satellite.configure_command(parser)
     options = parser.parse_args(["--to", "127.0.0.1:1", "point", *words])
-    arrived = unpack(CommandPacker().pack(command._command_of(options), 1))
+    arrived = unpack(satellite.packet_of(options))
     assert isinstance(arrived, Point)
     return attitude_matrix(law_of(arrived.target, AXES, BEGUN, ORBIT, 300.0)(ORBIT, TIME)[0])
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from flight.link.telemetry.packets import LAYOUTS
-from ground.console.cursor import Cursor
-from ground.console.history import History
-from ground.console.instant import Instant, values
+from ground.console.history import History, PageCursor, PageState, values
 from ground.telemetry import Run, read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -65,14 +63,14 @@ def test_a_peak_among_gaps_is_not_lost() -> None:
 
 
 def test_an_instant_shows_what_had_come_and_each_event_once(history: History, run: Run) -> None:
-    instant = Instant(history)
+    instant = PageState(history)
     seen = [instant.at(int(time * 1e9), LAYOUTS) for time in (0.0, 2.0, 4.0, 99.0)]
     assert [state["again"] for state in seen] == [True, False, False, False]
     events = [event for state in seen for event in state["listed"].get("event", [])]
     assert events == [values(row) for row in run["event"]]
     assert seen[1]["newest"]["control"]["time_ns"] <= 2 * 10**9
     assert "run" not in seen[1]["newest"], "nothing new"
-    instant.forget()
+    instant.reset()
     assert instant.at(LATER, LAYOUTS)["newest"]["control"] == values(run["control"][-1])
 
 
@@ -81,8 +79,8 @@ def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: R
     for until in (1_000_000_000, 3_300_000_000):
         with History() as then:
             then.append({n: rows[rows["time_ns"] <= until] for n, rows in run.flight.packets.items()})
-            live = Instant(then).at(then.span_ns[1], LAYOUTS)
-        assert Instant(history).at(until, LAYOUTS) == live
+            live = PageState(then).at(then.span_ns[1], LAYOUTS)
+        assert PageState(history).at(until, LAYOUTS) == live
 
 
 @pytest.mark.parametrize(
@@ -90,13 +88,13 @@ def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: R
     ["", "[]", "null", '{"at": NaN, "speed": 1}', '{"at": 1, "speed": -1}', '{"at": 1, "speed": 1e9}', "{}"],
 )
 def test_a_cursor_takes_no_nonsense(message: str) -> None:
-    cursor = Cursor()
+    cursor = PageCursor()
     assert not cursor.obey(message, 0.0)
     assert cursor.live
 
 
 def test_a_cursor_moves_at_its_speed_stays_within_and_goes_live_again() -> None:
-    cursor, span = Cursor(), (0, 10 * 10**9)
+    cursor, span = PageCursor(), (0, 10 * 10**9)
     assert cursor.at_ns(span, 5.0) == span[1]
     assert cursor.obey('{"at": 2.0, "speed": 3.0}', 100.0)
     assert [cursor.at_ns(span, now) for now in (100.0, 101.0, 200.0)] == [2 * 10**9, 5 * 10**9, span[1]]

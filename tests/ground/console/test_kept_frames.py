@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.console.kept_frames import FrameFolder, binned, pixels_of, png, stretched
+from ground.console.surroundings import FrameFolder, binned, pixels_of, png, stretched
 from knightcube.astro.arrays import Image
 from knightcube.vision.camera.images import portable_grey_map
 

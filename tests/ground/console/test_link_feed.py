@@ -10,9 +10,8 @@ import pytest
 
 from flight.link.commands import ChangeMode, CommandPacker
 from flight.link.modes import Mode
-from ground.console import link_feed
-from ground.console.commanding import Commanding
-from ground.console.link_feed import LinkFeed
+from ground.console import commanding
+from ground.console.commanding import CommandForms, LinkFeed
 from ground.xtce import TELECOMMANDS
 from knightcube.errors import FlightError, UsageError
 from tests.flight.link.process.both_ends import BothEnds
@@ -65,14 +64,14 @@ def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dic
 
 
 def test_the_forms_of_a_link_schedule_a_command_and_list_it(satellite: Satellite) -> None:
-    forms = Commanding(satellite.feed.send, TELECOMMANDS)
+    forms = CommandForms(satellite.feed.send, TELECOMMANDS)
     given = {"at": "2099-01-01T00:00:00", "words": "slew 0.2"}
-    assert forms.words("schedule", given) == "at 2099-01-01T00:00:00: slew 0.2"
+    assert forms.text("schedule", given) == "at 2099-01-01T00:00:00: slew 0.2"
     assert answered(satellite, lambda: forms.obey("schedule", given))["obeyed"] == 1
     listed = answered(satellite, lambda: forms.obey("list-schedule", {}))
     assert listed["text"] == "1: 2099-01-01T00:00:00Z slew 0.2; 1 scheduled"
     with pytest.raises(UsageError, match="new-key: no such command"):
-        forms.words("new-key", {})
+        forms.text("new-key", {})
 
 
 def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite: Satellite) -> None:
@@ -85,6 +84,6 @@ def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite:
 
 
 def test_without_an_answer_it_says_so(satellite: Satellite, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_feed, "_ANSWER_S", 0.05)
-    with pytest.raises(FlightError, match=r"no answer by the link within 0\.05 s"):
+    monkeypatch.setattr(commanding, "_ANSWER_S", 0.05)
+    with pytest.raises(FlightError, match=r"no answer over the link within 0\.05 s"):
         satellite.feed.send(CommandPacker().pack(ChangeMode(Mode.SAFE), 7))

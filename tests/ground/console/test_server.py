@@ -19,12 +19,11 @@ from flight.link.commands import COMMANDS, Command
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS, crc_of
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from ground.console.access import Access
-from ground.console.commanding import Commanding
+from ground.console.commanding import CommandForms
 from ground.console.history import History
-from ground.console.server import Console, application
-from ground.console.surroundings import NOWHERE, Surroundings
-from ground.watch.tail import LogTail
+from ground.console.server import Access, Console, application
+from ground.console.surroundings import UNKNOWN, FlightSurroundings
+from ground.watch import LogTail
 from tests.ground.report.synthetic import Recipe, make_run
 
 Answer = tuple[int, Any]
@@ -45,9 +44,9 @@ def asked(
     """Serve a run, and return what a client gets that has opened the address, or with `access` has not."""
 
     async def talk(history: History) -> Any:
-        place = Surroundings.of(folder / "config.yaml")
-        console = Console(folder.name, LogTail(folder), history, place, Commanding(send))
-        console.look()
+        place = FlightSurroundings.of(folder / "config.yaml")
+        console = Console(folder.name, LogTail(folder), history, place, CommandForms(send))
+        console.read()
         door = access or Access(lambda token: None)
         server = TestServer(application(console, door), host="127.0.0.1")
         async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:  # also of numeric hosts
@@ -164,7 +163,7 @@ def test_the_address_opens_the_page_for_one_browser_and_then_another_one_is_anno
 def test_every_answer_forbids_frames_bases_and_foreign_forms(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Commanding, "words", lambda *_: 1 / 0)
+    monkeypatch.setattr(CommandForms, "text", lambda *_: 1 / 0)
 
     async def ask(client: TestClient[Any, Any]) -> list[tuple[int, str]]:
         found = []
@@ -206,8 +205,8 @@ def test_the_table_has_every_field_and_every_command(folder: Path) -> None:
     ("query", "complaint"),
     [
         ("packet=none&field=q2&from=0&to=1", "none.q2: no such field"),
-        ("packet=event&field=text&from=0&to=1", "no such number"),
-        ("packet=imu&field=rate&component=3&from=0&to=1", "no such number"),
+        ("packet=event&field=text&from=0&to=1", "no such component"),
+        ("packet=imu&field=rate&component=3&from=0&to=1", "no such component"),
         ("packet=imu&field=rate&from=nan&to=1", "from = 'nan'"),
         ("packet=imu&field=rate&from=0&to=1&points=-3", "points = '-3'"),
     ],
@@ -263,18 +262,18 @@ def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path)
 
     with History() as history:
         feed = Feed()
-        console = Console("link", feed, history, NOWHERE, Commanding(None))
-        heard = console.flight_heard
-        console.look()
-        assert console.flight_heard == heard
+        console = Console("link", feed, history, UNKNOWN, CommandForms(None))
+        heard = console.flight_received
+        console.read()
+        assert console.flight_received == heard
         feed.came = ("link", "health")
-        console.look()
-        assert console.flight_heard > heard
+        console.read()
+        assert console.flight_received > heard
 
 
 def test_a_frame_that_was_not_kept_is_null_and_has_no_picture(folder: Path) -> None:
     assert get(folder, "/api/frame?sequence=7") == (200, None)
-    assert get(folder, "/api/frame.png?sequence=7") == (404, "that frame was not kept")
+    assert get(folder, "/api/frame.png?sequence=7") == (404, "this frame was not kept")
     assert get(folder, "/api/frame?sequence=x")[0] == 400
 
 
@@ -294,10 +293,10 @@ def test_what_is_shown_live_is_whole(folder: Path) -> None:
 
     with History() as history:
         feed, settled = Feed(), []
-        console = Console("run", feed, history, NOWHERE, Commanding(None))
+        console = Console("run", feed, history, UNKNOWN, CommandForms(None))
         for came in ((("control", 100),), (("health", 100), ("control", 125)), (("health", 125),), ()):
             feed.came = came
-            console.look()
+            console.read()
             settled.append(console.settled_ns)
     assert settled == [100, 100, 125, 125]
 
@@ -346,7 +345,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     [
         ("none", {}, "none: no such command"),
         ("slew", {"q2": "0.9"}, "q2 = 0.9 must lie within"),
-        ("slew", {"q2": "much"}, "'much' is no number"),
+        ("slew", {"q2": "much"}, "'much' is not a number"),
         ("ping", {}, "number is missing"),
         ("slew", {"q2": 0.1, "fast": 1}, "no such value: fast"),
         ("slew", "0.1", "a command is"),
@@ -371,7 +370,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
     """On an equinox at noon UTC the Sun stands over the equator, some 2 deg east of Greenwich."""
     shutil.copy(Path(__file__).parents[3] / "config/orbit.yaml", tmp_path / "config.yaml")
     noon = int(datetime(2026, 3, 20, 12, tzinfo=UTC).timestamp() * 1e9)
-    place = Surroundings.of(tmp_path / "config.yaml").at(noon)
+    place = FlightSurroundings.of(tmp_path / "config.yaml").at(noon)
     assert place is not None
     assert place["altitude_km"] == pytest.approx(500.0, abs=25.0)
     assert (place["sun_latitude"], place["sun_longitude"]) == (
@@ -379,10 +378,10 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
         pytest.approx(1.9, abs=0.5),
     )
     # Straight up is away from nadir, and the track passes below the satellite.
-    track = np.array(Surroundings.of(tmp_path / "config.yaml").track(noon))
+    track = np.array(FlightSurroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)
-    coil = Surroundings.of(tmp_path / "config.yaml").coil_dipole
+    coil = FlightSurroundings.of(tmp_path / "config.yaml").coil_dipole
     assert coil == pytest.approx(0.648 * 0.148), "A m^2 of a coil at its limit"
-    unknown = Surroundings.of(tmp_path / "nowhere")
+    unknown = FlightSurroundings.of(tmp_path / "nowhere")
     assert (unknown.at(noon), unknown.track(noon)) == (None, [])

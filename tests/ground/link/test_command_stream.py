@@ -13,7 +13,7 @@ from flight.link.files.units import DOWN, SEGMENT_BYTES, UP, UnitPacker
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import HEADER_BYTES, Packer
-from ground.link.command_stream import CommandStream, StreamError, new_token
+from ground.link.gateway import CommandStream, StreamError, new_token
 from tests.flight.link.telemetry.samples import plain_contents
 
 TOKEN = "0123456789abcdef" * 4

@@ -22,11 +22,8 @@ from flight.link.modes import Mode
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.packets import Packer
 from ground.link import gateway as module
-from ground.link.command_stream import new_token
-from ground.link.gateway import Gateway
-from ground.link.keys import make_keys
-from ground.link.terminal import Terminal
-from ground.link.token_file import token_file, token_path
+from ground.link.gateway import Gateway, new_token, token_file, token_path
+from ground.link.terminal import Terminal, make_keys
 from knightcube.errors import FlightError
 from tests.flight.link.telemetry.samples import plain_contents
 from tests.support import browser

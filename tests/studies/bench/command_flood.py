@@ -21,7 +21,7 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link.commands import CommandPacker, Ping
-from ground.commands.command import exchange
+from ground.link.commanding import exchange
 from knightcube.errors import FlightError
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import free_port
 from tests.support.linked_flight import service

@@ -28,9 +28,8 @@ from flight.link.process import directives
 from flight.link.process.directives import Play, SendFile
 from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
-from ground.link.files import FileSession
-from ground.link.keys import make_keys
-from ground.link.terminal import open_terminal
+from ground.link.commanding import FileSession
+from ground.link.terminal import make_keys, open_terminal
 from tests.studies.fuzz.link_frames import LinkFrames
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
@@ -99,7 +98,7 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
             session.take([(channel, packet)], time.monotonic_ns())
             if packet[:2] == LAYOUTS[LINK.name].identifier.to_bytes(2, "big"):
                 newest = packet
-        session.go_on(time.monotonic_ns())
+        session.transmit(time.monotonic_ns())
     file_bytes = sum(one.done for one in (*session.entity.transfers(), *session.entity.ended))
     session.close(time.monotonic_ns())
     terminal.close()

@@ -29,8 +29,7 @@ from flight.link.process.commanding import ControlLine, Sent
 from flight.link.process.downlink import LogFollower
 from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.security import Vault
-from ground.link.keys import make_keys
-from ground.link.terminal import Terminal, TerminalSettings
+from ground.link.terminal import Terminal, TerminalSettings, make_keys
 from tests.flight.link.process.both_ends import SETTINGS, GroundWire, Wire
 from tests.manual_clock import ManualClock
 

@@ -28,7 +28,7 @@ from flight.link.process.station import TURN_NS, Station, StationSettings
 from flight.link.security import Vault
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.packets import Packer
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.flight.link.process.both_ends import SETTINGS
 from tests.manual_clock import ManualClock
 from tests.studies.bench.link_kills import Way, killed

@@ -8,7 +8,7 @@ import pytest
 
 from flight.link.process.commanding import Timetable
 from flight.link.security import Vault
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.studies.bench import schedule_kills
 from tests.studies.bench.link_kills import measure
 

@@ -22,8 +22,8 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ground.link.keys import make_keys
-from ground.watch.tail import LogTail
+from ground.link.terminal import make_keys
+from ground.watch import LogTail
 from tests.support.browser import Page, missing, opened
 
 CONFIG = Path("config/step_demo.yaml")

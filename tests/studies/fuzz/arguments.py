@@ -36,7 +36,7 @@ from flight.link.telemetry.log import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from ground.commands import camera as camera_command
-from ground.watch.socket import answers
+from ground.watch import answers
 from knightcube.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE
 from tests.studies.fuzz.harness import Finding
@@ -240,9 +240,9 @@ def _in_folder(folder: Path, drawn: bool) -> Iterator[None]:
         "flight.app.cli._parser": _parser,
         "flight.app.flight.fly": _briefly,
         "ground.commands.camera._frames": _few_frames,
-        "ground.commands.watch.answers": _few_answers,
-        "ground.commands.watch._PING_S": 0.0,
-        "ground.watch.tail.LogTail.silence": math.inf,
+        "ground.commands.station.answers": _few_answers,
+        "ground.commands.station._PING_S": 0.0,
+        "ground.watch.LogTail.silence": math.inf,
         "ground.samples._MAKERS": {name: samples._MAKERS[name] for name in ("stars", "limb")},
         "ground.samples.PIXELS": 64,
         "ground.samples.EARTH_PIXELS": 64,

@@ -18,7 +18,7 @@ from flight.link.frames import TELECOMMAND_HEADER, TELECOMMAND_MASK, Telecommand
 from flight.link.process.station import parser_of
 from flight.link.security import COMMAND_SPIS, OVERHEAD_BYTES, Gate, RefusedError, Sealer, Vault
 from flight.link.telemetry.packets import CRC_BYTES
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 

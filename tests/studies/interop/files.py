@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, write
 from tests.studies.interop.lossy_relay import lossy_relay
 from tests.support.flooded_flight import free_port as free_udp_port

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.support.flights import CONFIG
 
 ROOT = Path(__file__).resolve().parents[4]

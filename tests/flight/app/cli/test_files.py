@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from ground.link.keys import make_keys
+from ground.link.terminal import make_keys
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import free_port
 from tests.support.linked_flight import service
@@ -82,7 +82,7 @@ def test_ctrl_c_keeps_what_came_and_a_second_call_has_the_folder_to_itself(
         assert main([*way, "list"]) == 2
         assert "another process" in capsys.readouterr().err
         process.send_signal(2)
-        assert "the same command goes on" in process.stderr.read()
+        assert "the same command continues" in process.stderr.read()
     assert process.returncode == 1
 
 

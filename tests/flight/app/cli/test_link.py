@@ -25,8 +25,7 @@ from flight.link.process.commanding import Report, Request, Stage
 from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, Packer, walk
-from ground.link.command_stream import new_token
-from ground.link.gateway import Gateway
+from ground.link.gateway import Gateway, new_token
 from ground.link.terminal import (
     DEFAULTS,
     StreamGround,
@@ -202,7 +201,7 @@ def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:
     ("words", "problem"),
     [
         (["command", "--link", "127.0.0.1:5", "ping"], "--link needs --keys"),
-        (["command", "--to", "x", "play", "0", "1"], "goes by --link"),
+        (["command", "--to", "x", "play", "0", "1"], "send it with --link"),
         (["command", "--link", "nowhere", "--keys", "{keys}", "ping"], "give HOST:PORT"),
         (["command", "--link", "127.0.0.1:5", "--keys", "/nowhere", "ping"], "no such folder"),
         (["link", str(CONFIG), "--log", "."], "no `link` section"),

@@ -15,8 +15,7 @@ from flight.link.security import Vault
 from flight.link.telemetry.definitions import COMMAND, LINK, MODE, VERIFICATION
 from flight.link.telemetry.log import SegmentStore
 from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
-from ground.link.keys import make_keys
-from ground.link.terminal import Terminal, TerminalSettings, report_of
+from ground.link.terminal import Terminal, TerminalSettings, make_keys, report_of
 from knightcube.errors import UsageError
 from tests.manual_clock import ManualClock
 

@@ -11,7 +11,7 @@ from flight.link.files.transfer import Progress
 from flight.link.process.commanding import Report
 from flight.link.process.directives import Directive
 from flight.link.process.station import TURN_NS
-from ground.link.files import FileSession, failed
+from ground.link.commanding import FileSession, failed
 from tests.flight.link.process.both_ends import BothEnds
 
 _MOST_S = 7200.0
@@ -58,7 +58,7 @@ class FiledEnds(BothEnds):
         packets = list(self.terminal.take())
         self.packets += packets
         self.session.take(packets, now_ns)
-        self.session.go_on(now_ns)
+        self.session.transmit(now_ns)
         while self.session.entity.ended:
             self.ended.append(self.session.entity.ended.popleft())
 

@@ -109,14 +109,14 @@ def test_only_known_kinds_come_up(link: FiledEnds, name: str) -> None:
     link.until_closed()
     (ended,) = link.ended
     assert ended.condition == 4
-    assert "KIND/NAME" in link.session.said_of(ended)
+    assert "KIND/NAME" in link.session.reason_of(ended)
 
 
 def test_what_came_has_a_limit(link: FiledEnds, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(filing, "MOST_RECEIVED", 5)
     link.session.put(config(link), "configuration/a", link.clock.now_ns())
     link.until_closed()
-    assert "delete what is not needed" in link.session.said_of(link.ended[0])
+    assert "delete what is not needed" in link.session.reason_of(link.ended[0])
 
 
 def test_wrong_units_are_refused_in_words_and_unknown_transfers_reported(link: FiledEnds) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,12 +19,12 @@ import pytest
 
 from flight.link import events
 from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
+from flight.link.telemetry.log import find_segments
 from flight.link.telemetry.packets import Packer
-from ground.commands import watch
-from ground.telemetry import scan
-from ground.watch.plain import PlainLines, state_line
-from ground.watch.tail import LogTail
-from ground.watch.view import View
+from ground.commands import station
+from ground.telemetry import read_run, scan
+from ground.watch import FlightState, LogTail, PlainLines, state_line
+from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.support.furnishings import Listener, answer
@@ -88,7 +91,7 @@ def test_one_look_as_json_has_mode_currents_streams_and_events(growing: Path) ->
 def test_a_log_that_stands_still_is_left_after_the_patience_with_status_1(growing: Path) -> None:
     done = command("watch", growing, "--patience", "0.2")
     assert done.returncode == 1
-    assert "the log just stops" in done.stderr
+    assert "no stop event in the log" in done.stderr
 
 
 def test_an_archive_shows_its_newest_run(growing: Path, tmp_path: Path) -> None:
@@ -130,7 +133,7 @@ def test_ctrl_c_ends_a_watch_in_order(watcher: subprocess.Popen[str], number: si
 
 
 def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same() -> None:
-    packer, view = Packer(), View()
+    packer, view = Packer(), FlightState()
     lines: list[str] = []
     data = event(packer, events.STARTED, 1.0, "\x1b[2Jgone\x07\r")
     data += pack(packer, EVENT, -9e9, severity=200, name="odd", text="ü")
@@ -143,7 +146,7 @@ def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same(
     assert "?[2Jgone??" in text
     assert all(letter.isprintable() or letter == "\n" for letter in text)
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
-    from ground.watch.panel import panel  # noqa: PLC0415 - needs rich
+    from ground.watch_panel import panel  # noqa: PLC0415 - needs rich
 
     console.print(panel(view, 0.0))
     assert "\x1b" not in console.export_text()
@@ -156,9 +159,9 @@ def _wild(kind: str, count: int) -> object:
 
 def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(growing: Path) -> None:
     console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
-    from ground.watch.panel import LISTED_EVENTS, panel  # noqa: PLC0415 - needs rich
+    from ground.watch_panel import LISTED_EVENTS, panel  # noqa: PLC0415 - needs rich
 
-    view = View()
+    view = FlightState()
     view.update(scan((growing / "flight-0001.ccsds").read_bytes()).packets)
     packer = Packer()
     many = b"".join(event(packer, events.MODE, 6.0 + 0.1 * n, f"note {n}") for n in range(30))
@@ -176,7 +179,7 @@ def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(gr
 
 
 def test_a_body_without_an_estimate_has_no_attitude_and_one_without_currents_its_dipole() -> None:
-    view, nothing = View(), [float("nan")] * 4
+    view, nothing = FlightState(), [float("nan")] * 4
     fields = {"quaternion": nothing, "rate": nothing[:3], "target": nothing, "dipole": [0.01, -0.02, 0.0]}
     view.update(scan(pack(Packer(), ATTITUDE, 1.0, mode=2, **fields)).packets)
     assert state_line(view) == "    1.000 s   detumble  dipole +10.00 -20.00 +0.00 mA m^2"
@@ -186,7 +189,7 @@ def test_a_terminal_without_rich_gets_lines_and_the_cure(
     growing: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rich.live", None)
-    assert watch._panel(View(), LogTail(growing)) is None
+    assert station._panel(FlightState(), LogTail(growing)) is None
     assert "pip install 'knightcube-flight[watch]'" in capsys.readouterr().err
 
 
@@ -204,7 +207,7 @@ def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
 def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
     tmp_path: Path, growing: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
+    monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
     log = scan((growing / "flight-0001.ccsds").read_bytes()).packets
     control = log["control"][-1:].tobytes()
@@ -220,15 +223,84 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
 
 
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
+    monkeypatch.setattr("ground.commands.station._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
     threading.Timer(0.2, listener.will_say, [b"x"]).start()
     done = command("watch", tmp_path / "socket", "--patience", "0.2")
     assert done.returncode == 1
     assert "  hold  answered in " in done.stdout
-    assert done.stderr.endswith("no answer any more\n")
+    assert done.stderr.endswith("no further answer\n")
 
 
 def test_what_is_neither_a_run_nor_a_socket_is_refused(tmp_path: Path) -> None:
     done = command("watch", tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
+
+
+@pytest.mark.parametrize("step", [997, 20_000, 10**9])
+def test_every_packet_comes_once_and_in_order(run: Path, tmp_path: Path, step: int) -> None:
+    data = (run / "flight-0001.ccsds").read_bytes()
+    path = tmp_path / "flight-0001.ccsds"
+    path.touch()
+    tail, came = LogTail(tmp_path), []
+    for start in range(0, len(data), step):
+        with path.open("ab") as file:
+            file.write(data[start : start + step])
+        came.append(tail.new())
+    whole = read_run(run).flight.packets
+    for name, rows in whole.items():
+        joined = np.concatenate([found[name] for found in came])
+        np.testing.assert_array_equal(joined["time_ns"], rows["time_ns"])
+    assert all(not len(rows) for rows in tail.new().values())
+
+
+def test_the_next_segment_is_read_when_it_begins_and_the_end_of_the_last_is_not_lost(
+    run: Path, tmp_path: Path
+) -> None:
+    data = (run / "flight-0001.ccsds").read_bytes()
+    first, second = (tmp_path / f"flight-{number}.ccsds" for number in ("9999", "10000"))
+    first.write_bytes(data[:5000])
+    tail = LogTail(tmp_path)
+    count = sum(map(len, tail.new().values()))
+    with first.open("ab") as file:
+        file.write(data[5000:9000])
+    second.write_bytes(data[9000:])
+    count += sum(map(len, tail.new().values()))
+    assert count == sum(read_run(run).flight.counts.values())
+    assert find_segments(tmp_path, "flight") == [first, second]
+
+
+def test_a_segment_that_is_dropped_meanwhile_is_passed_over(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "flight-0001.ccsds", tmp_path)
+    tail = LogTail(tmp_path)
+    tail.new()
+    (tmp_path / "flight-0001.ccsds").rename(tmp_path / "flight-0007.ccsds")
+    assert len(tail.new()["control"]) == 61
+
+
+def test_silence_is_counted_from_the_last_byte_and_of_an_old_log_from_its_file(
+    run: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "flight-0001.ccsds"
+    data = (run / "flight-0001.ccsds").read_bytes()
+    path.write_bytes(data[:3000])
+    os.utime(path, (time.time() - 500.0,) * 2)
+    tail = LogTail(tmp_path)
+    tail.new()
+    assert tail.silence == pytest.approx(500.0, abs=5.0)
+    with path.open("ab") as file:
+        file.write(data[3000:])
+    tail.new()
+    assert tail.silence < 5.0
+
+
+def test_a_folder_without_a_log_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no flight log"):
+        LogTail(tmp_path)
+    with pytest.raises(UsageError, match="no such folder"):
+        LogTail(tmp_path / "none")

@@ -1,0 +1,587 @@
+"""Commands to a flight: `flight command`, `flight parameters` and `flight files`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import select
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.app.run import utc_ns
+from flight.app.service import EndingSignals
+from flight.link.commands import (
+    COMMANDS,
+    LAYOUTS,
+    PING,
+    POINT,
+    SAFE,
+    Command,
+    CommandError,
+    CommandPacker,
+    DumpParameters,
+    LoadParameters,
+    Ping,
+    Point,
+    command_of,
+    shown,
+)
+from flight.link.files.store import Store, files_folder
+from flight.link.files.transfer import Progress
+from flight.link.modes import Mode
+from flight.link.process import directives
+from flight.link.process.commanding import Report, Stage
+from flight.link.process.directives import (
+    CancelFile,
+    DeleteFile,
+    Deletion,
+    Directive,
+    ListFiles,
+    Listing,
+    Play,
+    Scheduled,
+    SendFile,
+    Stop,
+    UseFile,
+)
+from flight.link.process.filing import KINDS, LISTING
+from flight.link.security import COMMAND_SPIS, TELEMETRY_SPIS, Vault
+from flight.link.telemetry.definitions import (
+    COMMAND,
+    PARAMETER_FIELDS,
+    PARAMETER_KEYS,
+    PARAMETERS,
+    VERIFICATION,
+    Field,
+    Packet,
+    crc_of,
+    problem_of,
+)
+from flight.link.telemetry.packets import LAYOUTS as TELEMETRY_LAYOUTS
+from flight.link.telemetry.packets import TelemetryError, to_text
+from flight.schema.document import read_document, read_text, to_yaml
+from ground.documentation import meaning_of
+from ground.link.commanding import (
+    FileSession,
+    add_link_options,
+    change_key,
+    exchange,
+    failed,
+    obeyed,
+    sha256_of,
+    terminal_of,
+)
+from ground.link.commanding import command as send
+from ground.link.terminal import Terminal, report_of
+from ground.telemetry import decode
+from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+
+Object = dict[str, Any]
+_DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
+_ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name == "table"}
+_RATE = 20_000.0
+"""Default rate of frames up (bytes/s)."""
+_SILENCE_S = 60.0
+"""Default time without a packet after which a file command fails (s)."""
+_TURN_S = 0.01
+"""Time to wait for packets before due units are sent (s)."""
+_SHOW_S = 1.0
+"""Time between two lines of progress (s)."""
+_LINGER_S = 0.5
+"""Time after a transfer (s) during which the other end may request the last answer again."""
+
+
+def _add_way(parser: argparse.ArgumentParser, timeout: float) -> None:
+    """Add the options that select a flight and the time to wait for its answer."""
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument(
+        "--to", metavar="SOCKET", help="UNIX socket of the flight, or its UDP address HOST:PORT on a bench"
+    )
+    add_link_options(parser, way)
+    _add_spi(parser)
+    parser.add_argument(
+        "--timeout", type=float, default=timeout, metavar="S", help=f"time to wait (default {timeout:g} s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def _add_spi(parser: argparse.ArgumentParser) -> None:
+    text = "key of the commands on the link (default %(default)s)"
+    parser.add_argument("--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help=text)
+
+
+def configure_command(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight command` to the parser."""
+    parser.description = (
+        "Send a command to a flight that accepts commands (`commands` in its configuration) and print its "
+        "answer. Exit status 0 if the flight obeyed, 1 if it refused or did not answer."
+    )
+    _add_way(parser, 2.0)
+    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    for packet in COMMANDS:
+        _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
+    play = words.add_parser("play", help="with --link: play back a part of the archive")
+    play.add_argument("begin", type=float, metavar="BEGIN", help="mission time, s")
+    play.add_argument("end", type=float, metavar="END", help="mission time, s")
+    play.add_argument(
+        "--run", type=int, default=0, metavar="N", help="run of the archive (default the newest)"
+    )
+    words.add_parser("stop-playback", help="with --link: end the playback")
+    timed = words.add_parser("schedule", help="with --link: execute a command at a UTC")
+    timed.add_argument("at", metavar="UTC", help="such as 2026-11-23T21:00:00")
+    timed.add_argument("words", nargs="+", metavar="WHAT", help="a command, such as slew 0.2")
+    deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
+    deleted.add_argument("number", type=int, metavar="N", help="number in list-schedule; 0 deletes all")
+    words.add_parser("list-schedule", help="with --link: show the scheduled commands")
+    key = words.add_parser("new-key", help="with --link: change a key at both ends")
+    key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
+    parser.set_defaults(command=run_command)
+
+
+def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
+    """Add the arguments of one command from the table of telecommands."""
+    parser.description = f"{packet.meaning}. Hazard: {packet.hazard or 'none'}."
+    if packet is POINT:
+        parser.description = (
+            "Point to nadir, velocity or sun; to inertial QX QY QZ QW, an attitude from ICRS into the body "
+            "frame, scalar last; to ground LAT LON, degrees; or to object, the moving object that the star "
+            f"camera detects in its field of view, or near RA DEC, degrees. Hazard: {POINT.hazard}."
+        )
+        text = "numbers of inertial, ground and object"
+        parser.add_argument("goal", choices=[goal.label for goal in Goal])
+        parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help=text)
+        parser.add_argument(
+            "--roll", type=float, metavar="DEG", help="about the pointing axis (default free)"
+        )
+        return
+    for field in packet.fields if packet is not PING else ():
+        _add_field(parser, field, optional=packet is SAFE)
+
+
+def _add_field(parser: argparse.ArgumentParser, field: Field, optional: bool) -> None:
+    meaning = meaning_of(replace(field, states=())).replace("%", "%%")
+    if field.states:
+        parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
+    elif field.kind.startswith("S"):
+        parser.add_argument(field.name, nargs="?" if optional else None, default="", help=meaning)
+    else:
+        parser.add_argument(field.name, type=float if field.kind.startswith("f") else int, help=meaning)
+
+
+def run_command(options: argparse.Namespace) -> int:
+    """Send the command, wait and print the answer."""
+    if options.link is not None:
+        return _command_by_link(options)
+    if options.what in _DIRECTIVES:
+        raise UsageError(f"{options.what}: is a command of the link itself, send it with --link")
+    data = packet_of(options)
+    raw = exchange(options.to, data, options.timeout)
+    try:
+        (row,) = decode(raw)[COMMAND.name]
+        mode = Mode(int(row["mode"]))
+    except (TelemetryError, ValueError) as error:
+        raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
+    done, text = bool(row["obeyed"]), shown(to_text(row["text"]))
+    if options.json:
+        facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
+        sys.stdout.write(json.dumps(facts) + "\n")
+    else:
+        sys.stdout.write(f"{'obeyed' if done else 'refused'}: {text}; mode {mode.label}\n")
+    return 0 if done else 1
+
+
+def _command_by_link(options: argparse.Namespace) -> int:
+    """Send the command in protected frames and print each stage of its verification."""
+    terminal = terminal_of(options)
+
+    def show(report: Report) -> None:
+        if not options.json:
+            sys.stdout.write(f"{report.stage.name.lower()}: {report.text}\n")
+            sys.stdout.flush()
+
+    try:
+        if options.what == "new-key":
+            vault = Vault(options.keys)
+            reports = change_key(terminal, vault, options.changed, options.spi, options.timeout, show)
+        else:
+            reports = send(terminal, packet_of(options), options.spi, options.timeout, show)
+    finally:
+        terminal.close()
+    done = obeyed(reports)
+    if options.json:
+        stages = [{"stage": report.stage.name.lower(), "text": report.text} for report in reports]
+        facts = {"obeyed": done, "counter": reports[-1].counter, "stages": stages}
+        sys.stdout.write(json.dumps(facts) + "\n")
+    return 0 if done else 1
+
+
+def packet_of(options: argparse.Namespace) -> bytes:
+    """Return the packet of the typed command; its time makes it unique. Raises UsageError."""
+    try:
+        match options.what:
+            case "play":
+                return directives.pack(Play(options.run, options.begin, options.end), utc_ns())
+            case "stop-playback":
+                return directives.pack(Stop(), utc_ns())
+            case "schedule":
+                return directives.pack(Scheduled(options.at, " ".join(options.words)), utc_ns())
+            case "unschedule":
+                return directives.pack(Deletion(options.number), utc_ns())
+            case "list-schedule":
+                return directives.pack(Listing(), utc_ns())
+            case _:
+                return CommandPacker().pack(_command_of(options), utc_ns())
+    except CommandError as error:
+        raise UsageError(str(error)) from error
+
+
+def _command_of(options: argparse.Namespace) -> Command:
+    packet = LAYOUTS[options.what].packet
+    if packet is PING:
+        return Ping(os.getpid() & 0xFFFFFFFF)
+    if packet is POINT:
+        goal = Goal.named(options.goal)
+        numbers = options.numbers if goal is Goal.INERTIAL else map(math.radians, options.numbers)
+        roll = None if options.roll is None else math.radians(options.roll)
+        return Point(PointingTarget(goal, tuple(numbers), roll))
+    fields = {}
+    for field in packet.fields:
+        value = getattr(options, field.name)
+        numbers_by_label = {label: number for number, label in field.states}
+        fields[field.name] = numbers_by_label[value] if field.states else value
+    return command_of(packet, fields)
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterTable:
+    """A table of parameters as reported by a flight."""
+
+    values: dict[str, float]
+    crc: int
+    loads: int
+    origin: str
+    kept: bool
+
+    @classmethod
+    def of(cls, row: np.void) -> ParameterTable:
+        """Return the table of a packet."""
+        values = {
+            key: float(row[field.name]) for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True)
+        }
+        origin = _ORIGINS["table"].get(int(row["table"]), "unknown")
+        return cls(values, int(row["crc"]), int(row["loads"]), origin, bool(row["kept"]))
+
+
+def configure_parameters(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight parameters` to the parser."""
+    parser.description = (
+        "Show the table of parameters that a flight uses. With NAME=VALUE or --load, load another table: the "
+        "flight accepts or refuses it as a whole, and only if its table has not changed meanwhile. It keeps "
+        "the new table for its next starts. Exit status 0 if done, 1 if the flight refused or did not answer."
+    )
+    parser.epilog = "example: python -m flight parameters --to runs/socket modes.tumble_rate=0.3"
+    _add_way(parser, 4.0)
+    parser.add_argument("--load", type=Path, metavar="FILE", help="YAML file of --save with all parameters")
+    parser.add_argument("--save", type=Path, metavar="FILE", help="write the table in use to this file")
+    parser.add_argument("changes", nargs="*", metavar="NAME=VALUE", help="such as modes.tumble_rate=0.3")
+    parser.set_defaults(command=run_parameters)
+
+
+def run_parameters(options: argparse.Namespace) -> int:
+    """Request the table, change it if asked to, and print the table in use."""
+    if not 0.0 < options.timeout < float("inf"):
+        raise UsageError(f"--timeout {options.timeout}: must be a positive number of seconds")
+    file = _parameters_in(options.load) if options.load is not None else None
+    changes = dict(map(_change, options.changes))
+    before, _ = _ask(options, DumpParameters())
+    if before is None:
+        raise FlightError("the flight sent no table of parameters: repeat it or use a longer --timeout")
+    wanted = {**(file or before.values), **changes}
+    if problem := problem_of(wanted):
+        raise UsageError(problem)
+    flown, refused = before, ""
+    if wanted != before.values:
+        _, refused = _ask(options, LoadParameters(before.crc, tuple(wanted[key] for key in PARAMETER_KEYS)))
+        flown = (_ask(options, DumpParameters())[0] or before) if not refused else before
+        if not refused and flown.crc != crc_of([wanted[key] for key in PARAMETER_KEYS]):
+            raise FlightError(
+                f"the flight uses table {flown.crc:08x}, not the one that was sent: check it with another "
+                "call"
+            )
+    _show(flown, before, refused, options.json)
+    if options.save is not None:
+        sections: dict[str, dict[str, float]] = {}
+        for key, value in flown.values.items():
+            section, _, name = key.partition(".")
+            sections.setdefault(section, {})[name] = value
+        options.save.write_text(to_yaml(sections), encoding="utf-8")
+    return 1 if refused else 0
+
+
+def _ask(options: argparse.Namespace, command: Command) -> tuple[ParameterTable | None, str]:
+    """Send a command and return the table received with its answer, and the reason for a refusal."""
+    packet = CommandPacker().pack(command, utc_ns())
+    if options.link is not None:
+        return _ask_by_link(options, packet, wants_table=isinstance(command, DumpParameters))
+    found = decode(exchange(options.to, packet, options.timeout))
+    answers, tables = found[COMMAND.name], found[PARAMETERS.name]
+    if not len(answers):
+        raise FlightError(f"{options.to}: its answer has no report on the command")
+    refused = "" if answers[-1]["obeyed"] else shown(to_text(answers[-1]["text"]))
+    return (ParameterTable.of(tables[-1]) if len(tables) else None), refused
+
+
+def _ask_by_link(
+    options: argparse.Namespace, packet: bytes, wants_table: bool
+) -> tuple[ParameterTable | None, str]:
+    """Send in protected frames; the table is in the live telemetry, before or after the verification."""
+    table: ParameterTable | None = None
+    refused: str | None = None
+    kinds = {TELEMETRY_LAYOUTS[kind.name].identifier: kind for kind in (PARAMETERS, VERIFICATION)}
+    terminal = terminal_of(options)
+    try:
+        counter = terminal.send(packet, options.spi)
+        for _, data in terminal.packets(options.timeout):
+            kind = kinds.get(int.from_bytes(data[:2], "big"))
+            if kind is PARAMETERS:
+                (row,) = decode(data)[kind.name]
+                table = ParameterTable.of(row)
+            elif kind is VERIFICATION:
+                report = report_of(data)
+                if (report.counter, report.spi) == (counter, options.spi) and report.stage.final:
+                    refused = "" if report.stage is Stage.COMPLETED else report.text
+            if refused or (refused is not None and (table is not None or not wants_table)):
+                break
+    finally:
+        terminal.close()
+    if refused is None:
+        raise FlightError(f"{options.link}: no answer within {options.timeout:g} s")
+    return table, refused
+
+
+def _show(table: ParameterTable, before: ParameterTable, refused: str, as_json: bool) -> None:
+    if as_json:
+        facts: Object = {
+            "crc": f"{table.crc:08x}",
+            "table": table.origin,
+            "loads": table.loads,
+            "kept": table.kept,
+            "refused": refused,
+            "values": table.values,
+        }
+        sys.stdout.write(json.dumps(facts) + "\n")
+        return
+    for key, field in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
+        low, high = field.valid or (-np.inf, np.inf)
+        old = "" if table.values[key] == before.values[key] else f"   was {before.values[key]:g}"
+        sys.stdout.write(f"{key:22s} {table.values[key]:<10g} {field.unit:9s} {low:g} to {high:g}{old}\n")
+    kept = "kept for the next starts" if table.kept else "not kept: this flight has no state folder"
+    loads = f"{table.loads} loads so far"
+    sys.stdout.write(f"table {table.crc:08x}, from the {table.origin}, {loads}; {kept}\n")
+    if refused:
+        sys.stderr.write(f"flight: refused: {refused}\n")
+
+
+def _change(text: str) -> tuple[str, float]:
+    """Return name and value of NAME=VALUE. Raises UsageError."""
+    key, _, value = text.partition("=")
+    if key not in PARAMETER_KEYS:
+        raise UsageError(f"{key}: no such parameter: {', '.join(PARAMETER_KEYS)}")
+    try:
+        return key, float(value)
+    except ValueError as error:
+        raise UsageError(f"{text}: give NAME=VALUE with a number") from error
+
+
+def _parameters_in(path: Path) -> dict[str, float]:
+    """Return the table in a file. Raises ConfigError, UsageError."""
+    document = read_document(read_text(path), str(path))
+    values: dict[str, float] = {}
+    for section, entries in document.values.items():
+        if not isinstance(entries, dict):
+            raise document.error(section, "must be a section of parameters, as --save writes it")
+        for name, value in entries.items():
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise document.error(f"{section}.{name}", f"is {value!r}: must be a number")
+            values[f"{section}.{name}"] = float(value)
+    if problem := problem_of(values):
+        raise UsageError(f"{path}: {problem}")
+    return values
+
+
+def configure_files(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight files` to the parser."""
+    parser.description = (
+        "List the files of a satellite, get files from it and put files on it over its link. Received data "
+        "is kept after Ctrl-C, and the same command later continues. Exit status 1 if a file is incomplete."
+    )
+    add_link_options(parser, parser.add_mutually_exclusive_group(required=True))
+    _add_spi(parser)
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        metavar="DIR",
+        help="folder of received files and open transfers (default files beside the keys)",
+    )
+    text = "maximum rate of frames to the satellite, bytes/s (default %(default)g)"
+    parser.add_argument("--rate", type=float, default=_RATE, metavar="B", help=text)
+    text = "time without a packet after which the command fails (default %(default)g s)"
+    parser.add_argument("--timeout", type=float, default=_SILENCE_S, metavar="S", help=text)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    listed = words.add_parser("list", help="list the files on board")
+    listed.add_argument("under", nargs="?", default="", metavar="BEGINNING", help="beginning of their names")
+    got = words.add_parser("get", help="get files from the satellite")
+    got.add_argument("names", nargs="+", metavar="NAME", help="name in the list")
+    for word, purpose, text in (
+        ("put", "put a file on the satellite", "the file"),
+        ("use", "use a file that was put on the satellite", "local copy of the file, whose SHA-256 is sent"),
+    ):
+        placed = words.add_parser(word, help=purpose)
+        placed.add_argument("kind", choices=KINDS, help="purpose of the file")
+        placed.add_argument("path", type=Path, metavar="FILE", help=text)
+    deleted = words.add_parser("delete", help="delete a file that was put on the satellite")
+    deleted.add_argument("name", metavar="NAME", help="name in the list")
+    cancelled = words.add_parser("cancel", help="cancel a transfer on board")
+    text = "sender: 1 for the satellite, 2 for the ground"
+    cancelled.add_argument("source", type=int, metavar="ENTITY", help=text)
+    cancelled.add_argument("number", type=int, metavar="N", help="number in the packet transfer")
+    parser.set_defaults(command=run_files)
+
+
+def run_files(options: argparse.Namespace) -> int:
+    """Carry out the file command and print its result."""
+    for name in ("rate", "timeout"):
+        if not 0.0 < getattr(options, name) < float("inf"):
+            raise UsageError(f"--{name} {getattr(options, name)}: must be a positive number")
+    terminal = terminal_of(options)
+    try:
+        store = Store(options.folder or files_folder(options.keys))
+        with store.owned(), EndingSignals() as signals:
+            session = FileSession(terminal, store, options.spi, options.rate, time.monotonic_ns())
+            work = _FileWork(session, terminal, options.timeout, lambda: signals.received)
+            try:
+                facts = work.obey(options)
+            finally:
+                session.close(time.monotonic_ns())
+    finally:
+        terminal.close()
+    if options.json:
+        sys.stdout.write(json.dumps(facts) + "\n")
+    else:
+        for one in facts.get("files", ()):
+            sys.stdout.write(f"{one['bytes']:>12} {one['name']}\n")
+        if "text" in facts:
+            sys.stdout.write(f"{facts['text']}\n")
+    return 0
+
+
+class _FileWork:
+    """One file command with a session."""
+
+    def __init__(
+        self, session: FileSession, terminal: Terminal, patience_s: float, ended: Callable[[], bool]
+    ) -> None:
+        self._session, self._terminal = session, terminal
+        self._patience_s, self._ended = patience_s, ended
+        self._shown_s = 0.0
+
+    def obey(self, options: argparse.Namespace) -> Object:
+        """Return the result of the command. Raises FlightError."""
+        match options.what:
+            case "list":
+                path = self._get(ListFiles(options.under), LISTING)
+                listing: Object = json.loads(path.read_bytes())
+                return listing | {"text": f"{listing['free']} bytes are free"}
+            case "get":
+                paths = [self._get(SendFile(name), name) for name in options.names]
+                return {"files": [self._facts(path) for path in paths]}
+            case "put":
+                return self._put(options.path, f"{options.kind}/{options.path.name}")
+            case "use":
+                name = f"received/{options.kind}/{options.path.name}"
+                return self._command(UseFile(name, sha256_of(options.path)))
+            case "delete":
+                return self._command(DeleteFile(options.name))
+            case _:
+                return self._command(CancelFile(options.source, options.number))
+
+    def _facts(self, path: Path) -> Object:
+        name, size = path.relative_to(self._session.received).as_posix(), path.stat().st_size
+        return {"name": name, "bytes": size, "path": str(path), "sha256": sha256_of(path).hex()}
+
+    def _get(self, directive: Directive, name: str) -> Path:
+        """Return the path of a file that was received completely."""
+        self._session.ask(directive, time.monotonic_ns())
+        completed = False
+        while not completed:
+            self._turn(name)
+            for report in self._session.reports():
+                if problem := failed([report]):
+                    raise FlightError(problem)
+                # The satellite completes when the file is here, which may be the work of an earlier session.
+                completed |= report.stage is Stage.COMPLETED
+            for progress in self._new_endings(name):
+                self._check(progress)
+                completed = True
+        until = time.monotonic() + _LINGER_S
+        while time.monotonic() < until and self._session.entity.transfers():
+            self._turn("")
+        return self._session.received / name
+
+    def _put(self, path: Path, name: str) -> Object:
+        begun = self._session.put(path.absolute(), name, time.monotonic_ns())
+        ended: list[Progress] = []
+        while not ended:
+            self._turn(name)
+            ended = [one for one in self._new_endings(name) if one.number == begun.number]
+        self._check(ended[0])
+        text = f"on board: received/{name}, {begun.size} bytes"
+        digest = sha256_of(path).hex()
+        return {"name": f"received/{name}", "bytes": begun.size, "sha256": digest, "text": text}
+
+    def _command(self, directive: Directive) -> Object:
+        self._session.ask(directive, time.monotonic_ns())
+        while True:
+            self._turn("")
+            reports = self._session.reports()
+            if problem := failed(reports):
+                raise FlightError(problem)
+            if any(report.stage is Stage.COMPLETED for report in reports):
+                return {"text": f"completed: {directive}"}
+
+    def _check(self, progress: Progress) -> None:
+        if progress.condition != 0:
+            raise FlightError(f"{progress.name}: {self._session.reason_of(progress)}")
+
+    def _new_endings(self, name: str) -> list[Progress]:
+        ended = self._session.entity.ended
+        found = [one for one in ended if one.name == name]
+        ended.clear()
+        return found
+
+    def _turn(self, name: str) -> None:
+        """Transfer for a moment. Raises FlightError after a signal or a long silence; data is kept."""
+        if select.select([self._terminal], [], [], _TURN_S)[0]:
+            self._session.take(self._terminal.take(), time.monotonic_ns())
+        now_ns = time.monotonic_ns()
+        self._session.transmit(now_ns)
+        kept = "; the received data is kept, and the same command continues" if name else ""
+        if self._ended():
+            raise FlightError(f"ended by a signal{kept}")
+        if now_ns - self._session.received_ns > self._patience_s * 1e9:
+            raise FlightError(f"no packet for {self._patience_s:g} s{kept}")
+        if name and now_ns * 1e-9 - self._shown_s >= _SHOW_S:
+            self._shown_s = now_ns * 1e-9
+            for one in self._session.entity.transfers():
+                part = f"{one.done} of {one.size} bytes" if one.size else "started"
+                sys.stderr.write(f"flight: {one.name or name}: {part}\n")

@@ -1,0 +1,349 @@
+"""Commands of a ground station: `flight keys`, `flight gateway`, `flight watch` and `flight console`."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import signal
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from flight.app.service import EndingSignals
+from flight.link.telemetry.definitions import STREAMS as STREAM_STATES
+from flight.link.telemetry.log import find_runs
+from ground.commands.options import positive
+from ground.link.commanding import add_link_options, terminal_of
+from ground.link.gateway import ADDRESS, Gateway, new_token, token_file, token_path
+from ground.link.terminal import make_keys
+from ground.watch import (
+    STREAMS,
+    FlightState,
+    LogTail,
+    PlainLines,
+    answers,
+    attitude_text,
+    event_line,
+    named,
+    state_line,
+)
+from knightcube.errors import FlightError, UsageError
+from knightcube.vision.camera import images
+
+if TYPE_CHECKING:
+    from ground.console.server import Console
+
+PORT = 8040
+_READ_S = 0.5
+"""Time between two reads of a growing log (s)."""
+_PING_S = 2.0
+"""Time between two pings of a watched flight (s)."""
+
+
+def configure_keys(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight keys` to the parser."""
+    parser.description = (
+        "Make new keys: FOLDER/satellite for the board, FOLDER/ground for the ground, readable by their "
+        "owner only. Existing keys are never overwritten."
+    )
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a folder that does not exist")
+    parser.set_defaults(command=run_keys)
+
+
+def run_keys(options: argparse.Namespace) -> int:
+    """Make the keys and print their folders."""
+    satellite, ground = make_keys(options.folder)
+    sys.stdout.write(f"for the satellite: {satellite}\nfor the ground: {ground}\n")
+    return 0
+
+
+def configure_gateway(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight gateway` to the parser."""
+    parser.description = (
+        "Connect a satellite's link to a ground station without keys, such as Yamcs: a connection to the "
+        "address receives every telemetry packet and may send command packets, which are sent up in "
+        "protected frames. The first line of a connection must be a token. It is new at each start and is "
+        "written to the file KEYS/gateway-PORT.token; a connection that sends anything else is closed. "
+        "Loopback only. Ctrl-C ends."
+    )
+    add_link_options(parser, parser.add_mutually_exclusive_group(required=True))
+    text = "address for ground stations (default %(default)s)"
+    parser.add_argument("--serve", default=ADDRESS, metavar="HOST:PORT", help=text)
+    parser.set_defaults(command=run_gateway)
+
+
+def run_gateway(options: argparse.Namespace) -> int:
+    """Relay packets until a signal."""
+    token = new_token()
+    with contextlib.closing(terminal_of(options)) as terminal:
+        gateway = Gateway(
+            terminal, options.serve, token, lambda text: sys.stderr.write(f"flight: gateway: {text}\n")
+        )
+        path = token_path(options.keys, gateway.port)
+        with contextlib.closing(gateway), EndingSignals() as signals, token_file(path, token):
+            sys.stdout.write(f"packets on 127.0.0.1:{gateway.port}, token in {path} (Ctrl-C ends)\n")
+            sys.stdout.flush()
+            gateway.run(lambda: signals.received)
+    return 0
+
+
+def configure_watch(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight watch` to the parser."""
+    parser.description = (
+        "Show a flight in the terminal from its log: mode, attitude, coil currents, devices and events, "
+        "while the log grows or up to its end. A terminal with rich (extra `watch`) shows a panel, "
+        "otherwise plain lines are printed. With a flight's command socket, a ping every two seconds "
+        "requests its state, which is printed as plain lines. Ctrl-C ends. Exit status 0 if the flight has "
+        "ended or after Ctrl-C, 1 if the log stopped growing."
+    )
+    parser.epilog = "example: python -m flight watch runs/demo"
+    parser.add_argument(
+        "flight", metavar="RUN|SOCKET", help="folder of a run or of an archive, a socket, or HOST:PORT"
+    )
+    text = "mission time between plain lines (default %(default)g s)"
+    parser.add_argument("--every", type=positive, default=10.0, metavar="S", help=text)
+    text = "time without new packets before the command ends (default %(default)g s)"
+    parser.add_argument("--patience", type=positive, default=30.0, metavar="S", help=text)
+    parser.add_argument("--plain", action="store_true", help="print plain lines on a terminal too")
+    parser.add_argument("--once", action="store_true", help="print the present state and end")
+    parser.add_argument("--json", action="store_true", help="print the present state as one JSON object")
+    parser.set_defaults(command=run_watch)
+
+
+def run_watch(options: argparse.Namespace) -> int:
+    """Show a flight until it ends, its log stops growing, or a signal."""
+    folder = Path(options.flight)
+    if folder.is_socket() or (":" in options.flight and not folder.exists()):
+        return _watch_socket(options)
+    runs = find_runs(folder)
+    tail, state = LogTail(runs[-1] if runs else folder), FlightState()
+    if options.json or options.once:
+        state.update(tail.new())
+        line = state_line(state) + (f"  ended: {state.ended}" if state.ended else "")
+        sys.stdout.write((json.dumps(_facts(state)) if options.json else line) + "\n")
+        return 0
+    with _ending() as ended:
+        shown = None if options.plain or not sys.stdout.isatty() else _panel(state, tail)
+        with shown or _lines(state, tail, options.every) as refresh:
+            refresh()
+            while not (state.ended or tail.silence > options.patience or ended.wait(_READ_S)):
+                refresh()
+    if not state.ended and not ended.is_set():
+        sys.stderr.write(f"flight: no new packet for {tail.silence:.0f} s and no stop event in the log\n")
+        return 1
+    return 0
+
+
+@contextlib.contextmanager
+def _ending() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C or SIGTERM sets; a second signal kills."""
+    ended = threading.Event()
+
+    def end(number: int, _: FrameType | None) -> None:
+        ended.set()
+        signal.signal(number, signal.SIG_DFL)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield ended
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _lines(state: FlightState, tail: LogTail, every: float) -> Iterator[Callable[[], None]]:
+    """Yield a function that prints the new packets as plain lines."""
+    lines = PlainLines(state, every, sys.stdout.write)
+
+    def refresh() -> None:
+        lines.feed(tail.new())
+        sys.stdout.flush()
+
+    yield refresh
+
+
+def _panel(state: FlightState, tail: LogTail) -> contextlib.AbstractContextManager[Callable[[], None]] | None:
+    """Return a context with a function that updates the panel, or None without rich."""
+    try:
+        from rich.live import Live  # noqa: PLC0415 - an extra
+
+        from ground.watch_panel import panel  # noqa: PLC0415
+    except ModuleNotFoundError:
+        sys.stderr.write("flight: a panel needs rich: pip install 'knightcube-flight[watch]'\n")
+        return None
+
+    @contextlib.contextmanager
+    def shown() -> Iterator[Callable[[], None]]:
+        with Live(auto_refresh=False) as live:
+
+            def refresh() -> None:
+                state.update(tail.new())
+                live.update(panel(state, tail.silence), refresh=True)
+
+            yield refresh
+
+    return shown()
+
+
+def _facts(state: FlightState) -> dict[str, Any]:
+    written, streams = state.value("control", "current_written"), None
+    if "health" in state.newest:
+        streams = {name: named(STREAM_STATES, state.value("health", name)) for name in STREAMS}
+    currents = None
+    if written is not None:
+        currents = [float(value) if abs(value) < float("inf") else None for value in written]
+    return {
+        "mission_time_s": state.time,
+        "mode": state.mode or None,
+        "attitude": attitude_text(state) or None,
+        "error_deg": state.error_deg,
+        "currents_a": currents,
+        "streams": streams,
+        "faults": state.faults,
+        "events": [
+            {"time_s": event.time, "severity": event.severity, "name": event.name, "text": event.text}
+            for event in state.events
+        ],
+        "ended": state.ended or None,
+    }
+
+
+def _watch_socket(options: argparse.Namespace) -> int:
+    """Request the state of a flight until it does not answer, or a signal."""
+    once, answered, state = options.once or options.json, False, FlightState()
+    with _ending() as ended:
+        for answer in answers(options.flight, options.patience, ended):
+            answered = True
+            found = state.update(answer.packets)
+            if not options.json:
+                sys.stdout.writelines(f"{event_line(event)}\n" for event in found)
+            facts = {"commands": answer.count, "answered_s": answer.delay}
+            text = f"{state_line(state)}  answered in {1e3 * answer.delay:.1f} ms"
+            sys.stdout.write((json.dumps(_facts(state) | facts) if options.json else text) + "\n")
+            sys.stdout.flush()
+            if once or ended.wait(_PING_S):
+                return 0
+        if not ended.is_set():
+            sys.stderr.write(f"flight: {options.flight}: {'no further' if answered else 'no'} answer\n")
+    return 0 if ended.is_set() else 1
+
+
+def configure_console(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight console` to the parser."""
+    parser.description = (
+        "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
+        "orbit on a map, and forms for commands. A flight in progress is shown live, from its log or over "
+        "its link; a finished run is replayed on the same page. The page is served on loopback only, and "
+        "only to the browser that opens the printed address: its token is good for one browser. Needs the "
+        "extra `ground`. Ctrl-C ends."
+    )
+    parser.epilog = (
+        "examples: python -m flight console runs/demo; "
+        "python -m flight console --fly config/step_demo.yaml runs/live; "
+        "python -m flight console --link 192.0.2.7:5010 --keys keys/ground --config orbit.yaml"
+    )
+    parser.add_argument(
+        "run",
+        metavar="RUN",
+        type=Path,
+        nargs="?",
+        help="folder of a run, or of an archive for its newest run",
+    )
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--to", metavar="SOCKET", help="send commands to the flight's UNIX socket or HOST:PORT")
+    way.add_argument(
+        "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration into RUN in real time"
+    )
+    add_link_options(parser, way)
+    parser.add_argument(
+        "--config", metavar="CONFIG", type=Path, help="with --link: configuration of the flight, for the map"
+    )
+    parser.add_argument(
+        "--frames",
+        metavar="FOLDER",
+        type=Path,
+        help="kept frames of the camera (default those of RUN; with --link as received by `flight files`)",
+    )
+    text = "port of the page, 0 for any (default %(default)s)"
+    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=text)
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.set_defaults(command=run_console)
+
+
+def run_console(options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    try:
+        from aiohttp import web  # noqa: PLC0415 - an extra
+
+        from ground.console.server import Access, application  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        needed = "pip install 'knightcube-flight[ground]'"
+        raise FlightError(f"the console needs {error.name}: {needed}") from error
+    if (options.run is None) == (options.link is None):
+        raise UsageError("give RUN, the folder of a run (with --fly: a new folder), or --link ADDRESS")
+    address = _listening(options.port)
+    with address, ExitStack() as stack:
+        shown = _shown(options, stack)
+        shown.read()
+        page = f"http://127.0.0.1:{address.getsockname()[1]}/"
+        access = Access(lambda token: _print(f"for one more browser: {page}?token={token}"))
+        url = f"{page}?token={access.token}"
+        _print(f"console of {shown.name}, for one browser: {url} (Ctrl-C ends)")
+        if options.open:
+            webbrowser.open(url)
+        web.run_app(application(shown, access), sock=address, print=None, access_log=None)
+    return 0
+
+
+def _print(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
+    """Return the console for the options; `stack` closes its resources."""
+    from ground.console.commanding import CommandForms, LinkFeed, by_socket, flying  # noqa: PLC0415
+    from ground.console.history import History  # noqa: PLC0415
+    from ground.console.server import Console  # noqa: PLC0415
+    from ground.console.surroundings import UNKNOWN, FlightSurroundings, FrameFolder  # noqa: PLC0415
+    from ground.xtce import TELECOMMANDS  # noqa: PLC0415
+
+    history = stack.enter_context(History())
+    if options.link is not None:
+        feed = LinkFeed(terminal_of(options))
+        stack.callback(feed.close)
+        place = UNKNOWN if options.config is None else FlightSurroundings.of(options.config)
+        by_link = CommandForms(feed.send, TELECOMMANDS)
+        return Console(options.link, feed, history, place, by_link, frames=FrameFolder(options.frames))
+    to = options.to
+    if options.fly is not None:
+        to = stack.enter_context(flying(options.fly, options.run))
+    folder = options.run
+    runs = find_runs(folder) if folder.is_dir() else []
+    folder = runs[-1] if runs else folder
+    forms = CommandForms(by_socket(to) if to else None)
+    place = FlightSurroundings.of(folder / "config.yaml")
+    frames = FrameFolder(options.frames or folder / images.KEPT_FRAMES_FOLDER)
+    return Console(folder.name, LogTail(folder), history, place, forms, frames=frames)
+
+
+def _listening(port: int) -> socket.socket:
+    """Return a socket that listens on loopback. Raises UsageError for an invalid or used port."""
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port {port}: must be 0 to 65535")
+    line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        line.bind(("127.0.0.1", port))
+    except OSError as error:
+        line.close()
+        raise UsageError(f"--port {port}: {error.strerror or error}; give another, or 0 for any") from error
+    return line

@@ -1,0 +1,272 @@
+"""State of a flight from its log or its command socket, as lines for the terminal."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.app.run import utc_ns
+from flight.link import events
+from flight.link.commands import CommandPacker, Ping
+from flight.link.telemetry.definitions import COMMAND, EVENT, MODES, SEVERITIES, STEERING, States
+from flight.link.telemetry.log import find_segments
+from flight.link.telemetry.packets import PacketArray, TelemetryError, to_text
+from ground.link.commanding import exchange
+from ground.telemetry import decode, scan
+from knightcube.astro.quaternion import angle_between
+from knightcube.errors import FlightError, UsageError
+
+STREAMS = ("imu", "field", "coils", "power", "camera")
+_KEPT_EVENTS = 200
+_MAX_TIME = 1e15
+"""Mission time (s) above which a time comes from a damaged log."""
+_TIMEOUT_S = 2.0
+"""Time to wait for the answer to a ping (s)."""
+
+
+class LogTail:
+    """Reader of a flight log that may still grow and end in an incomplete packet."""
+
+    def __init__(self, folder: Path) -> None:
+        """Begin at the log's oldest segment. Raises UsageError for a folder without a flight log."""
+        if not folder.is_dir():
+            raise UsageError(f"{folder}: no such folder; give the folder of a run, or a flight's socket")
+        segments = find_segments(folder, "flight")
+        if not segments:
+            raise UsageError(f"{folder}: no flight log (flight-0001.ccsds) in this folder")
+        self._folder = folder
+        self._path = segments[0]
+        self._offset = 0
+        self._rest = b""
+        try:
+            age = max(0.0, time.time() - segments[-1].stat().st_mtime)
+        except OSError:  # deleted meanwhile
+            age = 0.0
+        self._grew = time.monotonic() - age
+
+    @property
+    def silence(self) -> float:
+        """Time since the log last grew, s; at first by the modification time of its file."""
+        return time.monotonic() - self._grew
+
+    def new(self) -> dict[str, PacketArray]:
+        """Return the packets by name that were written since the last call. Raises UsageError."""
+        data = self._rest + self._read()
+        while (following := self._following()) is not None:
+            # The segment is complete: its last packets may have been written since it was read.
+            data += self._read()
+            self._path, self._offset = following, 0
+            data += self._read()
+        found = scan(data)
+        self._rest = data[len(data) - found.truncated_bytes :] if found.truncated_bytes else b""
+        return found.packets
+
+    def _read(self) -> bytes:
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._offset)
+                data = file.read()
+        except FileNotFoundError:  # deleted to keep the log's size budget
+            data = b""
+        except OSError as error:
+            raise UsageError(f"{self._path}: cannot be read: {error.strerror or error}") from error
+        if data and self._offset:
+            self._grew = time.monotonic()
+        self._offset += len(data)
+        return data
+
+    def _following(self) -> Path | None:
+        """Return the next segment, or None for the last one."""
+
+        def number(path: Path) -> int:
+            return int(path.stem.rpartition("-")[2])
+
+        segments = find_segments(self._folder, "flight")
+        return next((path for path in segments if number(path) > number(self._path)), None)
+
+
+@dataclass(frozen=True, slots=True)
+class PingAnswer:
+    """Answer of a flight to a ping.
+
+    Attributes:
+        packets: packets by name; the events are those that no earlier answer contained.
+        count: number of commands since the start of the flight.
+        delay: time until the answer, s.
+    """
+
+    packets: Mapping[str, PacketArray]
+    count: int
+    delay: float
+
+
+def answers(to: str, patience: float, ended: threading.Event) -> Iterator[PingAnswer]:
+    """Yield the answers to pings until none has been received for `patience` s. Raises UsageError."""
+    packer, answered, shown_ns = CommandPacker(), time.monotonic(), -1
+    while not ended.is_set():
+        asked = time.monotonic()
+        ping = packer.pack(Ping(int(asked * 1e3) & 0xFFFFFFFF), utc_ns())
+        try:
+            packets = decode(exchange(to, ping, min(_TIMEOUT_S, patience)))
+            (row,) = packets[COMMAND.name]
+        except UsageError:
+            raise
+        except (FlightError, TelemetryError, ValueError):
+            if time.monotonic() - answered > patience or ended.wait(min(1.0, patience)):
+                return
+            continue
+        answered = time.monotonic()
+        found = packets[EVENT.name]
+        packets[EVENT.name] = found[found["time_ns"] > shown_ns]
+        shown_ns = max([shown_ns, *found["time_ns"].tolist()])
+        yield PingAnswer(packets, int(row["count"]), answered - asked)
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedEvent:
+    """An event of the log, at mission time `time` s."""
+
+    time: float
+    severity: int
+    name: str
+    text: str
+
+
+@dataclass(slots=True)
+class FlightState:
+    """The newest packet of each type, and the newest events.
+
+    Attributes:
+        time: mission time of the newest packet, s.
+        mode: label of the mode, empty until it is known.
+        ended: reason for the end of the flight, empty before it.
+        events: newest events.
+        faults: number of events of severity fault.
+        newest: newest packets by name.
+    """
+
+    time: float = 0.0
+    mode: str = ""
+    ended: str = ""
+    events: deque[LoggedEvent] = field(default_factory=lambda: deque(maxlen=_KEPT_EVENTS))
+    faults: int = 0
+    newest: dict[str, Any] = field(default_factory=dict)
+
+    def update(self, packets: Mapping[str, PacketArray]) -> list[LoggedEvent]:
+        """Update the state with new packets and return the events among them."""
+        found = [
+            LoggedEvent(
+                float(row["time_ns"]) * 1e-9,
+                int(row["severity"]),
+                printable(to_text(row["name"])),
+                printable(to_text(row["text"])),
+            )
+            for row in packets["event"]
+        ]
+        for name, rows in packets.items():
+            if len(rows):
+                self.newest[name] = rows[-1]
+                self.time = max(self.time, float(rows["time_ns"][-1]) * 1e-9)
+        with_mode = [packets[name][-1:] for name in ("mode", "attitude", "health", "command")]
+        modes = [(int(row["time_ns"]), int(row["mode"])) for rows in with_mode for row in rows]
+        if modes:
+            self.mode = named(MODES, max(modes)[1])
+        self.events.extend(found)
+        self.faults += sum(event.severity >= events.Severity.FAULT for event in found)
+        ends = [event.text or event.name for event in found if event.name == events.STOPPED.name]
+        self.ended = ends[-1] if ends else self.ended
+        return found
+
+    def value(self, packet: str, name: str) -> Any:
+        """Return a field of the newest packet of a type, or None before the first one."""
+        row = self.newest.get(packet)
+        return None if row is None else row[name]
+
+    @property
+    def error_deg(self) -> float | None:
+        """Angle between the estimated and the target attitude, deg, or None if either is unknown."""
+        row = self.newest.get("attitude")
+        if row is None or not (np.all(np.isfinite(row["quaternion"])) and np.all(np.isfinite(row["target"]))):
+            return None
+        pair = [np.asarray(row[name], dtype=float) for name in ("quaternion", "target")]
+        if not all(0.5 < np.linalg.norm(one) < 2.0 for one in pair):
+            return None
+        return math.degrees(float(angle_between(*pair)))
+
+
+def named(states: States, number: Any) -> str:
+    """Return the name of a number in a packet, or the number if it has no name."""
+    return dict(states).get(int(number), str(int(number)))
+
+
+def printable(text: str) -> str:
+    """Return a text without control characters, with which a damaged log could control the terminal."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+class PlainLines:
+    """Writes the events as lines, and the state once per period of mission time."""
+
+    def __init__(self, state: FlightState, every: float, write: Callable[[str], object]) -> None:
+        """Update `state` with the packets and write it about every `every` s of mission time."""
+        self._state = state
+        self._every = every
+        self._write = write
+        self._written = -1
+
+    def feed(self, packets: Mapping[str, PacketArray]) -> None:
+        """Process new packets, oldest first, and write their lines."""
+        slots = {}
+        for name, rows in packets.items():
+            seconds = np.clip(rows["time_ns"] * 1e-9, -_MAX_TIME, _MAX_TIME)
+            slots[name] = np.floor(seconds / self._every).astype(np.int64)
+        for slot in sorted(set().union(*(found.tolist() for found in slots.values()))):
+            inside = {name: rows[slots[name] == slot] for name, rows in packets.items()}
+            for event in self._state.update(inside):
+                self._write(event_line(event) + "\n")
+            if slot > self._written:
+                self._written = slot
+                self._write(state_line(self._state) + "\n")
+
+
+def event_line(event: LoggedEvent) -> str:
+    """Return an event as a line."""
+    return f"{event.time:9.3f} s  {named(SEVERITIES, event.severity):8} {event.name}: {event.text}"
+
+
+def state_line(state: FlightState) -> str:
+    """Return the state of a flight as a line: time, mode, attitude, coils, slips and faults."""
+    parts = [f"{state.time:9.3f} s ", state.mode or "mode not known", attitude_text(state)]
+    written, dipole = state.value("control", "current_written"), state.value("attitude", "dipole")
+    if written is not None:
+        parts.append("coils " + " ".join(f"{1e3 * current:+.1f}" for current in written) + " mA")
+    elif dipole is not None:
+        parts.append("dipole " + " ".join(f"{1e3 * value:+.2f}" for value in dipole) + " mA m^2")
+    if (steering := state.value("control", "state")) is not None:
+        parts.append(f"coils {named(STEERING, steering)}")
+    if (slips := state.value("health", "slips")) is not None:
+        parts.append(f"slips {int(slips)}")
+    if state.faults:
+        parts.append(f"faults {state.faults}")
+    return "  ".join(part for part in parts if part)
+
+
+def attitude_text(state: FlightState) -> str:
+    """Return the attitude and the rate; empty without an estimate."""
+    rate = state.value("attitude", "rate")
+    parts = []
+    if (q2 := state.value("control", "q2")) is not None and np.isfinite(q2):
+        parts.append(f"q2 {q2:+.4f} -> {state.value('control', 'target_q2'):+.2f}")
+    if (error := state.error_deg) is not None:
+        parts.append(f"error {error:.2f} deg")
+    if rate is not None and np.all(np.isfinite(rate)):
+        parts.append(f"{1e3 * float(np.linalg.norm(rate)):.2f} mrad/s")
+    return "  ".join(parts)

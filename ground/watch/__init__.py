@@ -1,1 +1,0 @@
-"""A flight watched in the terminal, from its log as it grows: mode, attitude, currents, events."""

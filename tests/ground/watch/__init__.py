@@ -1,1 +1,0 @@
-"""A flight watched in the terminal."""
