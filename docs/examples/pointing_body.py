@@ -27,7 +27,7 @@ from flight.bodies.testbed.body import (
     dipole_per_ampere,
     surrounding_field,
 )
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
 from flight.loop.body import (

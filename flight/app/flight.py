@@ -18,8 +18,14 @@ from flight.app.accepted_config import Chosen, FlownConfig, accepted_config, req
 from flight.app.composition import Opened, build_loop, workers
 from flight.app.devices import check_settings, injected_faults, linux_rig, open_devices, simulated_rig
 from flight.app.run import RunRequest, RunResult, begin_folder, open_log
-from flight.app.service import EndingSignals, FlownRelease, StartRetry, retried_start
-from flight.app.supervision import start_guardian, supervise
+from flight.app.service import (
+    EndingSignals,
+    FlownRelease,
+    StartRetry,
+    retried_start,
+    start_guardian,
+    supervise,
+)
 from flight.link import events
 from flight.link.commands import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog, Recorder

@@ -42,7 +42,7 @@ class BdotDetumble(Detumble, frozen=True, kw_only=True):
 
 
 class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.guidance` explains the strategies.
+    """Virtual motion camouflage (Sease 5.8-5.15); `flight.bodies.testbed.control` explains the strategies.
 
     `cost` is the energy that paths minimise: heat R I^2 of the mean current, or V |I| taken from the supply.
     """

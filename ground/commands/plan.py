@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.document import config_path
 from ground.commands import plan_orbit

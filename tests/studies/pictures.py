@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from flight.app.flight import fly
 from flight.app.run import RunRequest
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
 from flight.schema.testbed import as_testbed

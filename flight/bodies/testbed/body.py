@@ -16,16 +16,14 @@ from flight.bodies.testbed.control import (
     CageField,
     CageFilter,
     CageTracker,
-    ThreadTracker,
-    controller_of,
-)
-from flight.bodies.testbed.guidance import (
     Planning,
     PlanningSettings,
     Strategy,
     ThreadReader,
     ThreadTargets,
+    ThreadTracker,
     TimedStep,
+    controller_of,
     law_of,
     plant_of,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flight.app.supervision import Supervision
+from flight.app.service import Supervision
 from flight.link.events import EventKind
 from flight.link.telemetry.log import Recorder
 from hal.interfaces.guardian import GuardianNews

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from knightcube.errors import UsageError
 from knightcube.gnc.control.one_axis.excitation import ExcitationController, manoeuvres
 from knightcube.gnc.guidance.one_axis.path import PathSample

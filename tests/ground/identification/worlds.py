@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.testbed import Identification, TestbedConfig
 from ground.identification.fit import MotionConstants

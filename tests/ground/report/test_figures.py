@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.guidance import plant_of
+from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.testbed import as_testbed
 from ground.report import draw, draw_path

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from flight.app import supervision as watchers
+from flight.app import service as watchers
 from hal.buses import linux_process
 from hal.drivers.coils import DEVICE as COILS
 

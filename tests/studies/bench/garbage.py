@@ -1,7 +1,7 @@
 """Pauses of the garbage collector in flight: `python -m tests.studies.bench garbage [--minutes M]`.
 
 The full load of `bench executive` is flown. A flight collects by itself never, and every 2 s when it says
-so (`flight.app.supervision`): printed is how long each collection held the interpreter, in processor
+so (`flight.app.service`): printed is how long each collection held the interpreter, in processor
 time and on the clock, and what it found. Exit status 1 where one took 1 ms of processor time or more.
 """
 

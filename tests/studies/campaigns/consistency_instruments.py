@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.bodies.testbed.guidance import about_thread
+from flight.bodies.testbed.control import about_thread
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, attitude_map, from_rotation_vector, multiply
 from knightcube.gnc.estimation.estimate import Estimate

@@ -118,7 +118,7 @@ def _set_up(config: Config) -> None:
     """Make of a configuration what a flight makes of it first."""
     from flight.app.composition import workers  # noqa: PLC0415
     from flight.app.devices import coil_settings, unit_settings  # noqa: PLC0415 - the whole flight hangs on it
-    from flight.bodies.testbed.guidance import plant_of  # noqa: PLC0415
+    from flight.bodies.testbed.control import plant_of  # noqa: PLC0415
 
     coils, unit = coil_settings(config), unit_settings(config)
     workers(config)

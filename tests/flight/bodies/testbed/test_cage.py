@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.control import CageField, CageTracker, local_frame
-from flight.bodies.testbed.guidance import ThreadEstimate, plant_of
+from flight.bodies.testbed.control import CageField, CageTracker, ThreadEstimate, local_frame, plant_of
 from flight.loop.body import CoilCommand
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError, config_path

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.bodies.testbed.guidance import ThreadEstimate as Estimate
+from flight.bodies.testbed.control import ThreadEstimate as Estimate
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 

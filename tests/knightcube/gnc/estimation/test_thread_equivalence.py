@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.guidance import about_thread
+from flight.bodies.testbed.control import about_thread
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter

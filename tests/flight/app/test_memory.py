@@ -36,7 +36,7 @@ _FRAMES = """
 import gc, sys
 from array import array
 from pathlib import Path
-from flight.app import supervision
+from flight.app import service
 
 def heap():
     lines = iter(Path("/proc/self/smaps").read_text().splitlines())
@@ -57,7 +57,7 @@ for _ in range(3):
     array("B", bytes(8 << 20))
 assert gc.get_freeze_count() == 0
 if sys.argv[1] == "settled":
-    supervision.settle_memory()
+    service.settle_memory()
     assert gc.get_freeze_count() > 1000 and not gc.isenabled()
 sys.stdout.write(str(frames()))
 """
@@ -65,14 +65,14 @@ sys.stdout.write(str(frames()))
 
 _LOOPS = """
 import gc, sys, weakref
-from flight.app import supervision
+from flight.app import service
 
 class Loop:
     def __init__(self):
         self.me = self
 
-supervision.settle_memory()
-collect = supervision.Collector()
+service.settle_memory()
+collect = service.Collector()
 kept = [Loop() for _ in range(1000)]
 collect()
 frozen = gc.get_freeze_count()
