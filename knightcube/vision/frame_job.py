@@ -146,7 +146,20 @@ class FrameFound:
 
 def run(job: FrameJob) -> FrameFound:
     """Return attitude and rate of a frame. The worker process imports this function by its name."""
-    found = _found(job)
+    tracker = job.tracker
+    if tracker is None:
+        found = FrameFound(_motion(job), None)
+    else:
+        sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
+        found = attitude_and_rate(job, tracker, sky)
+        if job.objects is not None and found.solution is not None:
+            from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - needs scipy
+
+            velocity, detection = tracker.solve.velocity, tracker.solve.detection
+            objects = measure_objects(
+                job.pixels, found.solution, job.exposure, sky.stars.epoch, velocity, detection, job.objects
+            )
+            found = replace(found, objects=objects)
     if job.kept is not None:
         keep_frame(job.kept, job.pixels, _facts(job, found))
     return found
@@ -173,17 +186,6 @@ def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
 def _places(points: FloatArray) -> list[list[float]]:
     """Return points (n, 2), px, rounded to tenths of a pixel."""
     return [[round(x, 1), round(y, 1)] for x, y in points.tolist()]
-
-
-def _found(job: FrameJob) -> FrameFound:
-    tracker = job.tracker
-    if tracker is None:
-        return FrameFound(_motion(job), None)
-    sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
-    found = attitude_and_rate(job, tracker, sky)
-    if job.objects is None or found.solution is None:
-        return found
-    return replace(found, objects=_objects(job, tracker, sky, found.solution, job.objects))
 
 
 def prepare() -> None:
@@ -229,9 +231,11 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
     # Few short streaks can be fitted, and their direction is uncertain; all stars have predicted positions.
-    near = _near(job, tracker, sky) if rests or _known_to_be_short(job) else None
-    if near is not None:
-        return FrameFound(motion or _no_motion(job), near)
+    trails, prior = _short_trails(job), job.attitude_prior
+    if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
+        near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
+        if near is not None:
+            return FrameFound(motion or _no_motion(job), near)
     if motion is None:
         return _of_picture(job, tracker, sky)
     if rests:
@@ -240,14 +244,6 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     if motion.status not in MOVED:
         return FrameFound(motion, None)
     return _from_motion(job, tracker, sky, motion)
-
-
-def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted positions; None without a prior or if it fails."""
-    prior = job.attitude_prior
-    if prior is None:
-        return None
-    return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _short_trails(job))
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
@@ -314,27 +310,6 @@ def _motion(job: FrameJob) -> FrameMotion:
     return estimator.motion(job.pixels, lens, job.exposure, rate, sigma, previous)
 
 
-def _objects(
-    job: FrameJob,
-    tracker: TrackerSettings,
-    sky: SkyIndex,
-    solution: FrameSolution,
-    settings: ObjectMeasurementSettings,
-) -> MeasuredObjects | None:
-    """Return the possible objects."""
-    from knightcube.vision.objects.measure import measure_objects  # noqa: PLC0415 - scipy comes with it
-
-    return measure_objects(
-        job.pixels,
-        solution,
-        job.exposure,
-        sky.stars.epoch,
-        tracker.solve.velocity,
-        tracker.solve.detection,
-        settings,
-    )
-
-
 def _no_motion(job: FrameJob) -> MotionResult:
     """Return the result without a motion, for a frame of points."""
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
@@ -356,11 +331,6 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
         return ShortTrails(turn)
     delay, doubt = estimator.delay_per_row / job.exposure, estimator.line_time_sigma / job.exposure
     return ShortTrails(turn, delay, doubt)
-
-
-def _known_to_be_short(job: FrameJob) -> bool:
-    """Return whether streaks are known to be short enough to be measured as points with trails."""
-    return _short_trails(job) is not None and _predicted_within(job, _SHORT_PX)
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:

@@ -110,7 +110,10 @@ def refit_motion(
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
-    course = _course_of(motion, motion.rate)
+    # The rotation over the exposure from the mean rate and the other terms of the motion.
+    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
+    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
+    course = CameraMotion.between(motion.rate * exposure, growth, shape)
     most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
     known = _known_stars(motion, solution, sky, settings, course, most)
     if known is None:
@@ -138,7 +141,9 @@ def refit_motion(
     apart = refit.rate - motion.rate
     if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
         return None
-    left = _elsewhere(motion.faint_endpoints, refit.endpoints)
+    # The faint streaks that differ from all refitted ones.
+    worst = np.linalg.norm(motion.faint_endpoints[:, None] - refit.endpoints, axis=-1).max(axis=-1)
+    left = (worst > _SAME).all(axis=1)
     return replace(
         refit,
         status=motion.status,
@@ -147,14 +152,6 @@ def refit_motion(
         faint_flux=motion.faint_flux[left],
         faint_significance=motion.faint_significance[left],
     )
-
-
-def _course_of(motion: MotionResult, rate: FloatArray) -> CameraMotion:
-    """Return the rotation over the exposure from the mean `rate` (3,), rad/s, and the terms of `motion`."""
-    exposure = motion.exposure
-    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
-    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
-    return CameraMotion.between(rate * exposure, growth, shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -243,16 +240,11 @@ def _scenes(
     hidden = near.copy()
     hidden[fitted] = False
     foreign = _foreign(camera.pinhole, course, motion, known)
-    scene = _scene(course, width, known.places[fitted], known.light[fitted], leading[fitted])
-    return scene.with_stars(motion.stars[foreign], motion.flux[foreign]), _scene(
-        course, width, known.places[hidden], known.light[hidden], leading[hidden]
+    fit, subtracted = (
+        StreakScene(course, width, known.places[k], known.light[k], np.zeros(len(known.light[k])), leading[k])
+        for k in (fitted, hidden)
     )
-
-
-def _scene(
-    course: CameraMotion, width: float, places: FloatArray, light: FloatArray, trusted: BoolArray
-) -> StreakScene:
-    return StreakScene(course, width, places, light, np.zeros(len(light)), trusted)
+    return fit.with_stars(motion.stars[foreign], motion.flux[foreign]), subtracted
 
 
 def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known: _Known) -> IntArray:
@@ -267,12 +259,6 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
     near |= beside & (azimuth_differences(azimuth, known_azimuth) < float(np.linalg.norm(course.rotation)))
     alike = known.light > _ALIKE * motion.flux[:, None]
     return np.flatnonzero(~(near & alike).any(axis=1))
-
-
-def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
-    """Return which streaks (n, 2, 2), px, differ from all streaks with `ends` (m, 2, 2), px."""
-    worst = np.linalg.norm(faint[:, None] - ends, axis=-1).max(axis=-1)
-    return np.asarray((worst > _SAME).all(axis=1))
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
