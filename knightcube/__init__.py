@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from knightcube.vision.star_tracker import MatchedStars as MatchedStars
     from knightcube.vision.star_tracker import StarSolution as StarSolution
     from knightcube.vision.star_tracker import StarTracker as StarTracker
+    from knightcube.vision.streaks.estimate import estimate_rate as estimate_rate
     from knightcube.vision.sun import find_sun as find_sun
 
 _MODULE_OF = {
@@ -54,6 +55,7 @@ _MODULE_OF = {
     "LensCalibration": "knightcube.vision.lens_calibration",
     "calibrate_lens": "knightcube.vision.lens_calibration",
     "detect_objects": "knightcube.vision.objects.detect",
+    "estimate_rate": "knightcube.vision.streaks.estimate",
     "find_nadir": "knightcube.vision.horizon.nadir",
     "find_sun": "knightcube.vision.sun",
     "magnetic_field": "knightcube.astro.almanac",

@@ -131,7 +131,12 @@ def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> 
 
 @pytest.mark.parametrize(
     ("page", "script"),
-    [("horizon-and-sun", "horizon_and_sun"), ("lens", "lens"), ("orbit", "orbit_and_field")],
+    [
+        ("horizon-and-sun", "horizon_and_sun"),
+        ("lens", "lens"),
+        ("orbit", "orbit_and_field"),
+        ("streaks", "streak_rate"),
+    ],
 )
 def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
     printed = run([str(EXAMPLES / f"{script}.py")], ROOT).stdout.rstrip()
