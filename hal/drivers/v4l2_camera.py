@@ -59,6 +59,11 @@ EXPOSURE_AUTO, EXPOSURE_MANUAL = 0x009A_0901, 1
 EXPOSURE_ABSOLUTE, EXPOSURE_UNIT_NS = 0x009A_0902, 100_000
 
 
+def _words(names: str) -> list[tuple[str, type[ctypes.c_uint32]]]:
+    """Return the definitions of unsigned fields of 32 bits, from their names in order."""
+    return [(name, ctypes.c_uint32) for name in names.split()]
+
+
 class Capability(ctypes.Structure):
     """struct v4l2_capability."""
 
@@ -66,9 +71,7 @@ class Capability(ctypes.Structure):
         ("driver", ctypes.c_char * 16),
         ("card", ctypes.c_char * 32),
         ("bus_info", ctypes.c_char * 32),
-        ("version", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
-        ("device_caps", ctypes.c_uint32),
+        *_words("version capabilities device_caps"),
         ("reserved", ctypes.c_uint32 * 3),
     )
 
@@ -77,12 +80,9 @@ class FormatDescription(ctypes.Structure):
     """struct v4l2_fmtdesc."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
+        *_words("index type flags"),
         ("description", ctypes.c_char * 32),
-        ("pixelformat", ctypes.c_uint32),
-        ("mbus_code", ctypes.c_uint32),
+        *_words("pixelformat mbus_code"),
         ("reserved", ctypes.c_uint32 * 3),
     )
 
@@ -91,28 +91,14 @@ class PixelFormat(ctypes.Structure):
     """struct v4l2_pix_format."""
 
     _fields_ = (
-        ("width", ctypes.c_uint32),
-        ("height", ctypes.c_uint32),
-        ("pixelformat", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
-        ("bytesperline", ctypes.c_uint32),
-        ("sizeimage", ctypes.c_uint32),
-        ("colorspace", ctypes.c_uint32),
-        ("priv", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("encoding", ctypes.c_uint32),
-        ("quantization", ctypes.c_uint32),
-        ("transfer", ctypes.c_uint32),
+        *_words("width height pixelformat field bytesperline sizeimage colorspace priv flags"),
+        *_words("encoding quantization transfer"),
     )
 
 
 class _FormatUnion(ctypes.Union):
     # The window of an overlay holds pointers, which is what aligns the kernel's union.
-    _fields_ = (
-        ("pix", PixelFormat),
-        ("raw_data", ctypes.c_uint8 * 200),
-        ("pointer", ctypes.c_void_p),
-    )
+    _fields_ = (("pix", PixelFormat), ("raw_data", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
 
 
 class Format(ctypes.Structure):
@@ -125,10 +111,7 @@ class RequestBuffers(ctypes.Structure):
     """struct v4l2_requestbuffers."""
 
     _fields_ = (
-        ("count", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
-        ("capabilities", ctypes.c_uint32),
+        *_words("count type memory capabilities"),
         ("flags", ctypes.c_uint8),
         ("reserved", ctypes.c_uint8 * 3),
     )
@@ -142,8 +125,7 @@ class TimeValue(ctypes.Structure):
 
 class _TimeCode(ctypes.Structure):
     _fields_ = (
-        ("type", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
+        *_words("type flags"),
         ("frames", ctypes.c_uint8),
         ("seconds", ctypes.c_uint8),
         ("minutes", ctypes.c_uint8),
@@ -160,18 +142,12 @@ class Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
     _fields_ = (
-        ("index", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
-        ("bytesused", ctypes.c_uint32),
-        ("flags", ctypes.c_uint32),
-        ("field", ctypes.c_uint32),
+        *_words("index type bytesused flags field"),
         ("timestamp", TimeValue),
         ("timecode", _TimeCode),
-        ("sequence", ctypes.c_uint32),
-        ("memory", ctypes.c_uint32),
+        *_words("sequence memory"),
         ("m", _BufferUnion),
-        ("length", ctypes.c_uint32),
-        ("reserved2", ctypes.c_uint32),
+        *_words("length reserved2"),
         ("request_fd", ctypes.c_int32),
     )
 
@@ -186,12 +162,9 @@ class StreamParameters(ctypes.Structure):
     """struct v4l2_streamparm, its capture side."""
 
     _fields_ = (
-        ("type", ctypes.c_uint32),
-        ("capability", ctypes.c_uint32),
-        ("capturemode", ctypes.c_uint32),
+        *_words("type capability capturemode"),
         ("timeperframe", Fraction),
-        ("extendedmode", ctypes.c_uint32),
-        ("readbuffers", ctypes.c_uint32),
+        *_words("extendedmode readbuffers"),
         ("reserved", ctypes.c_uint8 * 176),
     )
 
@@ -206,8 +179,7 @@ class QueryControl(ctypes.Structure):
     """struct v4l2_queryctrl."""
 
     _fields_ = (
-        ("id", ctypes.c_uint32),
-        ("type", ctypes.c_uint32),
+        *_words("id type"),
         ("name", ctypes.c_char * 32),
         ("minimum", ctypes.c_int32),
         ("maximum", ctypes.c_int32),
