@@ -8,7 +8,7 @@ from concurrent.futures import Future
 
 import numpy as np
 
-from flight.schema.devices import SolarStrings, WideCamera
+from flight.schema.devices import SolarStringsSection, WideCamera
 from flight.schema.sections import Config
 from hal.drivers.ads1115 import StringWiring
 from knightcube.astro.arrays import FloatArray, Image
@@ -59,7 +59,7 @@ def assemble_orbit(
 
 
 def _strings(
-    section: SolarStrings,
+    section: SolarStringsSection,
     truth: OrbitDeviceTruth,
     world: OrbitingWorld,
     now_ns: Callable[[], int],

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from ipaddress import IPv4Address, IPv4Network
 
-from flight.schema.devices import Camera, SolarStrings
+from flight.schema.devices import Camera, SolarStringsSection
 from flight.schema.document import Document
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import CONTROL_RATE_HZ, Commands, Config, Link
@@ -118,7 +118,7 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
         )
 
 
-def _check_strings(config: Config, strings: SolarStrings, refuse: Refuse) -> None:
+def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse) -> None:
     others = {config.coils.address} | ({config.power_monitor.address} if config.power_monitor else set())
     inputs = set()
     for index, string in enumerate(strings.strings):

@@ -30,7 +30,7 @@ _KNOWN = CameraKnowledge()
 ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
-class InertialUnit(Section, frozen=True, kw_only=True):
+class InertialUnitSection(Section, frozen=True, kw_only=True):
     """The VN-100 and its serial line.
 
     The coils stay off when a reading would be older than `max_age` s before the next reading is used.
@@ -64,7 +64,7 @@ class Coils(Section, frozen=True, kw_only=True):
     stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
 
 
-class PowerMonitor(Section, frozen=True, kw_only=True):
+class PowerMonitorSection(Section, frozen=True, kw_only=True):
     """The INA219 in the coils' supply."""
 
     address: Address = 0x45
@@ -98,7 +98,7 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
     line_time: NotNegative | None = _KNOWN.line_time
 
 
-class StarTracker(Section, frozen=True, kw_only=True):
+class StarTrackerSection(Section, frozen=True, kw_only=True):
     """The star tracker.
 
     `index` is the file of the sky index, by default the one in the cache folder. `scale_error` is the
@@ -171,7 +171,7 @@ class Camera(Section, frozen=True, kw_only=True):
     psf_sigma: Positive = 1.0
     line_time: NotNegative | None = None
     estimator: Estimator = "likelihood"
-    star_tracker: StarTracker | None = None
+    star_tracker: StarTrackerSection | None = None
     objects: ObjectTracking | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -208,7 +208,7 @@ class SolarString(Section, frozen=True, kw_only=True):
     volt_per_ampere: Positive = 2.0
 
 
-class SolarStrings(Section, frozen=True, kw_only=True):
+class SolarStringsSection(Section, frozen=True, kw_only=True):
     """The solar strings, measured every `period` s; a reading is stale after `max_age` s."""
 
     strings: Annotated[tuple[SolarString, ...], Meta(min_length=4, max_length=16)]

@@ -16,9 +16,9 @@ from flight.schema.devices import (
     Camera,
     Coils,
     Gps,
-    InertialUnit,
-    PowerMonitor,
-    SolarStrings,
+    InertialUnitSection,
+    PowerMonitorSection,
+    SolarStringsSection,
     WideCamera,
 )
 from flight.schema.values import (
@@ -207,12 +207,12 @@ class Config(Section, frozen=True, kw_only=True):
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
     body: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
-    inertial_unit: InertialUnit
+    inertial_unit: InertialUnitSection
     coils: Coils
-    power_monitor: PowerMonitor | None = None
+    power_monitor: PowerMonitorSection | None = None
     camera: Camera | None
     gps: Gps | None = None
-    solar_strings: SolarStrings | None = None
+    solar_strings: SolarStringsSection | None = None
     wide_cameras: Annotated[tuple[WideCamera, ...], Meta(max_length=6)] = ()
     executive: Executive = Executive()
     estimation: Estimation = Estimation()

@@ -139,7 +139,7 @@ def frame(kind: Kind, payload: bytes = b"") -> bytes:
     return SYNC + body + checksum(body)
 
 
-class StreamParser:
+class UbxParser:
     """Splits received bytes into frames; after a false start the search continues two bytes later.
 
     Attributes:
@@ -205,7 +205,7 @@ class UbloxReceiver:
         self._port = port
         self._clock = clock
         self._period_ns = period_ns
-        self._parser = StreamParser()
+        self._parser = UbxParser()
         self._requested_ns = -SILENCE_NS
         self._fix_arrival_ns = clock.now_ns()
         self._last_byte_ns = self._last_fix_ns = -1

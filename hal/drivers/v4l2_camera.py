@@ -169,7 +169,7 @@ class StreamParameters(ctypes.Structure):
     )
 
 
-class Control(ctypes.Structure):
+class ControlValue(ctypes.Structure):
     """struct v4l2_control."""
 
     _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
@@ -206,8 +206,8 @@ STREAMON = _request(1, 18, ctypes.c_int)
 STREAMOFF = _request(1, 19, ctypes.c_int)
 G_PARM = _request(3, 21, StreamParameters)
 S_PARM = _request(3, 22, StreamParameters)
-G_CTRL = _request(3, 27, Control)
-S_CTRL = _request(3, 28, Control)
+G_CTRL = _request(3, 27, ControlValue)
+S_CTRL = _request(3, 28, ControlValue)
 QUERYCTRL = _request(3, 36, QueryControl)
 
 
@@ -217,8 +217,8 @@ _MOST_FORMATS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Layout of the pixels in a buffer: `fourcc` names their format, rows are `stride` bytes apart."""
+class PixelLayout:
+    """PixelLayout of the pixels in a buffer: `fourcc` names their format, rows are `stride` bytes apart."""
 
     columns: int
     rows: int
@@ -293,13 +293,13 @@ class VideoDevice:
                 raise
             yield fourcc_name(answer.pixelformat)
 
-    def set_format(self, columns: int, rows: int, name: str) -> Layout:
+    def set_format(self, columns: int, rows: int, name: str) -> PixelLayout:
         """Request a format; return the one that the device set, which may differ."""
         answer = Format(type=VIDEO_CAPTURE)
         pix = answer.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = columns, rows, fourcc(name), FIELD_NONE
         self._ask(S_FMT, answer)
-        return Layout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
+        return PixelLayout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
     def set_interval(self, interval_ns: int) -> int:
         """Request an interval between frames; return the device's, 0 when it cannot be set."""
@@ -332,7 +332,7 @@ class VideoDevice:
 
     def set_control(self, control: int, value: int) -> int:
         """Set a control; return its resulting value."""
-        answer = Control(control, value)
+        answer = ControlValue(control, value)
         self._ask(S_CTRL, answer)
         self._ask(G_CTRL, answer)
         return int(answer.value)
@@ -365,7 +365,7 @@ class VideoDevice:
         """Return a buffer to the kernel to be filled again."""
         self._ask(QBUF, _numbered(index))
 
-    def pixels(self, index: int, layout: Layout, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    def pixels(self, index: int, layout: PixelLayout, kind: np.dtype[Any]) -> npt.NDArray[Any]:
         """Return a copy (rows, columns) of a buffer's pixels, without the padding of its rows."""
         memory = self._maps[index]
         view: npt.NDArray[Any] = np.ndarray(
@@ -558,7 +558,7 @@ def identity(name: str, device: VideoDevice) -> tuple[str, str]:
     return driver, card
 
 
-def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> Layout:
+def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelLayout:
     """Set the image format; raises Refused or CorruptData when the camera has no such format."""
     name = settings.path
     layout = device.set_format(settings.columns, settings.rows, settings.pixel_format)
@@ -621,7 +621,7 @@ class V4l2Camera:
         self._kind = settings.kind
         self._timing = ExposureTiming(settings, clock, self.counts)
         self._device: VideoDevice | None = None
-        self._layout = Layout(0, 0, "", 0)
+        self._layout = PixelLayout(0, 0, "", 0)
         self._exposures: ControlRange | None = None
         self._asked_steps = 0
         self._exposure_ns = 0  # as the camera set it

@@ -25,7 +25,7 @@ from hal.drivers.ublox import (
     THREE_DIMENSIONS,
     Kind,
     Pvt,
-    StreamParser,
+    UbxParser,
     frame,
 )
 from hal.interfaces.wires import SECOND_NS
@@ -120,7 +120,7 @@ class EmulatedGps:
             self._line.write(data, sent_ns)
 
     def _power(self, now_ns: int, start: float) -> None:
-        self._parser = StreamParser()
+        self._parser = UbxParser()
         self._sending: list[tuple[int, bytes]] = []
         self._asked = False
         self._found_ns = now_ns + round(start * SECOND_NS)

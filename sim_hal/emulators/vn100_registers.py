@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from hal.drivers.vn100.protocol import Layout, layout_of
+from hal.drivers.vn100.protocol import OutputLayout, layout_of
 
 Rule = Callable[[str], str]
 """Returns the text as the unit stores it; raises ValueError for an invalid text."""
@@ -173,7 +173,7 @@ class BinaryOutput:
 
     ports: int
     divisor: int
-    layout: Layout
+    layout: OutputLayout
 
 
 def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:

@@ -34,8 +34,7 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned
-from flight.schema.devices import SolarStrings as StringsSection
-from flight.schema.devices import camera_model
+from flight.schema.devices import SolarStringsSection, camera_model
 from flight.schema.document import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import CONTROL_RATE_HZ, Config
@@ -366,7 +365,7 @@ def _filter(
     return OrbitFilter(settings, environment.at), problems
 
 
-def _strings(section: StringsSection) -> SolarStringModel:
+def _strings(section: SolarStringsSection) -> SolarStringModel:
     normals = np.array([string.normal for string in section.strings])
     return SolarStringModel(normals, np.array([string.peak for string in section.strings]))
 

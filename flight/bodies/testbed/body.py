@@ -45,7 +45,7 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
 from flight.loop.coil_response import ResponseSettings
 from flight.loop.facts import Services
 from flight.loop.state import Learned, start_from
-from flight.schema.devices import InertialUnit
+from flight.schema.devices import InertialUnitSection
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.devices import ImuReading
@@ -71,7 +71,7 @@ from knightcube.gnc.guidance.one_axis.vmc import NODES
 class UnitFeed:
     """Implements `ReadingFeed`: starts the filter from attitude and rate, and applies both."""
 
-    def __init__(self, filter_: AttitudeFilter, unit: InertialUnit) -> None:
+    def __init__(self, filter_: AttitudeFilter, unit: InertialUnitSection) -> None:
         self._filter = filter_
         self._angle_covariance: FloatArray = np.eye(3) * unit.angle_noise**2
         self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2

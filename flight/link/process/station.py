@@ -325,11 +325,11 @@ class Station:
         self._packer, self._commands = Packer(), CommandPacker()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._status_ns = self._label_ns = clock.now_ns()
-        self._refusals = _Few()
+        self._refusals_ns = deque([-2 * SECOND_NS] * _REFUSALS_A_SECOND, _REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem = ""
         self._unpacked, self._unpacked_text = 0, ""
-        self._alive: Callable[[], object] = _nothing
+        self._alive: Callable[[], object] | None = None
         self._alive_ns = clock.now_ns()
         self._playback = Playback(self._downlink, log)
         self._scheduling = Scheduling(Timetable(vault.folder))
@@ -338,7 +338,7 @@ class Station:
 
     @property
     def transfers(self) -> int:
-        """How many files are on their way."""
+        """Number of open file transfers."""
         return len(self._filing.status())
 
     @property
@@ -406,7 +406,7 @@ class Station:
     def _beat(self) -> None:
         """Report once a second that the loop makes progress."""
         now_ns = self._clock.now_ns()
-        if now_ns >= self._alive_ns:
+        if self._alive is not None and now_ns >= self._alive_ns:
             self._alive_ns = now_ns + SECOND_NS
             self._alive()
 
@@ -415,7 +415,9 @@ class Station:
         try:
             admitted = self._gate.admit(frame)
         except RefusedError as error:
-            if error.counter is not None and self._refusals.fits(now_ns):
+            # A flood of repeated frames must cause few reports.
+            if error.counter is not None and now_ns - self._refusals_ns[0] > SECOND_NS:
+                self._refusals_ns.append(now_ns)
                 counter = min(error.counter, _HIGHEST_REPORTED)
                 self._report(Report(error.spi, counter, Stage.REFUSED, "", str(error)))
             return
@@ -531,24 +533,6 @@ class Station:
     def _time_ns(self) -> int:
         """Return the mission time (ns), limited to the range of the packets' field."""
         return min(self._mission_ns + self._clock.now_ns() - self._mission_at_ns, _HIGHEST_REPORTED)
-
-
-def _nothing() -> None:
-    """Do nothing, until a watcher of the loop is set."""
-
-
-class _Few:
-    """Rate limit of the reports of refused frames, so that a flood of repeated frames causes few reports."""
-
-    def __init__(self) -> None:
-        self._times: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
-
-    def fits(self, now_ns: int) -> bool:
-        """Return whether the limit of the last second allows another report, and count the report if so."""
-        fits = len(self._times) < _REFUSALS_A_SECOND or now_ns - self._times[0] > SECOND_NS
-        if fits:
-            self._times.append(now_ns)
-        return fits
 
 
 def _security(gate: Gate, vault: Vault) -> dict[str, Any]:

@@ -197,7 +197,7 @@ class Packer:
         except (KeyError, TypeError, ValueError, OverflowError, struct.error) as error:
             raise _explain(layout, time_ns, given) from error
         if len(given) != len(layout.fields):
-            raise _unknown_fields(layout, given)
+            raise _explain(layout, time_ns, given)
         self._counts[packet.name] = (count + 1) % SEQUENCE_MODULUS
         return body + crc16(body).to_bytes(CRC_BYTES, "big")
 
@@ -212,19 +212,13 @@ def _to_items(value: Any, count: int) -> list[Any]:
     return items
 
 
-def _unknown_fields(layout: Layout, given: Mapping[str, object]) -> TelemetryError:
-    unknown = sorted(set(given) - {field.name for field in layout.packet.fields})
-    return TelemetryError(f"packet {layout.packet.name}: no such field: {', '.join(unknown)}")
-
-
 def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> TelemetryError:
     """Return the error that names the wrong value of a packet that cannot be packed."""
-    name = layout.packet.name
-    missing = [field.name for field in layout.packet.fields if field.name not in given]
-    if missing:
+    name, names = layout.packet.name, [field.name for field in layout.packet.fields]
+    if missing := [each for each in names if each not in given]:
         return TelemetryError(f"packet {name}: missing: {', '.join(missing)}")
-    if len(given) != len(layout.fields):
-        return _unknown_fields(layout, given)
+    if unknown := sorted(set(given) - set(names)):
+        return TelemetryError(f"packet {name}: no such field: {', '.join(unknown)}")
     for field in layout.packet.fields:
         value: Any = given[field.name]
         try:

@@ -27,7 +27,7 @@ import numpy as np
 from hal.drivers.vn100.protocol import (
     AsciiLine,
     BinaryPacket,
-    Layout,
+    OutputLayout,
     Sentence,
     StreamParser,
     build,
@@ -494,7 +494,7 @@ class _Places:
     sensors: tuple[slice, slice, slice, slice]
 
 
-def _places(layout: Layout) -> _Places | None:
+def _places(layout: OutputLayout) -> _Places | None:
     """Return the positions of a reading in a packet; None if a part other than the time is missing."""
     sensors: list[slice] = []
     for names in _SOURCES:

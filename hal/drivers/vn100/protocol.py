@@ -63,8 +63,8 @@ Value = float | bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Layout of the packets of one output set.
+class OutputLayout:
+    """OutputLayout of the packets of one output set.
 
     Attributes:
         header: the bytes after the sync byte: group byte and field words.
@@ -94,7 +94,7 @@ class BinaryPacket:
     """
 
     arrival_ns: int
-    layout: Layout
+    layout: OutputLayout
     values: tuple[Value, ...]
 
     def __getitem__(self, field: str) -> tuple[Value, ...]:
@@ -107,7 +107,7 @@ def crc16(data: bytes) -> int:
     return crc_hqx(data, 0)
 
 
-def layout_of(words: Mapping[int, int]) -> Layout:
+def layout_of(words: Mapping[int, int]) -> OutputLayout:
     """Return the layout of field words by group bit, {0: 0x0131, 2: 0x0100}.
 
     Raises ValueError for a group or a field that is not in the tables.
@@ -128,7 +128,7 @@ def header_length(group_byte: int) -> int:
 
 
 @lru_cache(maxsize=256)
-def layout_of_header(header: bytes) -> Layout | None:
+def layout_of_header(header: bytes) -> OutputLayout | None:
     """Return the layout of `header` (group byte and its field words); None when there is none."""
     if not header:
         return None
@@ -150,7 +150,7 @@ def layout_of_header(header: bytes) -> Layout | None:
                 start += count
                 codes += code
     payload = struct.Struct(codes)
-    return Layout(header, tuple(fields), places, payload, 1 + len(header) + payload.size + 2)
+    return OutputLayout(header, tuple(fields), places, payload, 1 + len(header) + payload.size + 2)
 
 
 HEADER_LENGTHS: tuple[int, ...] = tuple(header_length(byte) for byte in range(256))

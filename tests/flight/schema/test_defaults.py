@@ -20,13 +20,13 @@ import sim_hal
 from flight.schema import devices, orbit, sections, testbed
 from hal.interfaces.wires import SECOND_NS
 
-OF_CAMERA = (devices.Camera, devices.StarTracker)
+OF_CAMERA = (devices.Camera, devices.StarTrackerSection)
 SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "AdaptiveSettings": (testbed.Control,),
     "AravisSettings": (devices.AravisDevice, devices.Camera),
     "CoilDriveSettings": (devices.Coils,),
     "CoilSettings": (devices.Coils,),
-    "CoilMonitorSettings": (devices.Coils, devices.PowerMonitor),
+    "CoilMonitorSettings": (devices.Coils, devices.PowerMonitorSection),
     "DetumblerSettings": (testbed.BdotDetumble, testbed.Plant),
     "ExcitationSettings": (testbed.Identification,),
     "FieldDetumblerSettings": (orbit.FieldDetumble,),
@@ -35,11 +35,11 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "ModeSettings": (sections.Modes, sections.Detumble),
-    "NavigationSettings": (devices.InertialUnit, sections.Estimation),
+    "NavigationSettings": (devices.InertialUnitSection, sections.Estimation),
     "OrbitFilterSettings": (orbit.OrbitEstimation, orbit.Craft),
     "PidSettings": (testbed.PidGains,),
     "PlanningSettings": (testbed.Guidance,),
-    "ResponseSettings": (testbed.Plant, devices.InertialUnit),
+    "ResponseSettings": (testbed.Plant, devices.InertialUnitSection),
     "ObjectMeasurementSettings": (devices.ObjectTracking,),
     "SolveSettings": OF_CAMERA,
     "StationSettings": (sections.Link,),
@@ -48,7 +48,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "TrackSettings": (devices.ObjectTracking,),
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
-    "Vn100Settings": (devices.InertialUnit,),
+    "Vn100Settings": (devices.InertialUnitSection,),
     "HorizonCameraSettings": (devices.WideCamera,),
 }
 """The sections that a flight fills each settings class from."""

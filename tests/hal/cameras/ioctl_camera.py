@@ -209,11 +209,11 @@ class IoctlCamera:
         answer.name, answer.step = knob.name, 1
         answer.minimum, answer.maximum = knob.minimum, knob.maximum
 
-    def _g_ctrl(self, answer: v4l2.Control) -> None:
+    def _g_ctrl(self, answer: v4l2.ControlValue) -> None:
         _require(answer.id in self.knobs, errno.EINVAL)
         answer.value = self.knobs[answer.id].value
 
-    def _s_ctrl(self, argument: v4l2.Control) -> None:
+    def _s_ctrl(self, argument: v4l2.ControlValue) -> None:
         _require(argument.id in self.knobs, errno.EINVAL)
         knob = self.knobs[argument.id]
         _require(knob.minimum <= argument.value <= knob.maximum, errno.ERANGE)

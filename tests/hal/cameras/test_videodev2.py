@@ -37,7 +37,7 @@ STRUCTURES = {
     "v4l2_requestbuffers": v4l2.RequestBuffers,
     "v4l2_buffer": v4l2.Buffer,
     "v4l2_streamparm": v4l2.StreamParameters,
-    "v4l2_control": v4l2.Control,
+    "v4l2_control": v4l2.ControlValue,
     "v4l2_queryctrl": v4l2.QueryControl,
 }
 MEMBERS = [

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyubx2 import UBXMessage, UBXReader
 
-from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, StreamParser, checksum, frame, unpack_pvt
+from hal.drivers.ublox import CFG_MSG, NAV_PVT, SYNC, UbxParser, checksum, frame, unpack_pvt
 from tests.hal.gps.fixes import PVT
 
 
@@ -29,7 +29,7 @@ def test_our_driver_reads_what_another_author_builds() -> None:
     fix = {"fixType": 3, "gnssFixOk": 1, "validDate": 1, "validTime": 1, "numSV": 7}
     place = {"lon": 12.5, "lat": -80.25, "height": 550_000_000, "velN": 100, "velE": -200, "velD": 300}
     built = UBXMessage("NAV", "NAV-PVT", 0, **date, **fix, **place)
-    [(kind, payload, behind)] = StreamParser().feed(built.serialize())
+    [(kind, payload, behind)] = UbxParser().feed(built.serialize())
     read = unpack_pvt(payload)
     assert (kind, behind) == (NAV_PVT, 0)
     assert (read.date, read.satellites) == ((2026, 11, 23, 1, 2, 3), 7)
@@ -49,7 +49,7 @@ def test_a_command_is_what_another_author_builds() -> None:
 def test_a_good_frame_is_found_behind_any_noise_in_pieces_of_any_size(
     noise: bytes, piece: int, behind: bytes
 ) -> None:
-    parser = StreamParser(longest=120)
+    parser = UbxParser(longest=120)
     sound = frame(NAV_PVT, PVT.packed())
     # Long enough that no false start can still wait for its end.
     data = noise + sound + behind + bytes(140)
@@ -63,5 +63,5 @@ def test_one_wrong_byte_is_never_taken_for_a_frame(at: int, mask: int) -> None:
     sound = frame(NAV_PVT, PVT.packed())
     broken = bytearray(sound)
     broken[at] ^= mask
-    assert [kind for kind, _, _ in StreamParser().feed(bytes(broken) + bytes(300)) if kind == NAV_PVT] == []
+    assert [kind for kind, _, _ in UbxParser().feed(bytes(broken) + bytes(300)) if kind == NAV_PVT] == []
     assert checksum(sound[2:-2]) == sound[-2:]

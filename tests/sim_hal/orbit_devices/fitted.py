@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from flight.schema import reader
-from flight.schema.devices import Gps, SolarString, SolarStrings, WideCamera
+from flight.schema.devices import Gps, SolarString, SolarStringsSection, WideCamera
 from flight.schema.testbed import TestbedConfig
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
@@ -37,7 +37,9 @@ def orbit_config(camera: bool = False) -> TestbedConfig:
         WideCamera(columns=128, rows=128, mounting=(DOWN, 0.0, 0.0, DOWN)),
     )
     config = demo_config(10.0, camera=camera)
-    return reader.replace(config, gps=Gps(), solar_strings=SolarStrings(strings=strings), wide_cameras=wide)
+    return reader.replace(
+        config, gps=Gps(), solar_strings=SolarStringsSection(strings=strings), wide_cameras=wide
+    )
 
 
 def orbit_world(boresight: FloatArray | None = None) -> Simulation:

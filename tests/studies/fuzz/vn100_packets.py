@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from hal.drivers.vn100.driver import OUTPUT_SET
-from hal.drivers.vn100.protocol import FIELDS, HEADER_LENGTHS, Layout, build, layout_of, layout_of_header
+from hal.drivers.vn100.protocol import (
+    FIELDS,
+    HEADER_LENGTHS,
+    OutputLayout,
+    build,
+    layout_of,
+    layout_of_header,
+)
 from tests.studies.fuzz.mutation import Draw, chance, integer
 
 REAL_PACKETS = Path(__file__).resolve().parents[4] / "shared" / "data" / "vn100_packets.json"
@@ -88,7 +95,7 @@ def hostile(draw: Draw, packet: bytes) -> bytes:
     return _sealed(layout, bytes(body[: layout.payload.size]).ljust(layout.payload.size, b"\0"))
 
 
-def _sealed(layout: Layout, payload: bytes) -> bytes:
+def _sealed(layout: OutputLayout, payload: bytes) -> bytes:
     body = layout.header + payload
     return b"\xfa" + body + checksum(body).to_bytes(2, "big")
 

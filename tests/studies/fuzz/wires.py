@@ -32,7 +32,7 @@ from flight.loop.worker import message_length, pack_values, unpack_values
 from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
-from hal.drivers.ublox import NAV_PVT, Pvt, StreamParser, frame, reading_of, unpack_pvt
+from hal.drivers.ublox import NAV_PVT, Pvt, UbxParser, frame, reading_of, unpack_pvt
 from hal.interfaces.errors import DeviceError, OutOfRange
 from knightcube.errors import FlightError
 from knightcube.vision.frame_job import FrameFound
@@ -63,7 +63,7 @@ def gps() -> DoorTarget:
     payload = good[6:-2]
 
     def enter(files: Files, whole: bool) -> str:
-        data, parser = files["line"], StreamParser()
+        data, parser = files["line"], UbxParser()
         found = parser.feed(data[: len(data) // 2]) + parser.feed(data[len(data) // 2 :])
         found += parser.feed(bytes(2 * LONGEST_FRAME)) + parser.feed(good)
         if not found or found[-1][:2] != (NAV_PVT, payload):
