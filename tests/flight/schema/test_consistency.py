@@ -1,4 +1,4 @@
-"""The link is open to its peers alone; plain UDP commands stay on the machine."""
+"""Values that contradict each other are refused; the link is open to its peers alone."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from flight.schema.consistency import peer_networks
 from flight.schema.document import ConfigError
 from flight.schema.reader import parse
 from tests.support.flights import CONFIG
+
+ORBIT = CONFIG.parent / "orbit.yaml"
 
 
 def networks(lines: str, commands: str = "{socket: /run/x}") -> list[str]:
@@ -72,3 +74,57 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
             sender.sendto(ping, channel._socket.getsockname())
             assert [data for data, _ in channel.poll()] == heard
             channel.close()
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        ("channel: 1}", "channel: 0}", r"`solar_strings.strings\[1\].channel` is 0: another string"),
+        ("channel: 0}", "channel: 0, address: 0x40}", r"strings\[0\].address` is 0x40, another part's"),
+        ("{normal: [1.0,", "{normal: [1.1,", r"strings\[0\].normal` has length 1.1: give a unit vector"),
+        (
+            "[0.0, 0.0, 0.0, 1.0], columns",
+            "[0.0, 0.1, 0.0, 1.0], columns",
+            r"wide_cameras\[4\].mounting` has",
+        ),
+        (
+            "period: 10.0}\n\n",
+            "period: 10.0, bits: 9}\n\n",
+            r"wide_cameras\[5\].bits` is 9: all respond alike.*8",
+        ),
+        ("  star_tracker: {}", "  objects: {}", "`camera.objects` needs `camera.star_tracker`"),
+        (
+            "  star_tracker: {}",
+            "  star_tracker: {}\n  objects: {needed: 7}",
+            "`camera.objects.needed` is 7: must not be above `within`",
+        ),
+        (
+            "  star_tracker: {}",
+            "  star_tracker: {}\n  device: {kind: v4l2, pixel_format: Y10}",
+            "`camera.bits` is 16: pixels of Y10 have 10$",
+        ),
+        (
+            "duration:",
+            "telemetry: {segment_bytes: 9000, budget_bytes: 17999}\nduration:",
+            "hold two segments",
+        ),
+    ],
+)
+def test_values_that_contradict_each_other_are_refused(right: str, wrong: str, complaint: str) -> None:
+    text = ORBIT.read_text(encoding="utf-8")
+    assert right in text
+    parse(text)
+    with pytest.raises(ConfigError, match=complaint):
+        parse(text.replace(right, wrong, 1))
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        "telemetry: {segment_bytes: 9000, budget_bytes: 18000}",
+        "commands: {udp: 'localhost:5000'}",
+        "commands: {udp: '127.1.2.3:5000'}",
+    ],
+)
+def test_values_at_a_limit_are_accepted(right: str) -> None:
+    parse(ORBIT.read_text(encoding="utf-8").replace("duration:", f"{right}\nduration:", 1))
