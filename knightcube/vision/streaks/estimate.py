@@ -548,10 +548,7 @@ def _rejection(
             f"the body shook: all streaks vary in common by {common.across:.2f} px across and "
             f"{100.0 * common.along:.0f} % in brightness",
         ),
-        (
-            double > _MOST_DOUBLE,
-            "most streaks are double: the body shook, or the point spread has a hole",
-        ),
+        (double > _MOST_DOUBLE, "most streaks are double: the body shook, or the point spread has a hole"),
         (
             known.model_error > settings.worst_uncertainty,
             f"uncertain by {100.0 * known.model_error:.1f} %: the streaks disagree, lens or shutter are not "

@@ -469,11 +469,7 @@ def _add(
 
 
 def _shared_pixels(
-    star: IntArray,
-    view: BlockPixels,
-    weight: Float32Array,
-    images: Float32Array,
-    matrix: FloatArray,
+    star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
 ) -> SharedPixels:
     """Return the derivatives on the pixels that other stars share."""
     block, place = np.divmod(view.crowded, images.shape[2])

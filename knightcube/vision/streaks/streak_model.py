@@ -589,11 +589,7 @@ def coefficients(
         delay, ending, spread = np.asarray(shutter.delay(rows)), of_block, np.arange(len(centre))
     times = (centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5)
     shift, side, speed = _displacements(
-        pinhole,
-        motion,
-        np.concatenate([of_block, of_block, ending, ending]),
-        np.concatenate(times),
-        growing,
+        pinhole, motion, np.concatenate([of_block, of_block, ending, ending]), np.concatenate(times), growing
     )
     cuts = np.cumsum([len(part) for part in times])[:-1]
     shift_a, shift_b, shift_first, shift_last = np.split(shift, cuts)

@@ -14,12 +14,7 @@ from knightcube.reference.corner_streaks.detectors import (
     trajkovic_response,
 )
 from knightcube.reference.corner_streaks.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from knightcube.vision.objects.streak_ends import (
-    chord_outward,
-    extend,
-    find_corners,
-    structure_tensor,
-)
+from knightcube.vision.objects.streak_ends import chord_outward, extend, find_corners, structure_tensor
 from tests.support.streak_frames import expose, star_camera, true_endpoints
 
 # Names of the ring around the centre c: rows are y, columns x.

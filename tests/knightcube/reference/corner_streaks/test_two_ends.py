@@ -28,19 +28,8 @@ from knightcube.reference.corner_streaks.two_ends import attitudes_of_ends, solv
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, SolveStatus
 from knightcube.vision.streaks.streak_result import StreakStatus
 from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
-from tests.support.attitude_errors import (
-    attitude_error,
-    error_in_pixels,
-    field_fraction,
-)
-from tests.support.streak_frames import (
-    expose,
-    random_stars,
-    rate_at,
-    read_out,
-    star_camera,
-    true_endpoints,
-)
+from tests.support.attitude_errors import attitude_error, error_in_pixels, field_fraction
+from tests.support.streak_frames import expose, random_stars, rate_at, read_out, star_camera, true_endpoints
 
 _EXPOSURE = 0.5
 _STREAK_PX = 40.0

@@ -1,1 +1,1 @@
-"""Tests of vision."""
+"""Mirrors `knightcube.vision.streaks`."""

@@ -1,4 +1,4 @@
-"""Frames of the simulator's star camera with the real sky, and what is true in them."""
+"""Simulated frames of the real sky, with their true motion and stars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EPOCH = 2030.0
 
 @dataclass(frozen=True)
 class Scene:
-    """A frame, the motion it was taken under, and the stars it holds, brightest first.
+    """A frame, its true motion, and its stars, brightest first.
 
     `stars` (n, 2) px at mid-exposure, `electrons` (n,).
     """

@@ -1,4 +1,4 @@
-"""The estimator on frames of the simulator, the real sky in them: against truth and against the bound."""
+"""The estimator on simulated frames of the real sky, compared with the truth and the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -21,14 +21,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
 from tests.flight.loop.passing import passed
-from tests.knightcube.vision.streaks.scenes import (
-    CAMERA,
-    SATURATION,
-    Scene,
-    real_sky,
-    taken,
-    turn_of,
-)
+from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, Scene, real_sky, taken, turn_of
 from tests.support.row_exposure import row_scene
 from tests.support.scenes import FIELD, RandomSlew, slew
 from tests.support.scenes import Scene as Drawn
@@ -49,7 +42,7 @@ def _squared(error: FloatArray, covariance: FloatArray) -> float:
     [(0.0, 51.0), (0.0, 205.0), (10.0, 102.0), (45.0, 51.0), (45.0, 205.0), (90.0, 102.0), (90.0, 205.0)],
 )
 def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float, length: float) -> None:
-    """One frame each: 3 degrees of freedom, 16.3 is exceeded once in a thousand; thrice the bound's size."""
+    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
     scene = real_sky(int(theta) + int(length), np.radians(theta), length, 0.2)
     found = _estimated(scene)
     assert found.status is StreakStatus.RATE
@@ -60,7 +53,7 @@ def test_the_rate_is_within_what_its_covariance_and_the_bound_allow(theta: float
     assert _squared(error, scene.bound().covariance) < 9.0 * 3.0
 
 
-def test_stars_at_mid_exposure_are_where_they_were() -> None:
+def test_stars_have_their_true_positions_at_mid_exposure() -> None:
     scene = real_sky(11, np.radians(60.0), 102.0, 0.2)
     found = _estimated(scene)
     nearest = np.linalg.norm(found.stars[found.used][:, None] - scene.stars, axis=2).argmin(axis=1)
@@ -87,14 +80,14 @@ def test_without_a_prior_the_direction_of_time_is_reported_as_ambiguous_and_with
 
 
 def test_directions_at_both_ends_are_joined_by_the_rate() -> None:
-    """A(start to end) takes every star's direction at the start to the one at the end."""
+    """The rotation over the exposure maps every direction at the start to the direction at the end."""
     found = _estimated(real_sky(13, np.radians(30.0), 80.0, 0.2))
     assert found.start_to_end is not None
     turned = found.directions[:, 0] @ attitude_matrix(found.start_to_end).T
     assert np.allclose(turned, found.directions[:, 2], atol=1e-9)
 
 
-def test_stars_at_rest_become_centroids_and_no_rate_is_claimed() -> None:
+def test_stars_at_rest_give_centroids_and_no_rate() -> None:
     scene = real_sky(14, np.radians(90.0), 1e-3, 0.2)
     found = _estimated(scene)
     assert found.status is StreakStatus.TOO_SHORT
@@ -103,7 +96,7 @@ def test_stars_at_rest_become_centroids_and_no_rate_is_claimed() -> None:
     assert np.median(np.linalg.norm(found.stars[:5] - scene.stars[nearest], axis=1)) < 0.05
 
 
-def test_short_streaks_give_a_rate_with_an_honest_covariance() -> None:
+def test_short_streaks_give_a_rate_within_its_covariance() -> None:
     scene = real_sky(15, np.radians(45.0), 6.0, 0.2)
     found = _estimated(scene)
     assert found.covariance is not None
@@ -111,7 +104,7 @@ def test_short_streaks_give_a_rate_with_an_honest_covariance() -> None:
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_saturated_frame_of_a_long_exposure_with_hot_pixels_is_no_obstacle() -> None:
+def test_a_long_exposure_with_saturated_and_hot_pixels_gives_the_rate() -> None:
     camera = scatter_hot_pixels(CAMERA, 300, 3000.0, np.random.default_rng(3))
     scene = real_sky(16, np.radians(45.0), 40.0, 1.0, camera)
     assert np.count_nonzero(scene.pixels >= SATURATION) > 50
@@ -122,7 +115,7 @@ def test_a_saturated_frame_of_a_long_exposure_with_hot_pixels_is_no_obstacle() -
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_gradient_and_eight_bits_are_no_obstacle() -> None:
+def test_eight_bits_and_a_background_gradient_give_the_rate() -> None:
     camera = replace(CAMERA, bits=8, gain=16.0, pedestal=20.0)
     scene = real_sky(17, np.radians(70.0), 60.0, 0.2, camera)
     ramp = np.linspace(0.0, 40.0, 1024).astype(np.uint16)
@@ -134,7 +127,7 @@ def test_a_gradient_and_eight_bits_are_no_obstacle() -> None:
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_rate_that_changes_misfits_the_constant_model_and_fits_the_accelerating_one() -> None:
+def test_a_changing_rate_fits_the_accelerating_model_and_not_the_constant_one() -> None:
     turn = turn_of(np.radians(90.0), 102.0, 0.7)
     scene = taken(np.random.default_rng(18), turn, 0.3 * turn, 0.5)
     constant = _estimated(scene, replace(_SETTINGS, rate_model="constant"))
@@ -148,7 +141,7 @@ def test_a_rate_that_changes_misfits_the_constant_model_and_fits_the_acceleratin
 
 @pytest.mark.parametrize("growth", [0.0, 0.1])
 def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
-    """Left to choose, the fit takes the model that the frame was taken under; its covariance is honest."""
+    """With `auto`, the fit selects the true model, and its error agrees with the covariance."""
     turn = turn_of(np.radians(60.0), 102.0, 0.4)
     scene = taken(np.random.default_rng(24), turn, growth * turn, 0.2)
     found = _estimated(scene)
@@ -160,10 +153,8 @@ def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
 
 
 @pytest.mark.parametrize(("growth", "length"), [(1.0, 50.0), (2.0, 16.0), (-2.0, 90.0)])
-def test_a_rate_that_grows_from_nothing_or_falls_to_it_is_fitted_from_the_start(
-    growth: float, length: float
-) -> None:
-    """To 200 % of the mean over the exposure: the slow ends are bright, the fast ones dim."""
+def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: float) -> None:
+    """The rate changes by up to 200 % of its mean, so that one end of each streak is bright and one dim."""
     turn = turn_of(np.radians(60.0), length, 0.4)
     found = _estimated(taken(np.random.default_rng(25), turn, growth * turn, 0.2))
     assert found.rate is not None
@@ -173,8 +164,8 @@ def test_a_rate_that_grows_from_nothing_or_falls_to_it_is_fitted_from_the_start(
     assert found.acceleration @ turn * 0.2**2 / (turn @ turn) == pytest.approx(growth, abs=0.05)
 
 
-def test_a_step_within_the_exposure_is_fitted_where_navigation_knows_the_course() -> None:
-    """At rest for a third of the exposure, then faster and faster: no growth describes that."""
+def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() -> None:
+    """The camera rests for a third of the exposure and then accelerates, which is no linear change."""
     turn = turn_of(np.radians(70.0), 40.0, 0.9)
     share = 1.0 / 3.0
 
@@ -196,7 +187,7 @@ def test_a_step_within_the_exposure_is_fitted_where_navigation_knows_the_course(
     assert _squared(found.rate - turn, found.covariance) < 16.3
 
 
-def test_a_course_that_is_wrong_is_dropped() -> None:
+def test_a_wrong_course_is_ignored() -> None:
     turn = turn_of(np.radians(60.0), 80.0, 0.4)
     scene = taken(np.random.default_rng(28), turn, np.zeros(3), 0.2)
     course = Course(np.stack([turn, turn, 0.0 * turn]), 1e-5)
@@ -206,14 +197,14 @@ def test_a_course_that_is_wrong_is_dropped() -> None:
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_turn_that_reverses_within_the_exposure_is_beyond_the_model_and_refused() -> None:
+def test_a_rotation_that_reverses_within_the_exposure_is_rejected() -> None:
     turn = turn_of(np.radians(60.0), 50.0, 0.4)
     found = _estimated(taken(np.random.default_rng(25), turn, 4.0 * turn, 0.2))
     assert found.rate is None
 
 
-def test_streaks_of_half_the_field_are_fitted_though_few_are_whole() -> None:
-    """The turn is found by a scan along the circles about the axis, where the regions' lengths mislead."""
+def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
+    """A scan along the circles about the axis finds the angle, because the regions have wrong lengths."""
     scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
     found = _estimated(scene)
     assert found.rate is not None
@@ -223,8 +214,8 @@ def test_streaks_of_half_the_field_are_fitted_though_few_are_whole() -> None:
     assert _squared(error, scene.bound().covariance) < 9.0 * 3.0
 
 
-def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_not() -> None:
-    """20 microseconds a line on streaks of 100 px in 0.2 s: lengths are off by a per cent."""
+def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
+    """A line time of 20 us changes the lengths of 100 px streaks in 0.2 s by one per cent."""
     camera = replace(CAMERA, line_time=2e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(21), turn, np.zeros(3), 0.2, camera)
@@ -239,8 +230,8 @@ def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_n
     assert abs(np.linalg.norm(blind.rate) / size - 1.0) > 0.005
 
 
-def test_a_rolling_shutter_makes_two_motions_of_a_turn_and_its_reverse() -> None:
-    """50 us a line in 0.2 s, across the boresight: 5 % apart. Without a prior the answer spans both."""
+def test_a_rolling_shutter_distinguishes_a_rotation_from_its_reverse() -> None:
+    """The two rates differ by 5 %. Without a prior, the covariance includes both."""
     camera = replace(CAMERA, line_time=5e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(22), turn, np.zeros(3), 0.2, camera)
@@ -262,7 +253,7 @@ def test_a_rolling_shutter_makes_two_motions_of_a_turn_and_its_reverse() -> None
     assert _squared(sign * alone.rate - scene.rate, alone.covariance) < 16.3
 
 
-def test_a_frame_of_noise_a_dead_and_a_frozen_one_are_told() -> None:
+def test_frames_of_noise_dead_frames_and_frozen_frames_have_their_status() -> None:
     noise = np.random.default_rng(19).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
     found = estimate_motion(noise, CAMERA.pinhole, 1.0, _SETTINGS)
     assert found.status is StreakStatus.TOO_FEW
@@ -279,7 +270,7 @@ def test_the_result_is_deterministic_and_travels_between_processes() -> None:
     assert passed(first).used_count == first.used_count
 
 
-def test_nonsense_is_refused() -> None:
+def test_invalid_arguments_raise_an_error() -> None:
     with pytest.raises(FlightError, match="shape"):
         estimate_motion(np.zeros((5, 5), np.uint16), CAMERA.pinhole, 1.0, _SETTINGS)
     with pytest.raises(FlightError, match="exposure"):
@@ -295,7 +286,7 @@ def _share_of_true_ends(scene: Scene, turn: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.8, 1.25, 1.6])
-def test_ends_are_true_under_the_true_turn_only(factor: float) -> None:
+def test_ends_are_correct_under_the_true_rotation_only(factor: float) -> None:
     scene = real_sky(31, np.radians(60.0), 150.0, 0.2)
     turn = scene.rate * scene.exposure
     assert _share_of_true_ends(scene, turn) > 0.8
@@ -303,7 +294,7 @@ def test_ends_are_true_under_the_true_turn_only(factor: float) -> None:
 
 
 @pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.9, 1.0), (1.6, 0.0, 0.4)])
-def test_light_lies_all_along_the_true_path_and_not_along_one_too_long(
+def test_streaks_are_unbroken_along_the_true_path_and_not_along_a_longer_one(
     factor: float, least: float, most: float
 ) -> None:
     scene = real_sky(33, np.radians(70.0), 200.0, 0.2)
@@ -315,7 +306,7 @@ def test_light_lies_all_along_the_true_path_and_not_along_one_too_long(
 
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 450.0), (60.0, 300.0), (20.0, 120.0)])
-def test_the_light_of_the_whole_frame_tells_the_angle_about_a_roughly_known_axis(
+def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
     theta: float, length: float
 ) -> None:
     scene = real_sky(34, np.radians(theta), length, 0.2)
@@ -327,14 +318,14 @@ def test_the_light_of_the_whole_frame_tells_the_angle_about_a_roughly_known_axis
 
 @pytest.mark.parametrize("width", [5, 485, 534])
 def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
-    """A frame whose light fitted a box of 534 samples on a circle of 1,081 ended the estimate."""
+    """A frame with the best box at 534 of 1,081 samples once raised an error."""
     widths = sharper_widths(width, 1081 // 2)
     assert width in widths
     assert widths[-1] <= 1081 // 2
 
 
-def test_hardly_any_streak_is_found_where_there_is_only_noise_near_the_axis_too() -> None:
-    """Close samples on slow circles share pixels: their noise does not average out."""
+def test_noise_gives_hardly_any_streaks_even_near_the_axis() -> None:
+    """Samples on slow circles share pixels, so that their noise is correlated."""
     noise = np.random.default_rng(5).normal(500.0, 10.5, (1024, 1024))
     frame = reduce_frame(np.rint(noise).astype(np.uint16), SATURATION, 1.0)
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
@@ -343,7 +334,7 @@ def test_hardly_any_streak_is_found_where_there_is_only_noise_near_the_axis_too(
     assert len(found.light) <= 1
 
 
-def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:
+def test_pieces_of_streaks_form_chains_and_entire_streaks_do_not() -> None:
     scene = real_sky(32, np.radians(45.0), 120.0, 0.2, faintest=5.5)
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
@@ -361,23 +352,23 @@ def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:
     assert np.mean(in_pieces[:20]) > 0.6
 
 
-def test_a_turn_that_only_streaks_cut_by_the_border_agree_on_is_not_believed() -> None:
-    """Run 216 of the campaign `failures`, seed 2026: 1.37 of the turn fits all but the whole streaks."""
+def test_a_rotation_supported_only_by_streaks_at_the_border_is_rejected() -> None:
+    """In run 216 of seed 2026, 1.37 times the true angle fits all streaks that the border cuts."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(2026, 216).exposed(camera)
     _assert_right_or_refused(camera, scene)
 
 
-def test_a_turn_whose_only_whole_streak_goes_on_is_not_believed() -> None:
-    """Half the field's width: all bright stars show one end only, and 0.88 of the turn fits those."""
+def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
+    """All bright streaks show only one end, and 0.88 of the true angle fits these."""
     camera, generator = StarCameraModel(field_of_view=FIELD), np.random.default_rng((4242, 2, 50, 7))
     theta = np.radians(generator.uniform(0.0, 90.0))
     _assert_right_or_refused(camera, slew(generator, float(theta), 0.5, 0.2, model=camera))
 
 
 @pytest.mark.parametrize("run", [188, 970])
-def test_where_bright_regions_are_several_stars_in_one_the_whole_frame_gives_the_angle(run: int) -> None:
-    """Crowded frames of the campaign `failures`, seed 62: a turn 2.5 times too large explained a little."""
+def test_the_whole_frame_gives_the_angle_if_bright_regions_are_blends(run: int) -> None:
+    """In these crowded frames, 2.5 times the true angle explains some of the light."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(62, run).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
@@ -393,7 +384,7 @@ def _assert_right_or_refused(camera: StarCameraModel, scene: Drawn) -> None:
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:
-    """NEES over 12 frames has 36 degrees of freedom: 19 to 62 in 99 of 100 cases; caution may halve it."""
+    """The sum over 12 frames has 36 degrees of freedom: 19 to 62 in 99 % of cases, half for a safe bound."""
     total = 0.0
     for seed in range(12):
         scene = real_sky(400 + seed, np.radians((0.0, 30.0, 60.0, 90.0)[seed % 4]), 45.0, 0.2)
@@ -405,8 +396,8 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     assert 9.0 < total < 62.0
 
 
-def test_the_rate_reaches_the_bound_where_the_sky_holds_no_hidden_light() -> None:
-    """Stars to V 5.2: rms over the bound of 12 frames, within what chance allows (36 degrees: 1.31)."""
+def test_the_rate_reaches_the_bound_without_faint_stars() -> None:
+    """The ratio to the bound over 12 frames stays below 1.31, the 99 % limit of 36 degrees of freedom."""
     ratios = []
     for seed in range(12):
         theta = np.radians((0.0, 30.0, 60.0, 90.0)[seed % 4])

@@ -1,4 +1,4 @@
-"""The circles about the axis: what is looked at of them is all that the detector shows."""
+"""Running sums on circles about the axis include all samples on the detector."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Regions of light are connected as an independent labelling connects them."""
+"""Bright regions, binning, width of the point spread, limbs and colour mosaics."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _frame(mask: np.ndarray) -> ReducedFrame:
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
 def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
-    """Eight-connected, at every density: sparse, near percolation, and all in one piece."""
+    """Regions are 8-connected at every density, also near percolation."""
     rng = np.random.default_rng(5)
     mask = np.zeros(_SHAPE, dtype=np.bool_)
     mask[1:-1, 1:-1] = rng.random((_SHAPE[0] - 2, _SHAPE[1] - 2)) < share
@@ -58,7 +58,7 @@ def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
 
 
 def test_a_frame_without_light_has_no_regions() -> None:
-    """None at all, and nothing is raised."""
+    """An empty frame raises no error."""
     assert len(find_bright_regions(_frame(np.zeros(_SHAPE, dtype=np.bool_)), 4.5, 48)) == 0
 
 
@@ -78,7 +78,7 @@ def test_a_star_is_in_the_same_direction_in_small_and_large_pixels(
     assert full.unit_vectors(there) == pytest.approx(binning.pinhole.unit_vectors(small), abs=1e-12)
 
 
-def test_sums_keep_light_and_what_is_saturated() -> None:
+def test_binning_keeps_light_and_saturation() -> None:
     pixels = np.arange(64, dtype=np.uint16).reshape(8, 8) * np.uint16(16)
     sums, top = Binning.suited(Pinhole(8, 8, 10.0), 2.0).frame(pixels, 1000.0)
     assert sums.shape == (4, 4)
@@ -90,7 +90,7 @@ def test_sums_keep_light_and_what_is_saturated() -> None:
 
 
 def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> None:
-    """Without binning such frames were refused. Chi-square of 3: 16.3 is exceeded once in a thousand."""
+    """A chi-square of 3 degrees of freedom exceeds 16.3 once in a thousand frames."""
     camera = replace(CAMERA, psf_sigma=3.0)
     scene = real_sky(2, 1.0, 90.0, 0.5, camera)
     settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=3.0)
@@ -108,7 +108,7 @@ def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> 
     assert np.median(apart) < 0.5
 
 
-def test_a_summed_row_takes_as_many_times_as_long_to_the_next_whether_it_is_stated_or_not() -> None:
+def test_the_line_time_of_binned_rows_is_a_multiple_whether_stated_or_not() -> None:
     binning = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0)
     nobody, stated = LikelihoodSettings(), LikelihoodSettings(line_time=1e-5)
     assert binning.settings(nobody).line_time_sigma == pytest.approx(3.0 * nobody.line_time_sigma)
@@ -141,7 +141,7 @@ def _nees(found: MotionResult, scene: Scene) -> float:
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0, 2.0, 3.0])
 @pytest.mark.parametrize(("theta", "length"), [(1.2, 60.0), (0.03, 250.0)])
-def test_the_frame_shows_its_point_spread_also_along_bent_streaks(
+def test_the_measured_width_is_true_for_straight_and_bent_streaks(
     sigma: float, theta: float, length: float
 ) -> None:
     scene = real_sky(2, theta, length, 1.0, replace(CAMERA, psf_sigma=sigma))
@@ -150,24 +150,23 @@ def test_the_frame_shows_its_point_spread_also_along_bent_streaks(
     assert seen == pytest.approx(sigma, rel=0.2, abs=0.15)
 
 
-def test_without_regions_no_point_spread_is_seen() -> None:
+def test_without_regions_no_width_is_measured() -> None:
     dark = np.random.default_rng(1).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
     frame = reduce_frame(dark, SATURATION, 1.0)
     assert measured_psf_sigma(frame, find_bright_regions(frame, 4.5, 48)) is None
 
 
 @pytest.mark.parametrize(("true", "described"), [(1.0, 2.0), (2.0, 1.0), (3.0, 1.0)])
-def test_a_gaussian_of_another_width_than_described_gives_a_rate_within_its_claim(
+def test_a_point_spread_of_another_width_gives_a_rate_within_its_covariance(
     true: float, described: float
 ) -> None:
-    """All of these were refused when only the widths were compared."""
     scene = real_sky(12, np.radians(70.0), 80.0, 1.0, replace(CAMERA, psf_sigma=true))
     found = _found(scene, psf_sigma=described)
     assert _nees(found, scene) < _HONEST
     assert found.psf_sigma == pytest.approx(true, rel=0.1)
 
 
-def test_a_bright_limb_is_left_out_and_the_stars_beside_it_give_the_rate() -> None:
+def test_a_bright_limb_is_excluded_and_the_stars_give_the_rate() -> None:
     scene = real_sky(12, np.radians(70.0), 80.0, 0.2)
     y, x = np.indices(scene.pixels.shape)
     limb = 3000.0 / (1.0 + np.exp(np.clip((np.hypot(x - 512.0, y - 3412.0) - 2600.0) / 4.0, -50.0, 50.0)))
@@ -184,7 +183,7 @@ def test_a_bright_limb_is_left_out_and_the_stars_beside_it_give_the_rate() -> No
     assert _nees(_found(scene, pixels), scene) < _HONEST
 
 
-def test_a_colour_mosaic_is_evened_out_and_one_colour_is_left_as_it_is() -> None:
+def test_a_colour_mosaic_is_equalised_and_a_monochrome_frame_is_unchanged() -> None:
     scene = real_sky(12, np.radians(70.0), 30.0, 1.0)
     mosaic = np.tile(np.array([[1.0, 0.6], [0.5, 1.0]]), (512, 512))
     dark = float(np.median(scene.pixels))
@@ -198,7 +197,7 @@ def test_a_colour_mosaic_is_evened_out_and_one_colour_is_left_as_it_is() -> None
     assert _nees(_found(scene, pixels), scene) < _HONEST
 
 
-def test_a_frame_that_clips_below_what_the_camera_says_is_read_as_clipped() -> None:
+def test_a_frame_that_saturates_below_the_described_level_is_recognised() -> None:
     scene = real_sky(12, np.radians(70.0), 30.0, 1.0)
     pixels = np.minimum(scene.pixels, 600)
     assert np.count_nonzero(pixels == 600) > 50

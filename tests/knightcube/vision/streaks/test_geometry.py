@@ -1,4 +1,4 @@
-"""A lens a little other than described: places through it and back, and how stars move in its picture."""
+"""Distorted pinhole: positions forth and back, and the motion of stars in the distorted image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _RNG = np.random.default_rng(1)
 _STARS, _TIME = _RNG.uniform(50.0, 970.0, (20, 2)), _RNG.uniform(-0.5, 0.5, 20)
 
 
-def test_a_corner_is_displaced_by_its_share_the_axis_by_the_shift_and_back() -> None:
+def test_distortion_moves_corner_and_centre_and_is_inverted() -> None:
     corner = np.array([[0.0, 0.0]])
     lens = DistortedPinhole(1024, 1024, 2903.0, (0.0, 0.0), 0.0, 0.01)
     assert lens.distorted(corner)[0] == pytest.approx([-5.115, -5.115])
@@ -24,11 +24,11 @@ def test_a_corner_is_displaced_by_its_share_the_axis_by_the_shift_and_back() -> 
     assert _LENS.undistorted(_LENS.distorted(_STARS)) == pytest.approx(_STARS, abs=1e-6)
 
 
-def test_a_star_is_named_by_its_pixel_in_the_lens_picture() -> None:
+def test_a_star_is_identified_by_its_distorted_pixel() -> None:
     assert positions(_LENS, _MOTION, _STARS, np.zeros(20)) == pytest.approx(_STARS, abs=1e-6)
 
 
-def test_velocity_and_acceleration_are_those_of_the_places() -> None:
+def test_velocity_and_acceleration_are_derivatives_of_the_position() -> None:
     step = 1e-4
     drawn = paths(_LENS, _MOTION, _STARS, _TIME)
     before, after = (paths(_LENS, _MOTION, _STARS, _TIME + way * step) for way in (-1.0, 1.0))
@@ -40,8 +40,8 @@ def test_velocity_and_acceleration_are_those_of_the_places() -> None:
 
 
 @pytest.mark.parametrize("parameter", range(8))
-def test_sensitivities_are_those_of_the_places(parameter: int) -> None:
-    """Growth is exact to the second order of the angle: a part in a thousand here."""
+def test_sensitivities_are_derivatives_of_the_position(parameter: int) -> None:
+    """The derivative by the acceleration is of second order, here exact to a thousandth."""
     change = np.zeros(8)
     change[parameter] = 1e-5 if parameter < 6 else 1e-2
 

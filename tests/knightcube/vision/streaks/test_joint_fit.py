@@ -1,4 +1,4 @@
-"""Where streaks do not end where a motion says, it is measured by how much, and the motion mended."""
+"""Correction of the length of a motion, and the selection of fitted stars."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, Strea
 
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 120.0), (60.0, 300.0), (20.0, 300.0)])
-def test_streaks_of_the_true_motion_end_where_it_says(theta: float, length: float) -> None:
+def test_the_light_ends_at_the_ends_of_the_true_motion(theta: float, length: float) -> None:
     camera, scene, _ = _seen(theta, length, 1.0)
     edges = find_edges(camera, scene)
     assert np.count_nonzero(np.isfinite(edges.beyond)) >= 8
@@ -41,9 +41,7 @@ def test_streaks_of_the_true_motion_end_where_it_says(theta: float, length: floa
 
 @pytest.mark.parametrize("turned", [0.96, 1.04])
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 200.0), (60.0, 300.0)])
-def test_a_motion_of_the_wrong_length_is_stretched_to_the_right_one(
-    theta: float, length: float, turned: float
-) -> None:
+def test_a_motion_of_wrong_length_is_corrected(theta: float, length: float, turned: float) -> None:
     camera, scene, true = _seen(theta, length, turned)
     mended = stretched(camera, scene)
     assert mended is not None
@@ -51,8 +49,8 @@ def test_a_motion_of_the_wrong_length_is_stretched_to_the_right_one(
     assert stretched(camera, mended) is None
 
 
-def test_stars_of_which_one_end_was_right_are_put_back_between_their_ends() -> None:
-    """A turn 4 % too long, each star's beginning where it should be: its middle is 6 px ahead."""
+def test_stars_with_one_correct_end_are_moved_between_their_ends() -> None:
+    """The rotation is 4 % too long and the first ends are correct, so that the centres are off by 6 px."""
     camera, scene, true = _seen(90.0, 300.0, 1.0)
     ahead = positions(camera.pinhole, true, scene.stars, np.full(_STARS, 0.02))
     off = replace(scene, motion=CameraMotion.steady(1.04 * true.rate), stars=ahead)
@@ -81,8 +79,8 @@ def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
 
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (60.0, 400.0), (30.0, 400.0), (3.0, 250.0)])
-def test_the_pixels_about_streaks_are_foreseen(theta: float, length: float) -> None:
-    """Within a third: straight, oblique, bent and leaving the frame."""
+def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: float) -> None:
+    """The prediction is within a third for straight, oblique and bent streaks and those leaving the frame."""
     camera, scene = _taken(theta, length)
     windows = camera.windows(scene)
     taken = windows.strips.index.size + windows.patches.index.size
@@ -90,8 +88,8 @@ def test_the_pixels_about_streaks_are_foreseen(theta: float, length: float) -> N
     assert 0.67 * taken < foreseen < 1.5 * taken
 
 
-def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In whatever order they come: the faintest are taken out, and the rate is as true as it claims."""
+def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The order of the stars does not matter, and the rate is within its covariance."""
     camera, scene = _taken(60.0, 300.0)
     room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)
@@ -104,8 +102,8 @@ def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPat
     assert error @ np.linalg.solve(done.solution.covariance[:3, :3], error) < 25.0
 
 
-def test_stars_with_a_say_are_fitted_whatever_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However little room there is."""
+def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit of one pixel leaves only the trusted stars."""
     camera, scene = _taken(60.0, 300.0)
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", 1.0)
     done = joint_fit.joint_fit(camera, scene)
@@ -113,8 +111,8 @@ def test_stars_with_a_say_are_fitted_whatever_they_need(monkeypatch: pytest.Monk
     assert len(done.scene.light) == _TRUSTED
 
 
-def test_a_fit_whose_point_spread_outgrows_the_first_is_none() -> None:
-    """Stars twice as wide as the fit set out with are not those it was given."""
+def test_a_fit_with_a_much_wider_point_spread_is_rejected() -> None:
+    """Stars twice as wide as the initial width are not the given stars."""
     camera, scene = _taken(60.0, 300.0)
     assert joint_fit.joint_fit(camera, scene) is not None
     assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None

@@ -1,4 +1,4 @@
-"""Whether stars contradict each other, by draws of what they would say under noise alone."""
+"""Scatter of the stars' equations, by random draws of their noise."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def _drawn(noise: float, blind: bool = False) -> StarEquations:
 
 @pytest.mark.parametrize("blind", [False, True])
 @pytest.mark.parametrize("noise", [1.0, 3.0])
-def test_a_chi_square_of_a_degree_of_freedom(noise: float, blind: bool) -> None:
-    """In whatever units the parameters are, and whatever a star knows nothing of."""
+def test_the_scatter_of_noise_is_one_per_degree_of_freedom(noise: float, blind: bool) -> None:
+    """Neither the units of the parameters nor undetermined directions matter."""
     assert contradiction(_drawn(noise, blind)) == pytest.approx(noise**2, rel=0.1)
 
 
-def test_one_star_contradicts_nobody() -> None:
+def test_a_single_star_has_no_scatter() -> None:
     many = _drawn(3.0)
     assert contradiction(StarEquations(_KEPT, many.information[:1], many.score[:1])) == 1.0

@@ -1,4 +1,4 @@
-"""The streak model against brute force: thousands of instants, each integrated over every pixel."""
+"""The streak model compared with thousands of instants, each integrated over every pixel."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _modelled(
 def test_the_light_is_that_of_brute_force(
     turn: list[float], star: list[float], sigma: float, allowed: float
 ) -> None:
-    """Within a thousandth of the peak at 1 px: far below the noise of any pixel that is not saturated."""
+    """The error is below a thousandth of the peak, far below the noise of an unsaturated pixel."""
     motion = CameraMotion.steady(np.array(turn))
     truth = _brute(motion, np.array(star), sigma)
     covered, light, _ = _modelled(motion, np.array(star), sigma)
@@ -70,7 +70,7 @@ def test_the_light_is_that_of_brute_force(
 @pytest.mark.parametrize("growth", [0.3, 1.0, 2.0, -2.0])
 @pytest.mark.parametrize("length", [16.0, 30.0, 90.0])
 def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, length: float) -> None:
-    """From rest the light piles up where the star is slow: a patch serves there, strips beyond."""
+    """A patch models the bright slow end of a motion from rest, strips model the rest."""
     turn = np.array([0.4, 0.9, 0.1]) * length / _PINHOLE.focal_length
     motion, star = CameraMotion(turn, growth * turn), np.array([160.3, 155.2])
     truth = _brute(motion, star, 1.0).reshape(-1)
@@ -88,7 +88,7 @@ def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, 
 
 @pytest.mark.parametrize(("turn", "star"), _CASES)
 def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[float]) -> None:
-    """Within 2 %: they set the covariance and the speed of convergence, not where it converges to."""
+    """An accuracy of 2 % suffices, because derivatives do not change the solution."""
     motion, place = CameraMotion.steady(np.array(turn)), np.array(star)
     covered, _, changes = _modelled(motion, place, 1.0)
     for k in range(5):
@@ -101,8 +101,8 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
         assert np.linalg.norm(found - truth) < 0.02 * np.linalg.norm(truth)
 
 
-def test_a_path_reaches_beyond_both_its_ends_whatever_its_times() -> None:
-    """A rolling shutter's times are any numbers: the pixels about the last instant are as many as before."""
+def test_strips_extend_beyond_both_ends_for_any_times() -> None:
+    """With a rolling shutter, times have arbitrary values; both ends have the same number of pixels."""
     motion, star = CameraMotion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
     rng = np.random.default_rng(11)
     for begin, end in np.sort(rng.uniform(-0.55, 0.55, (200, 2)), axis=1):
@@ -116,8 +116,8 @@ def test_a_path_reaches_beyond_both_its_ends_whatever_its_times() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.9, 2.5])
-def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they_need_be(turn: float) -> None:
-    """Through several diagonals: against the distance of every pixel from a path of hundreds of instants."""
+def test_strips_of_a_bent_streak_contain_each_pixel_once_in_short_lines(turn: float) -> None:
+    """The pixels are compared with the distance of every pixel from a finely sampled path."""
     motion, star, width = CameraMotion.steady(np.array([0.0, 0.02, turn])), np.array([231.3, 214.6]), 3.7
     strips = cut_strips(_PINHOLE, motion, star[None], np.array([[-0.5, 0.5]]), width)
     times = np.bincount(strips.index[strips.inside], minlength=320 * 320).reshape(320, 320)
@@ -134,7 +134,7 @@ def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they
 
 
 def test_a_short_bent_streak_is_summed_exactly() -> None:
-    """Five px from the axis at a radian: no line at all."""
+    """A star 5 px from the axis, rotated by a radian, is far from a straight line."""
     motion, star = CameraMotion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])
     patches = streak_model.cut_patches(_PINHOLE, star[None], 10)
     light, _ = streak_model.spot_derivatives(_PINHOLE, motion, Shutter(), star[None], 1.0, patches)
@@ -158,16 +158,16 @@ def test_sensitivities_are_finite_differences_of_the_path() -> None:
 
 
 @pytest.mark.parametrize("growth", [[0.0, 0.0, 0.0], [0.02, 0.03, -0.05]])
-def test_velocities_beside_sensitivities_are_those_of_the_paths(growth: list[float]) -> None:
-    """At constant rate and at one that changes: each has its own formula, from the flow and from the turn."""
+def test_velocities_with_the_sensitivities_equal_those_of_the_paths(growth: list[float]) -> None:
+    """The two functions use different formulas, for constant and for changing rates."""
     motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array(growth))
     stars, time = np.array([[100.0, 250.0], [280.0, 40.0]]), np.array([-0.4, 0.3])
     _, velocity = sensitivities_and_velocity(_PINHOLE, motion, stars, time)
     assert np.allclose(velocity, paths(_PINHOLE, motion, stars, time).velocity, rtol=1e-9)
 
 
-def test_the_turn_of_a_rate_that_changes_is_that_of_many_small_turns() -> None:
-    """The Magnus terms against 4000 steps of constant rate."""
+def test_the_rotation_of_a_changing_rate_equals_many_small_rotations() -> None:
+    """The Magnus expansion is compared with 4,000 steps of constant rate."""
     motion = CameraMotion(np.array([0.1, -0.2, 0.3]), np.array([0.1, 0.15, 0.1]))
     vector = np.array([0.02, -0.03, 1.0])
     steps = 4000

@@ -1,4 +1,4 @@
-"""What a fit claims: errors of the lens as turns, and their correction by the stars themselves."""
+"""Uncertainty of the rotation: calibration errors and their correction by the stars, and residuals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_an_exact_camera_has_no_errors() -> None:
     assert _seeming(EXACT)[0].shape == (25, 3, 0)
 
 
-def test_a_wrong_axis_seems_to_be_a_turned_camera() -> None:
+def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
     """A shift by dx is to first order a rotation by dx / f about y, which turns the rate with it.
 
     Of that only one of the two components of the motion asks: the flow of the second order, which the shift
@@ -68,8 +68,8 @@ def test_a_wrong_axis_seems_to_be_a_turned_camera() -> None:
     assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
 
 
-def test_a_wrong_focal_length_seems_to_be_another_rate_and_a_wrong_line_time_too() -> None:
-    """Across the boresight a rate is a length over the focal length; rows make it longer by their delay."""
+def test_wrong_focal_length_and_wrong_line_time_appear_as_another_rate() -> None:
+    """For an axis across the boresight, the rate is a length divided by the focal length."""
     found = _together(*_seeming(replace(EXACT, focal_length=0.01)))
     assert found[:, 0] == pytest.approx(0.01 * _TURN, abs=0.1 * 0.01 * float(np.linalg.norm(_TURN)))
     late = _together(*_seeming(replace(EXACT, line_time=1e-5)))
@@ -77,8 +77,8 @@ def test_a_wrong_focal_length_seems_to_be_another_rate_and_a_wrong_line_time_too
     assert abs(late[:, 0] @ _TURN) / (_TURN @ _TURN) == pytest.approx(rows_crossed, rel=0.1)
 
 
-def test_an_untold_shutter_seems_to_be_more_of_the_same_turn_to_each_star() -> None:
-    """It lengthens paths and bends them no more: long ones about a near axis show their curvature well."""
+def test_an_unstated_shutter_appears_as_a_larger_rotation_for_each_star() -> None:
+    """The delay lengthens the paths without changing their curvature."""
     turn = np.array([0.07, 0.05, -0.05])
     late, _ = _seeming(replace(EXACT, line_time=1e-5), turn)
     size = float(np.linalg.norm(turn))
@@ -86,7 +86,7 @@ def test_an_untold_shutter_seems_to_be_more_of_the_same_turn_to_each_star() -> N
     assert np.linalg.norm(late[:, :, 0] - along[:, None] * turn / size) < 0.05 * np.linalg.norm(along)
 
 
-def test_a_shutter_that_nobody_describes_may_roll_and_one_that_is_described_may_not() -> None:
+def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() -> None:
     assert LikelihoodSettings().line_time_sigma == UNSTATED
     assert LikelihoodSettings(line_time=0.0).line_time_sigma == 0.0
     assert LikelihoodSettings(line_time=2e-5).line_time_sigma == 0.0
@@ -97,8 +97,8 @@ def test_a_shutter_that_nobody_describes_may_roll_and_one_that_is_described_may_
     assert LikelihoodSettings(line_time=2e-5, knowledge=known).line_time_sigma == 3e-6
 
 
-def test_stars_that_show_the_cameras_error_correct_it_and_others_widen_the_covariance() -> None:
-    """Distortion of 1 % is seen a hundred times beyond the noise; one of chance is left alone."""
+def test_significant_calibration_errors_are_corrected_and_others_widen_the_covariance() -> None:
+    """A distortion of 1 % exceeds the noise a hundredfold; a chance error is not corrected."""
     seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
     score = np.einsum("nij,njk->ni", precise, seeming)
@@ -114,7 +114,7 @@ def test_stars_that_show_the_cameras_error_correct_it_and_others_widen_the_covar
     assert np.trace(done.added) == pytest.approx(float(mean @ mean), rel=0.05)
 
 
-def test_what_is_not_known_of_the_camera_widens_the_claim_and_leaves_the_rate() -> None:
+def test_an_uncertain_camera_widens_the_covariance_and_keeps_the_rate() -> None:
     scene = real_sky(12, np.radians(70.0), 102.0, 0.2)
 
     def found(**more: object) -> tuple[FloatArray, FloatArray]:
@@ -133,7 +133,7 @@ def test_what_is_not_known_of_the_camera_widens_the_claim_and_leaves_the_rate() 
     assert np.trace(doubted) > 10.0 * np.trace(exact)
 
 
-def test_short_streaks_of_another_point_spread_are_refused_with_a_reason() -> None:
+def test_short_streaks_of_another_point_spread_are_rejected_with_a_reason() -> None:
     scene = real_sky(12, np.radians(70.0), 12.0, 0.2, replace(CAMERA, psf_sigma=1.5))
     settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
@@ -141,7 +141,7 @@ def test_short_streaks_of_another_point_spread_are_refused_with_a_reason() -> No
     assert "point spread is 1.4" in result.reason
 
 
-def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
+def test_two_stars_give_a_rate_with_a_large_covariance() -> None:
     turn = turn_of(np.radians(60.0), 90.0, 0.3)
     middle = np.array([0.0, 0.0, 0.0, 1.0])
     stars = CAMERA.pinhole.unit_vectors(np.array([[300.0, 350.0], [700.0, 560.0]]))
@@ -159,8 +159,8 @@ def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(turn / 0.2)
 
 
-def test_what_is_hidden_in_streaks_does_not_move_their_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Crowded frames of `failures`: the brightest streaks, fitted with all on their pixels, know more."""
+def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In crowded frames, the brightest streaks fitted with all hidden stars give smaller errors."""
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(saturation=SATURATION, gain=camera.gain, knowledge=EXACT)
     errors = []
