@@ -264,10 +264,8 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
     # Fraction of correct ends, or of unbroken streaks if that is smaller; 1 if none can be judged.
-    times = exposure_bounds(camera.pinhole, done.scene.motion, camera.shutter, done.scene.stars)
-    seen = camera.frame, camera.pinhole, done.scene.motion, done.scene.stars, done.scene.light, times
-    correct = true_ends(*seen)
-    judged = correct[np.isfinite(correct)], unbroken(*seen)
+    correct = true_ends(camera, done.scene)
+    judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
     explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _ENDS_BY_CHANCE, 0.02)
     convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
@@ -321,11 +319,10 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
         return StreakVerdict.REJECTED
     deciding = scene.select(scene.trusted)
-    times = exposure_bounds(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
-    seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
-    if abs(scene.motion.relative_acceleration) > _UNEVEN and trailing_fraction(*seen) > _MOST_TRAILING:
+    uneven = abs(scene.motion.relative_acceleration) > _UNEVEN
+    if uneven and trailing_fraction(camera, deciding) > _MOST_TRAILING:
         return StreakVerdict.REJECTED
-    ends, lit = true_ends(*seen), unbroken(*seen)
+    ends, lit = true_ends(camera, deciding), unbroken(camera, deciding)
     known = np.isfinite(ends)
     both = known.all(axis=1)
     right = float(np.mean(ends[known])) if known.any() else 1.0

@@ -9,6 +9,7 @@ settle there; the end of the light along a longer stretch then corrects the leng
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -318,114 +319,88 @@ _TRAIL = 0.08
 _DARK = 0.15
 
 
-def true_ends(
-    frame: ReducedFrame,
-    pinhole: Pinhole,
-    motion: CameraMotion,
-    stars: FloatArray,
-    light: FloatArray,
-    times: FloatArray,
-) -> FloatArray:
-    """Return an array (n, 2) with 1 for the ends at which the light ends, and 0 for other ends.
+def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
+    """Return an array (n, 2) with 1 for the ends of streaks at which the light ends, and 0 for other ends.
 
-    Ends outside the detector and those of streaks too short to judge are NaN. `times` (n, 2) are the times
-    between which stars (n, 2) px of `light` (n,) counts are exposed.
+    Ends outside the detector and those of streaks too short to judge are NaN.
     """
-    out = np.full((len(stars), 2), np.nan)
-    length = path_lengths(pinhole, motion, stars)
+    out = np.full((len(scene.stars), 2), np.nan)
+    length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     long = length > 2.0 * (_FROM_END + _LEAST_STRETCH)
     if not long.any():
         return out
-    stars, light, times, length = stars[long], light[long], times[long], length[long]
+    scene, length = scene.select(long), length[long]
+    instants = np.linspace(-0.5, 0.5, _INSTANTS)
+    # The small term in time keeps the progress increasing during a rest.
+    progress = np.maximum.accumulate(scene.motion.progress(instants)) + 1e-9 * np.arange(_INSTANTS)
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
-    for end, sign in ((0, -1.0), (1, 1.0)):
-        steady, there, speed = _end_motion(pinhole, motion, stars, times[:, end])
-        part = _relative_brightness(motion, sign, _FROM_END / speed, (_FROM_END + stretch) / speed)
-        expected = expected_brightness(light, length) * part
+    for end, sign, steady, there, speed in _end_motions(camera, scene):
+        # Brightness of the stretch relative to the mean, from the time that a star spends there.
+        near, far = _FROM_END / speed, (_FROM_END + stretch) / speed
+        last = progress[-1 if sign > 0.0 else 0]
+        begin, stop = (np.interp(last - sign * distance, progress, instants) for distance in (near, far))
+        relative = np.abs(stop - begin) / np.maximum(far - near, 1e-9)
+        expected = expected_brightness(scene.light, length) * relative
         time = sign * away / speed[:, None]
-        within, beyond = (brightness(frame, pinhole, steady, there, t)[0] for t in (-time, time))
+        within, beyond = (brightness(camera, steady, there, t)[0] for t in (-time, time))
         known = np.isfinite(within) & np.isfinite(beyond)
         true = (within > _HALF * expected) & (beyond < _HALF * expected)
         out[long, end] = np.where(known, true, np.nan)
     return out
 
 
-def trailing_fraction(
-    frame: ReducedFrame,
-    pinhole: Pinhole,
-    motion: CameraMotion,
-    stars: FloatArray,
-    light: FloatArray,
-    times: FloatArray,
-) -> float:
+def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
     """Return the fraction of stars with faint light beyond an end, of the stars that can be judged.
 
-    An error of the rate's change leaves such a trail. The arguments are those of `true_ends`.
+    An error of the rate's change leaves such a trail.
     """
-    faint = _TRAIL * expected_brightness(light, path_lengths(pinhole, motion, stars))
+    length = path_lengths(camera.pinhole, scene.motion, scene.stars)
+    faint = _TRAIL * expected_brightness(scene.light, length)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * _LEAST_STRETCH
-    judged, lit = np.zeros(len(stars), dtype=np.bool_), np.zeros(len(stars), dtype=np.bool_)
-    for end, sign in ((0, -1.0), (1, 1.0)):
-        steady, there, speed = _end_motion(pinhole, motion, stars, times[:, end])
-        mean, deviation = brightness(frame, pinhole, steady, there, sign * away / speed[:, None])
+    judged, lit = np.zeros((2, len(scene.stars)), dtype=np.bool_)
+    for _, sign, steady, there, speed in _end_motions(camera, scene):
+        mean, deviation = brightness(camera, steady, there, sign * away / speed[:, None])
         known = np.isfinite(mean) & (faint > _LEAST_SIGNIFICANCE * deviation)
         judged |= known
         lit |= known & (mean > faint)
     return float(np.mean(lit[judged])) if judged.any() else 0.0
 
 
-def _end_motion(
-    pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
-) -> tuple[CameraMotion, FloatArray, FloatArray]:
-    """Return a steady motion, the ends of the paths (n, 2) px at `times` (n,), and the speed (n,) there.
+def _end_motions(
+    camera: FitProblem, scene: StreakScene
+) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
+    """Yield number and outward sign of both ends, a steady motion, the ends (n, 2) px, and their speed (n,).
 
     The motion itself may be at rest at an end, so that the steady motion extends the paths.
     """
-    there = positions(pinhole, motion, stars, times)
-    steady = CameraMotion.steady(motion.rotation)
-    velocity = paths(pinhole, steady, there, np.zeros(len(there))).velocity
-    return steady, there, np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
+    times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
+    steady = CameraMotion.steady(scene.motion.rotation)
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        there = positions(camera.pinhole, scene.motion, scene.stars, times[:, end])
+        velocity = paths(camera.pinhole, steady, there, np.zeros(len(there))).velocity
+        yield end, sign, steady, there, np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
 
 
-def _relative_brightness(motion: CameraMotion, sign: float, near: FloatArray, far: FloatArray) -> FloatArray:
-    """Return the brightness (n,) of the path between distances `near` and `far` (n,) of an end.
-
-    The brightness is relative to the mean, distances are fractions of the path. `sign` is 1 for the last end
-    and -1 for the first.
-    """
-    time = np.linspace(-0.5, 0.5, _INSTANTS)
-    progress = np.maximum.accumulate(motion.progress(time))
-    # The small term in time keeps the progress increasing during a rest.
-    progress += 1e-9 * np.arange(_INSTANTS)
-    end = progress[-1 if sign > 0.0 else 0]
-    begin, stop = (np.interp(end - sign * distance, progress, time) for distance in (near, far))
-    return np.asarray(np.abs(stop - begin) / np.maximum(far - near, 1e-9))
-
-
-def unbroken(
-    frame: ReducedFrame,
-    pinhole: Pinhole,
-    motion: CameraMotion,
-    stars: FloatArray,
-    light: FloatArray,
-    times: FloatArray,
-) -> FloatArray:
+def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return 1 for each star that is bright along its entire path on the detector, else 0; (k,).
 
-    Stars too short or too faint to judge are omitted. The arguments are those of `true_ends`.
+    Stars too short or too faint to judge are omitted.
     """
-    length = path_lengths(pinhole, motion, stars)
+    length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     long = length > _WITHIN * _LEAST_STRETCH
     if not long.any():
         return np.empty(0)
-    stars, light, times, length = stars[long], light[long], times[long], length[long]
+    scene, length = scene.select(long), length[long]
+    times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     share = (np.arange(_WITHIN * _WITHIN_SAMPLES) + 0.5) / (_WITHIN * _WITHIN_SAMPLES)
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
-    each = np.repeat(stars, _WITHIN, axis=0)
-    mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    rate = np.clip(motion.relative_rate(time.reshape(-1)), _SLOW, None).reshape(len(each), _WITHIN_SAMPLES)
-    expected = np.repeat(expected_brightness(light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
+    each = np.repeat(scene.stars, _WITHIN, axis=0)
+    mean, deviation = brightness(camera, scene.motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
+    rate = np.clip(scene.motion.relative_rate(time.reshape(-1)), _SLOW, None).reshape(
+        len(each), _WITHIN_SAMPLES
+    )
+    expected = np.repeat(expected_brightness(scene.light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
     known = np.isfinite(mean) & (expected > _LEAST_SIGNIFICANCE * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
     known_of = known.reshape(-1, _WITHIN).sum(axis=1)
@@ -439,13 +414,13 @@ def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
 
 
 def brightness(
-    frame: ReducedFrame, pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray
+    camera: FitProblem, motion: CameraMotion, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mean counts (n,) of pixels along stretches of paths, and their standard deviations (n,).
 
     `time` (n, s) are the instants of each stretch. The mean is NaN if too few pixels are usable.
     """
-    samples = time.shape[1]
+    frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
     way = there.velocity / np.maximum(np.linalg.norm(there.velocity, axis=1, keepdims=True), 1e-3)
     normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
@@ -519,9 +494,8 @@ def find_edges(camera: FitProblem, scene: StreakScene) -> LightEnds:
     expected = expected_brightness(scene.light[long], own)[:, None]
     for end, sign in ((0, -1.0), (1, 1.0)):
         time = times[:, end, None] + sign * outward / own[:, None]
-        mean, deviation = brightness(
-            camera.frame, camera.pinhole, motion, np.repeat(stars, _STEPS, axis=0), time.reshape(-1, 1)
-        )
+        repeated = np.repeat(stars, _STEPS, axis=0)
+        mean, deviation = brightness(camera, motion, repeated, time.reshape(-1, 1))
         mean, deviation = mean.reshape(-1, _STEPS), np.maximum(deviation.reshape(-1, _STEPS), 1e-6)
         seen = np.minimum(np.maximum(mean, -expected), _CAP * expected)
         # Log-likelihood ratio of a lit and a dark path, accumulated outwards.

@@ -15,8 +15,8 @@ from knightcube.vision.camera.lens import CameraKnowledge, Lens
 from knightcube.vision.streaks.estimate import estimate_motion, estimate_rate
 from knightcube.vision.streaks.faint_stars import find_faint, frame_angles, sharper_widths
 from knightcube.vision.streaks.frame import reduce_frame
-from knightcube.vision.streaks.geometry import CameraMotion, Course, chained_stars
-from knightcube.vision.streaks.joint_fit import true_ends, unbroken
+from knightcube.vision.streaks.geometry import CameraMotion, Course, Shutter, StreakScene, chained_stars
+from knightcube.vision.streaks.joint_fit import FitProblem, true_ends, unbroken
 from knightcube.vision.streaks.settings import LikelihoodSettings, knowledge_of_pinhole
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel, scatter_hot_pixels
@@ -277,20 +277,21 @@ def test_invalid_arguments_raise_an_error() -> None:
         estimate_motion(np.zeros((1024, 1024), np.uint16), CAMERA.pinhole, 0.0, _SETTINGS)
 
 
-def _share_of_true_ends(scene: Scene, turn: FloatArray) -> float:
+def _brightest(scene: Scene, factor: float) -> tuple[FitProblem, StreakScene]:
+    """Return the frame and its 12 brightest stars under `factor` times the true rotation."""
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
-    times = np.tile([-0.5, 0.5], (12, 1))
-    light = scene.electrons[:12]
-    motion = CameraMotion.steady(turn)
-    return float(np.nanmean(true_ends(frame, CAMERA.pinhole, motion, scene.stars[:12], light, times)))
+    camera = FitProblem(frame, CAMERA.pinhole, Shutter(), _SETTINGS, 1.0)
+    motion = CameraMotion.steady(factor * scene.rate * scene.exposure)
+    everyone = np.ones(12, dtype=np.bool_)
+    stars, light = scene.stars[:12], factor * scene.electrons[:12]
+    return camera, StreakScene(motion, 1.04, stars, light, np.zeros(12), everyone)
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.8, 1.25, 1.6])
 def test_ends_are_correct_under_the_true_rotation_only(factor: float) -> None:
     scene = real_sky(31, np.radians(60.0), 150.0, 0.2)
-    turn = scene.rate * scene.exposure
-    assert _share_of_true_ends(scene, turn) > 0.8
-    assert _share_of_true_ends(scene, factor * turn) < 0.5
+    assert float(np.nanmean(true_ends(*_brightest(scene, 1.0)))) > 0.8
+    assert float(np.nanmean(true_ends(*_brightest(scene, factor)))) < 0.5
 
 
 @pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.9, 1.0), (1.6, 0.0, 0.4)])
@@ -298,9 +299,7 @@ def test_streaks_are_unbroken_along_the_true_path_and_not_along_a_longer_one(
     factor: float, least: float, most: float
 ) -> None:
     scene = real_sky(33, np.radians(70.0), 200.0, 0.2)
-    frame = reduce_frame(scene.pixels, SATURATION, 1.0)
-    times, motion = np.tile([-0.5, 0.5], (12, 1)), CameraMotion.steady(factor * scene.rate * scene.exposure)
-    whole = unbroken(frame, CAMERA.pinhole, motion, scene.stars[:12], factor * scene.electrons[:12], times)
+    whole = unbroken(*_brightest(scene, factor))
     assert len(whole) >= 8
     assert least <= np.mean(whole) <= most
 
