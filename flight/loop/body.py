@@ -90,8 +90,8 @@ class Steered:
     Attributes:
         reference: the body's `Reference` now; None without a path.
         dipole: (3,) A m^2, commanded.
-        currents: (3,) A, sent to the driver: after reallocation, with the coil watch's probe, and zero when a
-            fault of this cycle switched the coils off.
+        currents: (3,) A, sent to the driver: after reallocation, with the coil monitor's probe, and zero when
+            a fault of this cycle switched the coils off.
     """
 
     state: SteeringState
@@ -206,7 +206,7 @@ class WindowedLaw(Protocol):
 
 
 class Tracker(Protocol):
-    """Turns estimate and reference into a command, once a control cycle."""
+    """Computes a command from estimate and reference, once in a control cycle."""
 
     def command(self, estimate: Estimate, reference: Any) -> CoilCommand:
         """Return the command that keeps the body on the reference."""

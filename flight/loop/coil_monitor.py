@@ -282,7 +282,7 @@ class CoilMonitorSettings:
         current_uncertainty: A, bound on each driven coil's deviation from its command.
         gain_error: relative bound: resistance, supply, and the monitor's sampling of the chopped current.
         monitor_noise: A, bound, at any current.
-        window_ns: averaging time of a reading's mean. A longer gap between readings resets the watch.
+        window_ns: averaging time of a reading's mean. A longer gap between readings resets the monitor.
         persistence: readings in a row that fit no healthy circuit, until there is a suspicion.
         settle: readings after that until the window lies wholly after the fault.
         evidence: readings that a verdict needs.
@@ -324,7 +324,7 @@ class CurrentValidity:
         now: whether the currents in force are known.
         since_last_look: whether the chip kept all commands since the previous look.
         since_ns: time since which they are known.
-        uncertain_since_ns: time from which currents assumed so far turn out to be uncertain; None if none do.
+        uncertain_since_ns: time from which the assumed currents are uncertain after all; else None.
     """
 
     now: bool
@@ -540,7 +540,7 @@ class CoilMonitor:
         In a tumble an axis that looks reversed rests without a verdict.
         """
         for axis in response.reversed_axes():
-            # An uncommanded current turns the body too.
+            # An uncommanded current rotates the body too.
             if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
                 continue
             if response.fastest <= self.tumble_rate:
@@ -622,7 +622,7 @@ class CoilMonitor:
         }
 
     def _look_at_legs(self, reading: PowerReading) -> None:
-        """Search for a leg stuck high, if this conversion was made under the present brakes."""
+        """Search for a leg stuck high, if this ADC sample was made under the present brakes."""
         commands = self._commands
         if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
             return
@@ -639,7 +639,7 @@ class CoilMonitor:
             self.interrupted(reading.time_ns)
 
     def _predictions(self, reading: PowerReading) -> list[Predicted]:
-        """Return a reading's newest conversion, and its mean unless it mixes states, with predictions."""
+        """Return predictions of a reading's newest ADC sample, and of its mean if it has one state."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns = reading.time_ns - self._settings.window_ns
         if begin_ns >= self._unmixed_ns:
@@ -677,7 +677,7 @@ class CoilMonitor:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Give a verdict if the evidence leaves one axis; drop the suspicion if the readings are healthy."""
+        """Give a verdict if the evidence leaves one axis; discard the suspicion of healthy readings."""
         evidence = tuple(self._evidence)
         if len(evidence) < self._settings.evidence:
             return

@@ -49,12 +49,12 @@ NONE: Axes = (False, False, False)
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """A conversion made entirely under the present brakes, and the current that healthy coils would draw.
+    """An ADC sample made entirely under the present brakes, and the expected current of healthy coils.
 
     Attributes:
         current: A, measured.
         least, most: A, bounds of the total current of healthy coils.
-        spread: A, range of the total command in the conversion's window.
+        spread: A, range of the total command in the sample's window.
         at_rest: the axes that were not driven and have no known fault.
         driven: whether any axis was driven.
     """
@@ -130,9 +130,9 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""A single conversion, at an unknown time in its window; 18 % (`hal.drivers.ina219`)."""
+"""Error of a single ADC sample at an unknown time in its window, 18 % (`hal.drivers.ina219`)."""
 MEAN = Sampling(0.02, 0.25)
-"""The mean of five conversions; the remaining 7 % are in the gain, common to readings in a row."""
+"""Error of the mean of five ADC samples; the remaining 7 % are in the gain, common to all readings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class CoilCommands:
         return np.array(sampled)
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest conversion with the bounds of the current that healthy coils would draw.
+        """Return the newest ADC sample with the bounds of the current of healthy coils.
 
         `known` holds the known faults by axis.
         """
@@ -305,7 +305,7 @@ class ResponseSettings:
         inertia: (3, 3) kg m^2.
         dipole_per_ampere: n A of each coil, m^2.
         rate_noise: rad/s, standard deviation of a sample of the rate about each axis.
-        free: (3,) whether the body can turn about each axis; on a thread only about y.
+        free: (3,) whether the body can rotate about each axis; on a thread only about y.
         bin_samples: samples of the rate in a bin.
         bins: differences of bins in the fit.
         model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.

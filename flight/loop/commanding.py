@@ -52,11 +52,11 @@ from flight.schema.sections import CommandStep, Config, Health, Modes
 S = TypeVar("S", Modes, Health)
 
 PROVEN_NS = 60_000_000_000
-"""Flight time after which a loaded table stays, however the flight ends."""
+"""Flight time (ns) after which a loaded table stays even if the flight ends uncleanly."""
 
 
 class ParameterTable:
-    """Owns the table of parameters that flies."""
+    """The table of parameters in force."""
 
     def __init__(
         self,
@@ -81,10 +81,10 @@ class ParameterTable:
         self._loaded_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Fly the kept table, where this version and configuration can; report the table that flies."""
+        """Apply the stored table, if this version and configuration accept it; record the table in force."""
         self._loaded_ns = now_ns
         if kept := self._table.values:
-            # Of another version of the software a key may be gone or new: there the configuration holds.
+            # Another version of the software may have added or removed keys; the configuration fills them.
             table = {key: kept.get(key, value) for key, value in self._configured.items()}
             if problem := problem_of(table) or self._adopt(table):
                 self._table = msgspec.structs.replace(self._table, values={}, proven=True)
@@ -92,12 +92,12 @@ class ParameterTable:
         self.dump(now_ns)
 
     def run(self, now_ns: int) -> None:
-        """Trust a table that has flown long enough."""
+        """Mark a table that has flown for `PROVEN_NS` as proven."""
         if not self._table.proven and now_ns - self._loaded_ns >= PROVEN_NS:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Fly another table in place of the one whose CRC is `replaced`; return why not, empty when done."""
+        """Replace the table whose CRC is `replaced`; return why the new table is refused, else ""."""
         if replaced != self._crc:
             return f"the table that flies is {self._crc:08x}, not {replaced:08x}: dump it and look again"
         before = self._table.values if self._table.proven else self._table.before
@@ -133,7 +133,7 @@ class ParameterTable:
             self._keeper.note_table(table)
 
     def _adopt(self, values: Mapping[str, float]) -> str:
-        """Have everybody go on with a table; return why the schema refuses it, empty when done."""
+        """Give a table to all tasks that use it; return why the schema refuses it, else ""."""
         try:
             modes = _section(self._config.modes, "modes", values)
             health = _section(self._config.health, "health", values)
@@ -152,7 +152,7 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a section with the values of a table. Raises ValidationError."""
+    """Return a section of the configuration with the values of a table. Raises ValidationError."""
     changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
     return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
 
@@ -185,7 +185,7 @@ class CommandTask:
         self._count = 0
 
     def begin(self, now_ns: int) -> None:
-        """Fly the parameters that an earlier boot kept."""
+        """Apply the parameters that an earlier boot stored."""
         self._parameters.begin(now_ns)
 
     def run(self, cycle: Cycle) -> None:
@@ -210,7 +210,7 @@ class CommandTask:
                 channel.answer(answer, sender)
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
-        """Execute a datagram; return the fields of the answer, and whether it is a packet of a command."""
+        """Execute a datagram; return the fields of the answer, and whether it is a command packet."""
         command: Command | None = None
         problem = ""
         well_formed = True
@@ -226,7 +226,7 @@ class CommandTask:
         return self._conclude(source, command, problem, now_ns), well_formed
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
-        """Execute a command, unless there is a `problem`; report and record the result."""
+        """Execute a command if it has no `problem`; report and record the result."""
         self._count += 1
         if command is not None and not problem:
             try:
@@ -250,7 +250,7 @@ class CommandTask:
         return fields
 
     def _obey(self, command: Command, now_ns: int) -> str:
-        """Execute a command; return why it was refused, empty when done."""
+        """Execute a command; return why it is refused, else ""."""
         problem = ""
         match command:
             case Ping():
@@ -279,7 +279,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a step of a time line. Raises CommandError unless it is exactly one."""
+    """Return the command of a step of a time line. Raises CommandError unless the step has one command."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

@@ -247,14 +247,14 @@ class _GroupWatch:
 
 
 class GroupsAndWorkers:
-    """Watches rate groups and workers."""
+    """Detects stalled rate groups and workers."""
 
     def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
         self._groups = [_GroupWatch(group) for group in groups]
         self._workers = workers
 
     def begin(self, time_ns: int) -> None:
-        """Count from here."""
+        """Restart the measurement of progress at `time_ns`."""
         for watch in self._groups:
             watch.since_ns = time_ns
 
@@ -311,7 +311,7 @@ class PerformanceObserver:
         self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Switch the coils off when the control task failed, and report the error's place."""
+        """Switch the coils off when the control task failed, and report where the error occurred."""
         if group.name == CONTROL:
             self._coils.off()
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -445,7 +445,7 @@ class HealthWatch:
         self._recorder = services.recorder
         self._events = services.events
         self._jobs = services.jobs
-        # Every death of a worker is written: the budget of restarts bounds them, so there is no throttle.
+        # Every death of a worker is written without a throttle, because the budget of restarts limits them.
         self._worker_events = EventLog(services.recorder.event, 0)
         self._facts = services.facts
         self._streams = services.streams

@@ -420,7 +420,7 @@ class ModeControl:
 
     @property
     def flies_steps(self) -> bool:
-        """Whether the configured steps are flown, or will be once the devices give good data."""
+        """Whether the configured steps are flown, or will be after BOOT."""
         booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 

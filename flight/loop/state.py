@@ -381,7 +381,7 @@ def note_boot(folders: Iterable[Path], number: int) -> None:
 
 
 def newest_boot(folders: Iterable[Path]) -> int:
-    """Return the highest number noted in some folders, 0 where there is none. Never raises."""
+    """Return the highest boot number noted in some folders, 0 without a note. Never raises."""
     numbers = [0]
     for folder in folders:
         with suppress(OSError):
@@ -638,7 +638,7 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
 
 
 def service_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the state folder that systemd gives a service, None without one."""
+    """Return the state folder of a systemd service; None outside a service."""
     # systemd separates several folders by colons; the first is the application's own.
     first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(first) if first else None
@@ -651,7 +651,7 @@ def open_state(
     stack: ExitStack,
     runs: Sequence[Path] = (),
 ) -> StateKeeper | None:
-    """Count this boot; return None where no state is stored.
+    """Count this boot and return its state; None if no state is stored.
 
     `runs` are the folders of the newest runs, this one the last: the boot's number is noted in them.
     `stack` closes the state: cleanly, unless an exception passes. A DeviceError counts as clean: the device

@@ -187,7 +187,7 @@ _HEADER = struct.Struct("<QQI")
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
     """Pickle a value: its large buffers go into the slab, the rest is returned with its length in front.
 
-    Raises FlightError where the slab is too small.
+    Raises FlightError if the slab is too small.
     """
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
@@ -274,7 +274,7 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
 
 
 def _answer(function: Any, argument: Any, slab: mmap.mmap) -> bytes:
-    """Return the message of a job's result, or of its failure where the result cannot be sent."""
+    """Return the message of a job's result, or of its failure if the result cannot be sent."""
     outcome = _run(function, argument)
     try:
         return pack_values(outcome, slab)
@@ -291,12 +291,8 @@ def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
     return "done", value, "", time.perf_counter_ns() - begun
 
 
-def _nothing() -> None:
-    """No-op."""
-
-
 def end_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent ends; end now where the parent has ended already."""
+    """Make the kernel kill this process when its parent ends; end now if the parent has ended."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(0)
@@ -332,7 +328,8 @@ def main(arguments: list[str]) -> None:
         os.sched_setaffinity(0, map(int, cores.split(",")))
     lean_numpy()
     home = importlib.import_module(module)
-    getattr(home, "prepare", _nothing)()
+    if (prepare := getattr(home, "prepare", None)) is not None:
+        prepare()
     function = getattr(home, name)
     line = socket.socket(fileno=int(socket_fd))
     slab = mmap.mmap(int(memory_fd), SLAB_BYTES)

@@ -1,4 +1,4 @@
-"""Jobs in real time: a thread starts, feeds, watches, restarts and reaps the workers' processes.
+"""Jobs in real time: a thread starts, supervises, restarts and reaps the workers' processes.
 
 The control thread exchanges only finished values with this thread, through queues that never wait: nothing of
 a worker's life costs the control thread time. Each worker process has a socket for messages, and a memory
@@ -38,21 +38,21 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Deaths in a row until the worker rests; with the growing intervals they take at least 127.5 s."""
+"""Number of deaths in a row after which a worker rests; they take at least 127.5 s."""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
-"""A worker that lived for so long has a new budget."""
+"""Life (ns) after which a worker has its full budget of restarts again."""
 REST_NS = 600 * SECOND_NS
 
 
 class Attempts:
-    """Counts the deaths of one worker since it last lived long enough."""
+    """Counts the deaths of one worker since its last long life."""
 
     def __init__(self) -> None:
         self.deaths = 0
 
     def died(self, lived_ns: int) -> int:
-        """Count a death after a life of `lived_ns`; return after which time to start again, ns."""
+        """Count a death after a life of `lived_ns`; return the delay (ns) of the restart."""
         if lived_ns >= STEADY_NS or self.is_spent:
             self.deaths = 0
         self.deaths += 1
@@ -62,7 +62,7 @@ class Attempts:
 
     @property
     def is_spent(self) -> bool:
-        """Whether the budget is spent: the worker rests."""
+        """Whether the budget of restarts is spent, so that the worker rests."""
         return self.deaths >= BUDGET
 
 
@@ -76,10 +76,10 @@ _REAPED_WITHIN_S = 1.0
 
 
 class WorkerProcess:
-    """A running worker; `ready` once it has imported its function. For one thread."""
+    """A running worker, for use by one thread; `ready` once it has imported its function."""
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
-        """Start the process on the given cores, on all where none is given. Raises OSError."""
+        """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
         self._name = worker.name
         self._received = bytearray()
         self.ready = False
@@ -120,7 +120,7 @@ class WorkerProcess:
 
     def is_stopped(self) -> bool:
         """Return whether a signal such as SIGSTOP has stopped the process; it may still be starting."""
-        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # takes nothing from who reaps it
+        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # the process can still be reaped
         with suppress(ChildProcessError):  # reaped already
             return os.waitid(os.P_PID, self._process.pid, look) is not None
         return False
@@ -130,7 +130,7 @@ class WorkerProcess:
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
-        """Submit a job. Raises FlightError for one that cannot be sent, EOFError where the process died."""
+        """Submit a job. Raises FlightError if it cannot be sent, EOFError if the process has died."""
         message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
@@ -164,13 +164,15 @@ class WorkerProcess:
         return None
 
     def end(self) -> str:
-        """Kill the process, reap it and release its memory; return how it ended where it ended by itself."""
+        """Kill the process, reap it and release its memory; return how the process ended."""
         status = self._process.poll()
         if status is None:
             with suppress(subprocess.TimeoutExpired):  # at its end the process may still be writing
                 status = self._process.wait(0.05)
         self._process.kill()
-        with suppress(subprocess.TimeoutExpired):  # one that hangs in the kernel is reaped by a later start
+        with suppress(
+            subprocess.TimeoutExpired
+        ):  # a process that hangs in the kernel is reaped by a later start
             self._process.wait(_REAPED_WITHIN_S)
         self._socket.close()
         self._slab.close()
@@ -186,7 +188,7 @@ _CLOSE_S = 5.0
 
 
 class _Kept:
-    """A worker that is kept alive, for the supervisor's thread, and the job that it has."""
+    """A worker that the supervisor's thread keeps alive, and its job."""
 
     def __init__(self, worker: Worker, clock: Clock, cores: Set[int]) -> None:
         self.worker = worker
@@ -200,14 +202,14 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return when this worker is to be looked at without any message."""
+        """Return the next time (ns) at which to serve this worker without a message; -1 for none."""
         if self.process is None:
             return self._due_ns
         dues = [self.submitted_ns + self.worker.timeout_ns] if self.submitted_ns >= 0 else []
         return min([*dues, *([] if self.process.ready else [self._begun_ns + START_LIMIT_NS])], default=-1)
 
     def serve(self) -> tuple[list[JobResult], list[WorkerNews]]:
-        """Start, feed or bury the process as needed; return results and news."""
+        """Start the process, exchange messages with it, or reap it; return results and news."""
         now_ns = self._clock.now_ns()
         try:
             if self.process is None:
@@ -248,7 +250,7 @@ class _Kept:
         return results, news
 
     def _check(self, process: WorkerProcess, now_ns: int) -> None:
-        """Raise TimeoutError where a worker hangs: a stopped one at once, others by their times."""
+        """Raise TimeoutError for a worker that is stopped, late with its job, or late with its start."""
         if process.is_stopped():
             raise TimeoutError("stopped by a signal")
         if self.submitted_ns >= 0 and now_ns - self.submitted_ns > self.worker.timeout_ns:
@@ -257,7 +259,7 @@ class _Kept:
             raise TimeoutError(f"not ready within {START_LIMIT_NS * 1e-9:g} s")
 
     def _bury(self, outcome: Outcome, text: str, now_ns: int) -> tuple[list[JobResult], list[WorkerNews]]:
-        """Reap a process that has failed, and set when the next is started."""
+        """Reap a failed process, and set the time of the next start."""
         self.accepts = False
         process, self.process = self.process, None
         if process is not None:
@@ -274,7 +276,7 @@ class _Kept:
         return results, news
 
     def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
-        """Return the results of all jobs at hand, which are lost."""
+        """Return the results of the lost jobs: the running job and the waiting jobs."""
         lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
         while self.inbox:
             lost.append(self.inbox.popleft()[1])
@@ -288,7 +290,7 @@ class ProcessRunner:
     borrowed_ns = 0
 
     def __init__(self, clock: Clock, workers: Sequence[Worker], cores: Set[int] = frozenset()) -> None:
-        """Start the workers, on the given cores where there are any."""
+        """Start the workers on the given cores; an empty set permits all cores."""
         self._clock = clock
         self._kept = {worker.name: _Kept(worker, clock, cores) for worker in workers}
         self._busy: set[str] = set()
@@ -332,12 +334,12 @@ class ProcessRunner:
             os.close(self._bell)
 
     def process_identifiers(self) -> dict[str, int]:
-        """Return the process identifier of each worker that runs."""
+        """Return the process identifier of each running worker."""
         running = [(name, kept.process) for name, kept in self._kept.items()]
         return {name: process.process_id for name, process in running if process is not None}
 
     def _supervise(self) -> None:
-        """Serve the workers until closed: the thread that starts them must live, or the kernel kills them."""
+        """Serve the workers until `close`; the kernel kills them when the thread that started them ends."""
         while not self._closing.is_set():
             for kept in self._kept.values():
                 results, news = kept.serve()

@@ -42,7 +42,7 @@ _LOOK_NS = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Probed:
-    """A device: its name in the configuration, where it should be, and its answer or the cure."""
+    """A device or file: its name in the configuration, its address, and its answer or the cure."""
 
     name: str
     place: str
@@ -76,7 +76,7 @@ def _probed(name: str, place: str, ask: Callable[[ExitStack], str]) -> Probed:
 
 
 def _chips(config: Config) -> Iterator[Probed]:
-    """Look for the chips on the I2C bus, by reading one register of each."""
+    """Probe the chips on the I2C bus by reading one register of each chip."""
     bus = device_file(config.coils.bus)
     addresses = {"coils": (config.coils.address, MODE1)}
     if config.power_monitor is not None:
@@ -166,7 +166,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def check(options: argparse.Namespace) -> int:
-    """Examine, print the verdict; 1 when the configuration is not ready to fly."""
+    """Check a configuration and print the verdict; return 1 if it is not ready to fly."""
     from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.cli.check import probe  # noqa: PLC0415
     from flight.app.composition import body_kind  # noqa: PLC0415 - the whole flight hangs on these
@@ -190,7 +190,7 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _fly(verdict: CheckResult) -> None:
-    """Fly the beginning in lock-step, into a folder that is forgotten."""
+    """Fly the beginning in lock-step, in a temporary folder."""
     from flight.app.flight import fly  # noqa: PLC0415
 
     duration, begun = min(FLOWN_S, verdict.config.duration), time.perf_counter()
@@ -201,7 +201,7 @@ def _fly(verdict: CheckResult) -> None:
 
 
 def flight_problems(result: RunResult) -> list[str]:
-    """Return what went wrong in a flight; faults that were injected may be noticed and may leave alarms."""
+    """Return the problems of a flight; with injected faults, events and alarms are no problems."""
     ending = result.ending
     problems = [text for text in (result.log_error, result.restart, ending.coil_error) if text]
     if result.interrupted:

@@ -34,7 +34,7 @@ _NICE = 10
 
 @dataclass(frozen=True, slots=True)
 class _JudgedLink:
-    """A configuration that was found right: its link, its command socket, and why another file was read."""
+    """A valid configuration: its link, its command socket, and why another file was read."""
 
     link: Link
     socket: Path
@@ -43,7 +43,7 @@ class _JudgedLink:
 
 @dataclass(frozen=True, slots=True)
 class _OpenedLink:
-    """A link that is ready to run, and the names of its lines."""
+    """An opened link, and the names of its lines."""
 
     station: Station
     names: str
@@ -68,19 +68,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def link(options: argparse.Namespace) -> int:
-    """Open the lines, again and again until that succeeds, and turn until a signal.
+    """Open the lines, with retries until that succeeds, and run the link until a signal.
 
-    Raises ConfigError only for a configuration that was read whole and judged wrong; after anything else that
-    ends the link its unit starts it again.
+    Raises ConfigError for an invalid configuration. After any other problem that ends the link, its unit
+    restarts it.
     """
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    with suppress(OSError):  # a service's unit has done so, and its sandbox forbids it
+    with suppress(OSError):  # the unit of a service sets the priority, and its sandbox forbids this call
         os.nice(_NICE)
     try:
         _run(options.config, options.log, ended.is_set)
-    except StoppedError as error:  # by whoever started it
+    except StoppedError as error:  # a signal during the start
         _say(str(error))
     except ConfigError:
         raise
@@ -105,7 +105,7 @@ def _run(config: Path, log: Path, ended: Callable[[], bool]) -> None:
 
 
 def _judge(config_path: Path, log: Path) -> _JudgedLink:
-    """Read the configuration, and judge it. Raises UnreadConfigError; ConfigError for a wrong one."""
+    """Read and validate the configuration. Raises UnreadConfigError, ConfigError."""
     # A service keeps the last configuration that flew beside its archive.
     chosen = accepted_config(config_path, {"STATE_DIRECTORY": str(log.absolute().parent)})
     config = parse(chosen.text, str(chosen.path))
@@ -115,7 +115,7 @@ def _judge(config_path: Path, log: Path) -> _JudgedLink:
 
 
 def _open(log: Path, judged: _JudgedLink, stack: ExitStack) -> _OpenedLink:
-    """Open keys and lines. Raises UsageError, FlightError, DeviceError, OSError for what may pass."""
+    """Open keys and lines. Raises UsageError, FlightError, DeviceError, OSError for temporary problems."""
     if judged.problem:
         _say(judged.problem)
     section, clock = judged.link, SystemClock()
@@ -152,7 +152,7 @@ def _open_lines(section: Link, clock: SystemClock, stack: ExitStack) -> list[Lin
 
 
 def _say(text: str) -> None:
-    """Write a line on standard error; a disk that takes none does not end the link."""
+    """Write a line to standard error; a full disk does not end the link."""
     with suppress(OSError):
         sys.stderr.write(f"flight: {text}\n")
         sys.stderr.flush()

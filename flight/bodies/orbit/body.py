@@ -14,7 +14,7 @@ import numpy as np
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed, horizon_camera_feed
 from flight.bodies.orbit.control import FieldDetumblingLaw, PointingTracker, SunAcquisitionLaw, expected_field
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFeed, OrbitFilter, OrbitFilterSettings, learned_of, start_from
 from flight.bodies.orbit.guidance import (
     ObjectAim,
@@ -74,7 +74,7 @@ class OrbitView:
         self,
         brake: FieldDetumblingLaw,
         filter_: OrbitFilter,
-        environment: OrbitEnvironment,
+        environment: EstimatedEnvironment,
         services: Services,
     ) -> None:
         self._filter = filter_
@@ -162,7 +162,7 @@ class SatelliteEstimation(BodyEstimation):
 
     def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
         """Start from the states that an earlier boot learned."""
-        self.environment = OrbitEnvironment(_elements(config), services.clock)
+        self.environment = EstimatedEnvironment(_elements(config), services.clock)
         self._services = services
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
@@ -276,7 +276,7 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
 
 
-def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> PointingTracker:
+def _tracker(config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment) -> PointingTracker:
     craft, pauses = config.craft, _pauses(config)
     inertia = np.array(craft.inertia)
     return PointingTracker(filter_, environment, pauses, _limit(config), craft.dipole_per_ampere, inertia)
@@ -345,7 +345,7 @@ def _utc(services: Services) -> float:
 
 
 def _filter(
-    config: OrbitConfig, environment: OrbitEnvironment, learned: Mapping[str, Learned], utc: float
+    config: OrbitConfig, environment: EstimatedEnvironment, learned: Mapping[str, Learned], utc: float
 ) -> tuple[OrbitFilter, list[str]]:
     """Return the filter, and why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
@@ -370,7 +370,9 @@ def _strings(section: SolarStringsSection) -> SolarStringModel:
     return SolarStringModel(normals, np.array([string.peak for string in section.strings]))
 
 
-def _sun(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> CoarseSunFeed | None:
+def _sun(
+    config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment
+) -> CoarseSunFeed | None:
     section = config.solar_strings
     if section is None:
         return None
@@ -398,7 +400,9 @@ def _elements(config: OrbitConfig) -> TwoLineElements | None:
         raise ConfigError("elements", f"are no two-line elements: {error}") from error
 
 
-def _detumbler(config: OrbitConfig, filter_: OrbitFilter, environment: OrbitEnvironment) -> FieldDetumbler:
+def _detumbler(
+    config: OrbitConfig, filter_: OrbitFilter, environment: EstimatedEnvironment
+) -> FieldDetumbler:
     section, craft = config.detumble, config.craft
     settle_ns, measure_ns, act_ns = (
         round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)

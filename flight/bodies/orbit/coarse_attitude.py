@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.schema.devices import WideCamera, camera_model
 from hal.interfaces.devices import Frame, StringReading
@@ -70,7 +70,11 @@ class CoarseSunFeed:
     """Gives the filter an attitude from the magnetic field and the solar cells."""
 
     def __init__(
-        self, strings: SolarStringModel, period_ns: int, filter_: OrbitFilter, environment: OrbitEnvironment
+        self,
+        strings: SolarStringModel,
+        period_ns: int,
+        filter_: OrbitFilter,
+        environment: EstimatedEnvironment,
     ) -> None:
         """`period_ns` is the duration of a round of readings, which are not simultaneous."""
         self.strings = strings
@@ -170,7 +174,7 @@ class HorizonCameraFeed:
         cameras: Sequence[MountedCamera],
         lens_error: float,
         filter_: OrbitFilter,
-        environment: OrbitEnvironment,
+        environment: EstimatedEnvironment,
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
@@ -299,7 +303,7 @@ class HorizonCameraFeed:
 def horizon_camera_feed(
     sections: Sequence[WideCamera],
     filter_: OrbitFilter,
-    environment: OrbitEnvironment,
+    environment: EstimatedEnvironment,
     sun: CoarseSunFeed | None,
 ) -> HorizonCameraFeed:
     """Return the feed of the configured horizon cameras."""

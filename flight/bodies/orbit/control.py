@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFilter, StuckFieldCheck
 from flight.bodies.orbit.guidance import PathPoint
 from flight.link import events
@@ -79,7 +79,7 @@ class FieldDetumblingLaw(_MagneticLaw):
 
 
 def expected_field(
-    filter_: OrbitFilter, environment: OrbitEnvironment, instants: FloatArray
+    filter_: OrbitFilter, environment: EstimatedEnvironment, instants: FloatArray
 ) -> Callable[[int], FloatArray | None]:
     """Return a function that predicts the field (n, 3) T at `instants` (n,) s after a time.
 
@@ -138,7 +138,7 @@ class PointingTracker:
     def __init__(
         self,
         filter_: OrbitFilter,
-        environment: OrbitEnvironment,
+        environment: EstimatedEnvironment,
         pauses: WindowSchedule,
         limit: float,
         dipole_per_ampere: float,

@@ -37,7 +37,7 @@ _UNIX_EPOCH = 2_440_587.5
 _SHORTEST = 1.0
 
 
-class OrbitEnvironment:
+class EstimatedEnvironment:
     """Knowledge of the orbit. `refused` counts the GPS fixes that contradict it."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:

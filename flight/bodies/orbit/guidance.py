@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.link import events
 from flight.loop.body import COMMANDED, KEPT, PLANNER, Target
 from flight.loop.executive import Cycle, JobResult
@@ -368,7 +368,7 @@ class PointingPlanner:
         self,
         craft: PlannedCraft,
         paths: PointingPaths,
-        environment: OrbitEnvironment,
+        environment: EstimatedEnvironment,
         disturbed: Callable[[], tuple[FloatArray, FloatArray]],
         objects: ObjectAim,
         services: Services,

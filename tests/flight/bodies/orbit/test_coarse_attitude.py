@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.coarse_attitude import CoarseSunFeed
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
 from hal.interfaces.devices import ImuReading, StringReading
 from hal.interfaces.wires import SECOND_NS
@@ -56,7 +56,7 @@ class Lit:
         )
         self.filter = OrbitFilter(settings, self.at)
         strings = SolarStringModel(peaks=np.full(6, 0.5))
-        self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(OrbitEnvironment, self))
+        self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(EstimatedEnvironment, self))
         self.wrong: list[str | None] = []
         self.magnet: FloatArray = np.zeros(3)
         self.begin_ns = 0  # when stars begin the filter

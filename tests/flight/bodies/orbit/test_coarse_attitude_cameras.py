@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 
 from flight.bodies.orbit.coarse_attitude import CONTRADICTED, HorizonCameraFeed
-from flight.bodies.orbit.environment import OrbitEnvironment
+from flight.bodies.orbit.environment import EstimatedEnvironment
 from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
 from hal.interfaces.devices import Frame, ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -50,7 +50,9 @@ class Still:
             history_ns=12 * SECOND_NS,
         )
         self.filter = OrbitFilter(settings, self.at)
-        self.feed = HorizonCameraFeed([CAMERA], LENS, self.filter, cast(OrbitEnvironment, self), None, None)
+        self.feed = HorizonCameraFeed(
+            [CAMERA], LENS, self.filter, cast(EstimatedEnvironment, self), None, None
+        )
         self.now_ns = 0
         self.sunlit = 1.0
 

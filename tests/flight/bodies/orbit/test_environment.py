@@ -8,7 +8,7 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, OrbitEnvironment
+from flight.bodies.orbit.environment import CONTRADICTED, GPS_DELAY_NS, EstimatedEnvironment
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from hal.interfaces.devices import GpsReading
@@ -45,7 +45,7 @@ def reading(elements: TwoLineElements, time_ns: int, shift: FloatArray | None = 
 
 
 def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -> None:
-    known = OrbitEnvironment(elements, SimClock(UTC_NS))
+    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
     for seconds in (0.0, 15.0, 31.0, 500.0):
         now_ns = round(seconds * SECOND_NS)
         date = known.julian_date(now_ns)
@@ -60,7 +60,7 @@ def test_elements_place_the_satellite_and_its_field(elements: TwoLineElements) -
 
 
 def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLineElements) -> None:
-    known = OrbitEnvironment(None, SimClock(UTC_NS + 300 * SECOND_NS))
+    known = EstimatedEnvironment(None, SimClock(UTC_NS + 300 * SECOND_NS))
     assert known.at(0) is None
     assert known.velocity(0) is None
     assert known.state(0) is None
@@ -72,7 +72,7 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
 
 
 def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements: TwoLineElements) -> None:
-    known = OrbitEnvironment(elements, SimClock(UTC_NS))
+    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
     shift = np.array([3e4, 0.0, 0.0])
     answers = [known.fix(reading(elements, k * SECOND_NS, shift)) for k in range(CONTRADICTED + 5)]
     assert not any(answers)
@@ -81,14 +81,14 @@ def test_a_false_fix_is_refused_by_the_elements_however_often_it_comes(elements:
 
 
 def test_without_elements_a_first_fix_that_was_false_is_given_up(elements: TwoLineElements) -> None:
-    known = OrbitEnvironment(None, SimClock(UTC_NS))
+    known = EstimatedEnvironment(None, SimClock(UTC_NS))
     assert known.fix(reading(elements, 0, np.array([3e4, 0.0, 0.0])))
     answers = [known.fix(reading(elements, k * SECOND_NS)) for k in range(1, CONTRADICTED + 2)]
     assert answers == [False] * CONTRADICTED + [True]
 
 
 def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLineElements) -> None:
-    known = OrbitEnvironment(None, SimClock(UTC_NS))
+    known = EstimatedEnvironment(None, SimClock(UTC_NS))
     assert not known.fix(replace(reading(elements, 0), valid=False))
     assert known.refused == 0
 
@@ -96,7 +96,7 @@ def test_a_fix_that_the_receiver_does_not_vouch_for_is_not_used(elements: TwoLin
 def test_a_long_prediction_from_the_known_state_agrees_with_the_environment(
     elements: TwoLineElements,
 ) -> None:
-    known = OrbitEnvironment(elements, SimClock(UTC_NS))
+    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
     state = known.state(5 * SECOND_NS)
     assert state is not None
     ahead = predict(state, 100.0)
@@ -106,7 +106,7 @@ def test_a_long_prediction_from_the_known_state_agrees_with_the_environment(
 
 
 def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements: TwoLineElements) -> None:
-    known, frozen = OrbitEnvironment(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
+    known, frozen = EstimatedEnvironment(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
     assert known.fix(frozen)
     for seconds in range(11, 60):
         time_ns = seconds * SECOND_NS + GPS_DELAY_NS
@@ -116,7 +116,7 @@ def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements
 
 
 def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while(elements: TwoLineElements) -> None:
-    known, late_ns = OrbitEnvironment(elements, SimClock(UTC_NS)), 2 * SECOND_NS
+    known, late_ns = EstimatedEnvironment(elements, SimClock(UTC_NS)), 2 * SECOND_NS
     assert known.fix(reading(elements, 10 * SECOND_NS))
     used = []
     for seconds in range(11, 60):
