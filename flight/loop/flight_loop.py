@@ -14,7 +14,6 @@ from flight import __version__
 from flight.link import events
 from flight.link.events import EventKind, Severity
 from flight.link.telemetry.definitions import RUN
-from flight.link.telemetry.log import Recorder
 from flight.loop.body import ControlOutput, FlightBody, SteeringState
 from flight.loop.control_cycle import ControlCycle, LoopTasks
 from flight.loop.executive import Cycle, CyclicExecutive, RateGroup
@@ -33,29 +32,6 @@ class RunLabel:
     seed: int
     simulated: bool
     realtime: bool
-
-
-def record_run(
-    recorder: Recorder, config: Config, label: RunLabel, epoch_ns: int, utc_ns: int, period_ns: int
-) -> None:
-    """Record the run that begins at `epoch_ns`, UTC `utc_ns`; `period_ns` is the control period."""
-    coils = config.coils
-    recorder.record(
-        RUN,
-        epoch_ns,
-        config_name=config.name,
-        config_crc=zlib.crc32(label.config_text.encode()),
-        software=__version__,
-        seed=label.seed,
-        utc_ns=utc_ns,
-        simulated=int(label.simulated),
-        realtime=int(label.realtime),
-        control_period_ns=period_ns,
-        duration=config.duration,
-        coil_resistance=list(coils.resistance),
-        supply_voltage=coils.supply_voltage,
-        current_limit=coils.current_limit,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,16 +100,6 @@ class Supervisors:
     board: ResourceReader | None = None
 
 
-@dataclass(slots=True)
-class _Requests:
-    """Requests of the application to the flight, and the mission time at which the flight ended."""
-
-    stop_reason: str = ""
-    ended_ns: int = 0
-    progress: Callable[[FlightProgress], None] | None = None
-    notes: list[tuple[EventKind, str]] = field(default_factory=list)
-
-
 class FlightLoop:
     """One flight: from the release at mission time zero to the end of the configured duration."""
 
@@ -145,8 +111,10 @@ class FlightLoop:
         self._tasks = tasks
         self._services = services
         self._supervisors = supervisors
-        self._requests = _Requests()
-        self._requests.notes += [
+        self._stop_reason = ""
+        self._ended_ns = 0
+        self._show: Callable[[FlightProgress], None] | None = None
+        self._notes: list[tuple[EventKind, str]] = [
             (events.LEARNED_REFUSED, problem) for problem in body.estimation.learned_problems
         ]
         self._control = ControlCycle(tasks, body, services)
@@ -166,16 +134,16 @@ class FlightLoop:
 
     def stop(self, reason: str) -> None:
         """End the flight after the running cycle. Safe from a signal handler."""
-        self._requests.stop_reason = reason
+        self._stop_reason = reason
         self._executive.stop()
 
     def note(self, kind: EventKind, text: str) -> None:
         """Keep an event from before the flight, to be reported at its start."""
-        self._requests.notes.append((kind, text))
+        self._notes.append((kind, text))
 
     def watch(self, progress: Callable[[FlightProgress], None]) -> None:
         """Call `progress` once a second of mission time."""
-        self._requests.progress = progress
+        self._show = progress
 
     def run(self, epoch_ns: int, label: RunLabel) -> str:
         """Fly from `epoch_ns` on; return why the flight ended. The coils are at zero on return or error."""
@@ -187,8 +155,8 @@ class FlightLoop:
             self._tasks.drive.off()
             self._tasks.health.close()
             now_ns = services.clock.now_ns()
-            self._requests.ended_ns = max(now_ns - epoch_ns, 0)
-            reason = self._requests.stop_reason or "the configured duration is over"
+            self._ended_ns = max(now_ns - epoch_ns, 0)
+            reason = self._stop_reason or "the configured duration is over"
             self._tasks.housekeeping.report_lost(now_ns)
             services.events.flush(now_ns)
             services.events.report(events.STOPPED, now_ns, reason)
@@ -202,7 +170,7 @@ class FlightLoop:
         for kind, count in self._services.events.counts.items():
             counts.setdefault(kind.severity, {})[kind.name] = count
         return FlightEnding(
-            mission_time=self._requests.ended_ns * 1e-9,
+            mission_time=self._ended_ns * 1e-9,
             cycles=self._groups[0].completed,
             mode=self._tasks.modes.mode.label,
             alarms=tuple(fact.name for fact in facts.held()),
@@ -227,11 +195,25 @@ class FlightLoop:
         if tasks.commanding is not None:
             tasks.commanding.begin(epoch_ns)
         services.streams.begin(epoch_ns)
-        utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
-        record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)
+        recorder.record(
+            RUN,
+            epoch_ns,
+            config_name=config.name,
+            config_crc=zlib.crc32(label.config_text.encode()),
+            software=__version__,
+            seed=label.seed,
+            utc_ns=clock.utc_ns() - (clock.now_ns() - epoch_ns),
+            simulated=int(label.simulated),
+            realtime=int(label.realtime),
+            control_period_ns=self._groups[0].period_ns,
+            duration=config.duration,
+            coil_resistance=list(config.coils.resistance),
+            supply_voltage=config.coils.supply_voltage,
+            current_limit=config.coils.current_limit,
+        )
         tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
         services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
-        for kind, text in self._requests.notes:
+        for kind, text in self._notes:
             services.events.report(kind, epoch_ns, text)
         tasks.health.begin(epoch_ns)
         if supervisors.board is not None:
@@ -267,21 +249,19 @@ class FlightLoop:
         self._tasks.housekeeping.run(cycle, state)
         self._keep_state(now_ns)
         self._record_performance(now_ns)
-        if self._requests.progress is not None:
-            self._requests.progress(self._progress(state, now_ns))
-
-    def _progress(self, state: SteeringState, now_ns: int) -> FlightProgress:
-        output, services = self._output, self._services
+        if self._show is None:
+            return
         x, y, z = output.steered.currents.tolist() if output is not None else (0.0, 0.0, 0.0)
-        return FlightProgress(
-            (now_ns - services.recorder.epoch_ns) * 1e-9,
+        progress = FlightProgress(
+            (now_ns - self._services.recorder.epoch_ns) * 1e-9,
             self._config.duration,
             self._body.view.progress(output),
             (x, y, z),
             state.name.lower(),
             sum(group.slips for group in self._groups),
-            services.events.count,
+            self._services.events.count,
         )
+        self._show(progress)
 
     def _keep_state(self, now_ns: int) -> None:
         """Give the state that outlives the process to its keeper, and report its events; no disk access."""

@@ -233,37 +233,29 @@ class WorkerWatch:
     limit_ns: int
 
 
-class _GroupWatch:
-    def __init__(self, group: RateGroup) -> None:
-        self.group = group
-        self.limit_ns = max(_PERIODS * group.period_ns, _SHORTEST_LIMIT_NS)
-        self._completed = group.completed
-        self.since_ns = 0
-
-    def is_stalled(self, now_ns: int) -> bool:
-        if self.group.completed != self._completed:
-            self._completed, self.since_ns = self.group.completed, now_ns
-        return now_ns - self.since_ns > self.limit_ns
-
-
 class GroupsAndWorkers:
     """Detects stalled rate groups and workers."""
 
     def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
-        self._groups = [_GroupWatch(group) for group in groups]
         self._workers = workers
+        # The number of completed cycles of each group, and the time of the last increase.
+        self._progress = {group: (group.completed, 0) for group in groups}
 
     def begin(self, time_ns: int) -> None:
         """Restart the measurement of progress at `time_ns`."""
-        for watch in self._groups:
-            watch.since_ns = time_ns
+        self._progress = {group: (completed, time_ns) for group, (completed, _) in self._progress.items()}
 
     def stalled(self, now_ns: int) -> list[str]:
         """Return the names of the stalled groups and workers."""
-        names = [watch.group.name for watch in self._groups if watch.is_stalled(now_ns)]
+        names = []
+        for group, (completed, since_ns) in self._progress.items():
+            if group.completed != completed:
+                self._progress[group] = group.completed, now_ns
+            elif now_ns - since_ns > max(_PERIODS * group.period_ns, _SHORTEST_LIMIT_NS):
+                names.append(group.name)
         for worker in self._workers:
-            since_ns = worker.busy_since_ns()
-            if since_ns is not None and now_ns - since_ns > worker.limit_ns:
+            since = worker.busy_since_ns()
+            if since is not None and now_ns - since > worker.limit_ns:
                 names.append(worker.name)
         return names
 
