@@ -1,11 +1,13 @@
 """Builds the simulated hardware of a configuration: the world and the emulated devices in it.
 
 The devices offer the same Protocols as the devices on Linux, so simulated flights exercise the flight
-drivers. Until its release the body is held still at its initial attitude.
+drivers. Until its release the body is held still at its initial attitude. The camera models and the devices
+of an orbit are imported late: they take half a second, and a testbed flight has none.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
@@ -13,31 +15,49 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, WideCamera
 from flight.schema.sections import Config
+from hal.drivers.ads1115 import StringWiring
 from hal.drivers.coils import CoilSettings, wirings
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
+from knightcube.vision.camera.lens import Lens, Pinhole
 from sim_hal.clock import EmulatedDevice, FaultTimeline, SerialEnd, TimedSimulation
-from sim_hal.emulators.camera import EmulatedCamera, Expose
-from sim_hal.emulators.coil_circuit import CoilCircuit
+from sim_hal.emulators.camera import EmulatedCamera, Expose, no_objects
+from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
-from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
-from sim_hal.objects import Objects
-from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
-from sim_hal.orbit_sky import from_orbit
 from sim_hal.settings import Simulation, SkySection
-from sim_hal.worlds.world import BodyMotion, OrbitingWorld, TruthRecorder, World, WorldInputs, make_world
+from sim_hal.worlds.world import (
+    BodyMotion,
+    OrbitingWorld,
+    TruthRecorder,
+    World,
+    WorldInputs,
+    make_world,
+    orbiting,
+    utc_date,
+)
 
 if TYPE_CHECKING:
+    from sim_hal.earth_camera import EarthCameraModel, EarthScene
+    from sim_hal.emulators.gps import EmulatedGps
+    from sim_hal.emulators.solar_cells import EmulatedSolarCells
     from sim_hal.star_camera import SourceTrack, StarCameraModel
-
+    from sim_hal.star_camera.objects import SkyObjects
 
 BUS_VOLTAGE = 5.0
-"""V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
+"""Supply of the coils (V) before the losses of the bridge [ch. 5: a 5 V power bus]."""
+GPS_LINE = 1
+"""Number of the GPS receiver's serial line in the random streams; that of the inertial unit has none."""
+READOUT_NS = 50_000_000
+_LINE_STREAM, _FAULT_STREAM, _ORBIT_STREAM = 0x11E, 0xFA017, 0x0B17
+_EARTH_RATE = 2.0 * math.pi * 1.002_737_909_35 / 86_400.0
+
+ExposeWide = Callable[["EarthCameraModel", "EarthScene", tuple[int, ...]], "Future[Image]"]
+"""Renders a scene with the noise of a seed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,47 +70,18 @@ class CoilHardware:
     circuit: CoilCircuit
 
 
-def assemble_coils(
-    config: Config,
-    section: Simulation,
-    generator: np.random.Generator,
-    now_ns: Callable[[], int],
-    wait: Callable[[int], None] | None = None,
-) -> CoilHardware:
-    """Build the coils; `now_ns` returns the simulation's time, `wait` advances time while the bus hangs."""
-    pwm = EmulatedPca9685(config.coils.address, now_ns)
-    circuit = CoilCircuit(
-        pwm,
-        _coil_settings(config, section),
-        generator,
-        now_ns,
-        uncertainty=section.current_noise,
-        bus_voltage=BUS_VOLTAGE,
-    )
-    settings = config.power_monitor
-    monitor = None
-    if settings is not None:
-        monitor = EmulatedIna219(settings.address, now_ns, circuit.mean_supply, settings.shunt)
-    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
-    return CoilHardware(bus, pwm, monitor, circuit)
+@dataclass(frozen=True, slots=True)
+class OrbitDevices:
+    """The fitted devices that need an orbit; `wide` are the horizon cameras."""
 
-
-def _coil_settings(config: Config, section: Simulation) -> CoilSettings:
-    """Return the true coil settings."""
-    coils = config.coils
-    resistance = section.truth.resistance or coils.resistance
-    supply = section.truth.supply_voltage or coils.supply_voltage
-    wired = wirings(coils.channels, resistance, coils.signs)
-    return CoilSettings(wired, supply, coils.current_limit, coils.stale_after)
-
-
-_LINE_STREAM = 0x11E
-_FAULT_STREAM = 0xFA017
+    gps: EmulatedGps | None = None
+    cells: EmulatedSolarCells | None = None
+    wide: tuple[EmulatedCamera, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All simulated parts. Drivers use `bus` and `camera`; faults and tests use the rest."""
+    """All simulated parts. Drivers use `bus` and `camera`; faults and tests use the others."""
 
     simulation: TimedSimulation
     world: World
@@ -103,12 +94,13 @@ class Hardware:
     truth: TruthRecorder | None
     faults: FaultTimeline
     orbit: OrbitDevices
-    objects: Objects
+    objects: SkyObjects | None
 
     def release(self, epoch_ns: int) -> None:
         """Release the body at `epoch_ns`, mission time zero."""
         self.world.release_at(epoch_ns)
-        self.objects.begin(epoch_ns)
+        if self.objects is not None:
+            self.objects.begin(epoch_ns)
         if self.truth is not None:
             self.truth.begin(epoch_ns)
 
@@ -128,18 +120,24 @@ def assemble(
 
     `now_ns` returns the simulation's time; `line` and `gps_line` are the device ends of the serial lines;
     `expose` and `expose_wide` replace the cameras' renderers (in real time a process of its own); `wait`
-    advances time while the bus hangs. Raises ConfigError for a world that cannot be made.
+    advances time while the bus hangs. Raises ConfigError for an invalid world.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wait)
-    circuit = coils.circuit
-    world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
-    sense = _sense(world, circuit, np.array(section.coil_field), np.array(section.imu.field_bias))
-    free_fall = isinstance(world, OrbitingWorld)
-    unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns(), free_fall)
-    objects = Objects(section.objects, section.utc, now_ns(), world)
-    camera = _camera(config.camera, section, world, expose, now_ns, objects)
-    orbit = _orbit(config, section, world, now_ns, gps_line, expose_wide)
+    world = make_world(WorldInputs(config, section, coils.circuit.currents, now_ns()))
+    unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), now_ns())
+    objects = sky_objects(section, now_ns(), world)
+    camera = None
+    if config.camera is not None:
+        make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
+        if isinstance(world, OrbitingWorld):
+            from sim_hal.star_camera.objects import from_orbit  # noqa: PLC0415 - see above
+
+            make = from_orbit(make, world, config.camera)
+        camera = emulated_camera(config.camera, section.sky, world.motion, make, now_ns, objects)
+    orbit = OrbitDevices()
+    if config.gps or config.solar_strings or config.wide_cameras:
+        orbit = assemble_orbit(config, section, world, now_ns, gps_line, expose_wide)
     for part in orbit.cells.parts if orbit.cells is not None else ():
         coils.bus.attach(part)
     faults = FaultTimeline()
@@ -148,38 +146,62 @@ def assemble(
     # At equal times devices run in this order.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
-    parts = (unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults, orbit, objects)
-    return Hardware(simulation, world, *parts)
+    return Hardware(
+        simulation,
+        world,
+        unit,
+        coils.bus,
+        coils.pwm,
+        coils.monitor,
+        coils.circuit,
+        camera,
+        truth,
+        faults,
+        orbit,
+        objects,
+    )
 
 
-def _sense(
-    world: World, circuit: CoilCircuit, coil_field: FloatArray, bias: FloatArray
-) -> Callable[[int], BodyMotion]:
-    """Return the motion that the inertial unit measures, with the coils' field and the magnetometer's bias.
-
-    `coil_field` is (3, 3) T/A, `bias` (3,) T, body axes.
-
-    The mean currents count: the unit averages its magnetometer over one control period.
-    """
-    if not (coil_field.any() or bias.any()):
-        return world.motion
-
-    def sense(time_ns: int) -> BodyMotion:
-        motion = world.motion(time_ns)
-        return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
-
-    return sense
+def assemble_coils(
+    config: Config,
+    section: Simulation,
+    generator: np.random.Generator,
+    now_ns: Callable[[], int],
+    wait: Callable[[int], None] | None = None,
+) -> CoilHardware:
+    """Build the coils; `now_ns` returns the simulation's time, `wait` advances time while the bus hangs."""
+    coils, truth = config.coils, section.truth
+    pwm = EmulatedPca9685(coils.address, now_ns)
+    wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs)
+    supply = truth.supply_voltage or coils.supply_voltage
+    settings = CoilSettings(wired, supply, coils.current_limit, coils.stale_after)
+    circuit = CoilCircuit(pwm, settings, generator, now_ns, section.current_noise, BUS_VOLTAGE)
+    monitor, fitted = None, config.power_monitor
+    if fitted is not None:
+        monitor = EmulatedIna219(fitted.address, now_ns, circuit.mean_supply, fitted.shunt)
+    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
+    return CoilHardware(bus, pwm, monitor, circuit)
 
 
 def _unit(
     config: Config,
     section: Simulation,
-    sense: Callable[[int], BodyMotion],
+    world: World,
+    circuit: CoilCircuit,
     line: SerialEnd,
     generator: np.random.Generator,
     now_ns: int,
-    free_fall: bool,
 ) -> Vn100Emulator:
+    """Return the inertial unit; its magnetometer also measures the coils' field, and has a bias."""
+    coil_field, bias = np.array(section.coil_field), np.array(section.imu.field_bias)
+    sense = world.motion
+    if coil_field.any() or bias.any():
+
+        def sense(time_ns: int) -> BodyMotion:
+            # The unit averages its magnetometer over one control period, so the mean currents count.
+            motion = world.motion(time_ns)
+            return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
+
     imu = section.imu
     profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]
     settings = Vn100EmulatorSettings(
@@ -187,43 +209,32 @@ def _unit(
         mounting=np.array(config.inertial_unit.mounting),
         gyro_bias=np.array(imu.gyro_bias),
         clock_ppm=imu.clock_ppm,
-        free_fall=free_fall,
+        free_fall=isinstance(world, OrbitingWorld),
     )
     return Vn100Emulator(sense, line, generator, settings, now_ns=now_ns)
 
 
-def _camera(
-    camera: Camera | None,
-    section: Simulation,
-    world: World,
-    expose: Expose | None,
-    now_ns: Callable[[], int],
-    objects: Objects,
-) -> EmulatedCamera | None:
-    if camera is None:
+def sky_objects(section: Simulation, now_ns: int, world: World) -> SkyObjects | None:
+    """Return the moving objects of a simulated sky; None if it has none. Raises ConfigError."""
+    if not section.objects:
         return None
-    make = expose or inline_exposure(StarRenderer(camera, section.sky, section.seed))
-    if isinstance(world, OrbitingWorld):
-        make = from_orbit(make, world, camera)
-    readout_ns = round(section.sky.readout * 1e9)
-    scan_ns = round(section.sky.line_time * camera.rows * 1e9)
-    mounting = np.array(camera.mounting)
-    return EmulatedCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns, objects.tracks)
+    from sim_hal.star_camera.objects import SkyObjects  # noqa: PLC0415 - see above
+
+    return SkyObjects(section.objects, section.utc, now_ns, world)
 
 
-def _orbit(
-    config: Config,
-    section: Simulation,
-    world: World,
+def emulated_camera(
+    camera: Camera,
+    sky: SkySection,
+    motion: Callable[[int], BodyMotion],
+    expose: Expose,
     now_ns: Callable[[], int],
-    line: SerialEnd | None,
-    expose: ExposeWide | None,
-) -> OrbitDevices:
-    if not wanted(config):
-        return OrbitDevices()
-    from sim_hal.orbit_assembly import assemble_orbit  # noqa: PLC0415 - see `orbit_devices`
-
-    return assemble_orbit(config, section, world, now_ns, line, expose)
+    objects: SkyObjects | None,
+) -> EmulatedCamera:
+    """Return the star camera on a body with this motion."""
+    readout_ns, scan_ns = round(sky.readout * 1e9), round(sky.line_time * camera.rows * 1e9)
+    tracks = no_objects if objects is None else objects.tracks
+    return EmulatedCamera(motion, expose, now_ns, readout_ns, np.array(camera.mounting), scan_ns, tracks)
 
 
 def line_generator(seed: int, *line: int) -> np.random.Generator:
@@ -237,9 +248,8 @@ def fault_generator(seed: int) -> np.random.Generator:
 
 
 def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
-    """Return the optics and detector of an emulated camera."""
-    # Imported late: half of a server's start-up time, and another process renders its frames.
-    from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415
+    """Return the optics and detector of an emulated star camera."""
+    from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415 - see above
 
     return StarCameraModel(
         columns=camera.columns,
@@ -260,7 +270,7 @@ def camera_model(camera: Camera, sky: SkySection) -> StarCameraModel:
 
 
 class StarRenderer:
-    """Renders the frames of one camera; the noise of frame k depends on the seed and k only."""
+    """Renders the frames of one star camera; the noise of frame k depends on the seed and k only."""
 
     def __init__(self, camera: Camera, sky: SkySection, seed: int) -> None:
         self._model = camera_model(camera, sky)
@@ -273,7 +283,7 @@ class StarRenderer:
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack] = ()
     ) -> Image:
         """Return frame `sequence`, exposed along `attitudes` (k, 4) at `times` (k,) s."""
-        from sim_hal.star_camera import render  # noqa: PLC0415 - see `camera_model`
+        from sim_hal.star_camera import render  # noqa: PLC0415 - see above
 
         generator = np.random.default_rng([self._seed, sequence])
         return render(self._model, self._directions, self._magnitudes, times, attitudes, generator, tracks)
@@ -285,8 +295,105 @@ def inline_exposure(renderer: StarRenderer) -> Expose:
     def expose(
         sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
     ) -> Future[Image]:
-        future: Future[Image] = Future()
-        future.set_result(renderer.render(sequence, times, attitudes, tracks))
-        return future
+        return _finished(renderer.render(sequence, times, attitudes, tracks))
 
     return expose
+
+
+def _finished(image: Image) -> Future[Image]:
+    future: Future[Image] = Future()
+    future.set_result(image)
+    return future
+
+
+def assemble_orbit(
+    config: Config,
+    section: Simulation,
+    world: World,
+    now_ns: Callable[[], int],
+    line: SerialEnd | None,
+    expose: ExposeWide | None = None,
+) -> OrbitDevices:
+    """Build the devices that need an orbit; `line` is the receiver's end of its serial line.
+
+    `expose` replaces the renderer of the horizon cameras. Raises ConfigError in a world without an orbit.
+    """
+    from sim_hal.emulators.gps import EmulatedGps, GpsErrors  # noqa: PLC0415 - see above
+    from sim_hal.emulators.solar_cells import EmulatedSolarCells, SolarCellsModel  # noqa: PLC0415 - see above
+
+    receiver, currents, errors = (np.random.default_rng([section.seed, _ORBIT_STREAM, n]) for n in range(3))
+    truth = section.orbit_devices
+    gps, cells = None, None
+    if config.gps is not None and line is not None:
+        settings = GpsErrors(walk=truth.gps_walk, noise=truth.gps_noise, start=truth.gps_start)
+        gps = EmulatedGps(orbiting(world, "gps"), line, receiver, settings, now_ns())
+    if config.solar_strings is not None:
+        strings = config.solar_strings.strings
+        model = SolarCellsModel(
+            normals=np.array([string.normal for string in strings]),
+            peaks=np.array([string.peak for string in strings]),
+            gain_errors=truth.string_gain * errors.standard_normal(len(strings)),
+            noise=truth.string_noise,
+            albedo=truth.albedo,
+        )
+        wired = [StringWiring(one.address, one.channel, one.volt_per_ampere) for one in strings]
+        cells = EmulatedSolarCells(orbiting(world, "solar_strings"), model, wired, now_ns, currents)
+    wide = tuple(
+        _horizon_camera(camera, (section.seed, _ORBIT_STREAM, index), world, now_ns, expose or inline_wide)
+        for index, camera in enumerate(config.wide_cameras)
+    )
+    return OrbitDevices(gps, cells, wide)
+
+
+def _horizon_camera(
+    camera: WideCamera, seed: tuple[int, ...], world: World, now_ns: Callable[[], int], expose: ExposeWide
+) -> EmulatedCamera:
+    from sim_hal.earth_camera import EarthScene  # noqa: PLC0415 - see above
+    from sim_hal.worlds.orbit import sun_position  # noqa: PLC0415 - see above
+
+    model, orbit = wide_model(camera, seed[-1]), orbiting(world, "wide_cameras")
+
+    def exposed(sequence: int, _: FloatArray, attitudes: FloatArray, __: object) -> Future[Image]:
+        scene = EarthScene(
+            position=np.array(orbit.surroundings().position),
+            attitude=attitudes[len(attitudes) // 2],
+            sun=sun_position(utc_date(orbit)),
+            rotation=_EARTH_RATE * orbit.utc_ns() * 1e-9 % (2.0 * math.pi),
+        )
+        return expose(model, scene, (*seed, sequence))
+
+    return EmulatedCamera(world.motion, exposed, now_ns, READOUT_NS, np.array(camera.mounting))
+
+
+def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
+    """Return optics and detector of a horizon camera."""
+    from sim_hal.earth_camera import EarthCameraModel  # noqa: PLC0415 - see above
+
+    known = camera.lens
+    if known is None:
+        field = math.radians(camera.field_of_view_deg)
+        lens = Lens.of(Pinhole.from_field_of_view(camera.columns, camera.rows, field))
+    else:
+        lens = Lens(camera.columns, camera.rows, known.focal_length, known.centre, known.k1, known.k2)
+    return EarthCameraModel(
+        lens=lens,
+        rows=camera.rows,
+        columns=camera.columns,
+        bits=camera.bits,
+        response=camera.response,
+        decades=camera.decades,
+        pedestal=camera.pedestal,
+        seed=seed,
+    )
+
+
+def render_wide(model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]) -> Image:
+    """Return the frame of a scene."""
+    from sim_hal.earth_camera import render  # noqa: PLC0415 - see above
+
+    return render(model, scene, np.random.default_rng(seed))
+
+
+def inline_wide(model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]) -> Future[Image]:
+    """Render at once, for lock-step."""
+    return _finished(render_wide(model, scene, seed))

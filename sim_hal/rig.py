@@ -1,46 +1,82 @@
-"""The simulator's only interface to the flight application: rigs of emulated devices, and the faults in them.
+"""The simulator's only interface to the flight application: rigs of emulated devices, and their faults.
 
-In lock-step the devices live beside the loop and advance as it sleeps; in real time they live in a process of
-their own.
+In lock-step the devices run in the process of the flight and advance as its loop sleeps: the clock jumps, and
+runs repeat exactly. In real time they run in a server process (`sim_hal.serving.server`), with bus and
+cameras on a socket and the serial lines on pseudo-terminals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+import json
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from flight.link.telemetry.log import FlightLog
 from flight.schema import reader as configuration
 from flight.schema.document import ConfigError
 from flight.schema.sections import Config
-from hal.interfaces.devices import FrameSource
+from hal.buses.clock import SystemClock
+from hal.buses.i2c_bus import lock_bus
+from hal.buses.serial_port import PySerialPort
+from hal.interfaces.devices import Frame, FrameSource
+from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import CoilReach
-from hal.interfaces.wires import SECOND_NS, Clock, Rig
+from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
 from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import UsageError
-from sim_hal import lockstep
-from sim_hal.clock import SimClock
+from sim_hal.assembly import (
+    GPS_LINE,
+    Hardware,
+    StarRenderer,
+    assemble,
+    emulated_camera,
+    fault_generator,
+    inline_exposure,
+    line_generator,
+    sky_objects,
+)
+from sim_hal.clock import SimClock, TimedSimulation
+from sim_hal.emulators.serial_line import EmulatedSerialLine
 from sim_hal.faults import schedule
+from sim_hal.faults.bench import Bench
 from sim_hal.faults.catalogue import listing
 from sim_hal.faults.host import corrupted_by, host_faults
-from sim_hal.faults.schedule import check, scheduled
-from sim_hal.lockstep import posed_camera
-from sim_hal.serving import remote
+from sim_hal.faults.schedule import check, put, scheduled
+from sim_hal.serving.device_link import DeviceLink, RemoteI2cBus
 from sim_hal.settings import Simulation
+from sim_hal.worlds.world import BodyMotion, TruthRecorder, WorldInputs, make_world
+
+PATIENCE_S = 5.0
+"""Time (s) after which the devices of a flight process that died end."""
+_START_S = 20.0
+"""Longest start (s) of the server process."""
+_FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide")
+OPENER = "sim_hal.serving.device_link:open_bus"
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationRequest:
-    """The requests of a run to the simulator, besides its configuration.
+    """The requests of a run to the simulator, in addition to its configuration.
 
     Attributes:
-        config_path: the configuration's file; `text` its content as it is flown.
-        out: the run's folder, for the log of the truth.
-        realtime: whether the devices live in a process of their own.
-        seed: replaces the configuration's where given.
-        devices: file of a server of devices that runs already; None starts one.
-        faults: beside those of the configuration.
+        config_path: file of the configuration.
+        text: content of the configuration as flown.
+        out: folder of the run, for the log of the truth.
+        realtime: whether the devices run in a server process.
+        seed: replaces the seed of the configuration, if given.
+        devices: facts file of a device server that runs already; None starts a server.
+        faults: faults in addition to those of the configuration.
     """
 
     config_path: Path
@@ -61,22 +97,39 @@ class SimulationRequest:
 
 
 def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Rig:
-    """Open the emulated devices of a configuration with the faults asked for; `stack` closes them.
+    """Open the emulated devices of a configuration with the requested faults; `stack` closes them.
 
-    Raises UsageError and ConfigError before anything is opened, DeviceError.
+    Raises UsageError or ConfigError before a device is opened, and DeviceError if a device fails.
     """
     section = request.section()
     if request.seed is not None:
         section = configuration.replace(section, seed=request.seed)
     section = configuration.replace(section, faults=(*section.faults, *schedule.entries(request.faults)))
     check(section.faults, config, request.realtime)
-    opener = _served if request.realtime else _in_lockstep
-    return with_host_faults(opener(request, config, section, stack), section)
+    if not request.realtime:
+        if request.devices is not None:
+            raise UsageError("--devices: the devices of a server run in real time: give --realtime too")
+        hardware = stack.enter_context(opened_lockstep(config, section, request.out))
+        latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
+        rig = Rig(hardware.clock, hardware.wires, hardware.release, False, section.seed, latency)
+        return with_host_faults(rig, section)
+    if request.devices is not None:
+        served = stack.enter_context(running_server(request.devices))
+    else:
+        served = stack.enter_context(started_server(request.config_path, section.seed, request.out))
+    reach = CoilReach(OPENER, str(served.socket_path), config.coils.address)
+    faults = [str(fault) for fault in scheduled(section.faults, True)]
+
+    def release(epoch_ns: int) -> None:
+        served.release(epoch_ns, faults)
+
+    rig = Rig(served.clock, served.wires, release, True, section.seed, reach=reach)
+    return with_host_faults(rig, section)
 
 
 @dataclass(frozen=True, slots=True)
 class PosedCamera:
-    """A camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
+    """A star camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
 
     clock: Clock
     frames: FrameSource
@@ -84,30 +137,53 @@ class PosedCamera:
 
 
 def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) -> PosedCamera:
-    """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
+    """Return the emulated star camera of a configuration, alone and with a known motion.
+
+    It starts at the attitude of the body's release and turns at `rate` (3,) rad/s, camera axes. Raises
+    ConfigError for an invalid world.
+    """
     section = request.section()
-    clock = SimClock(lockstep.utc_ns(section.utc))
-    return PosedCamera(clock, *posed_camera(config, section, clock, rate))
+    return posed_camera(config, section, SimClock(utc_ns(section.utc)), rate)
+
+
+def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
+    """Return the star camera of `open_camera` on a clock."""
+    camera = config.camera
+    assert camera is not None, "the caller checks that the configuration has a camera"
+    begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
+    world = make_world(WorldInputs(config, section, lambda: np.zeros(3), begun_ns))
+    objects = sky_objects(section, begun_ns, world)
+    held, body_rate = world.motion(begun_ns), attitude_matrix(mounting).T @ rate
+    zero = np.zeros(3)
+
+    def motion(time_ns: int) -> BodyMotion:
+        turned = from_rotation_vector(body_rate * ((time_ns - begun_ns) * 1e-9))
+        return BodyMotion(time_ns, multiply(turned, held.quaternion), body_rate, zero, zero)
+
+    expose = inline_exposure(StarRenderer(camera, section.sky, section.seed))
+    device = emulated_camera(camera, section.sky, motion, expose, clock.now_ns, objects)
+    clock.attach(TimedSimulation(lambda _: None, [device]))
+    return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))
 
 
 def fault_catalogue() -> tuple[str, str]:
-    """Return how faults are written, and a list of all."""
+    """Return the syntax of faults, and a list of all faults."""
     return schedule.GRAMMAR, listing()
 
 
 def injected_faults(request: SimulationRequest) -> tuple[str, ...]:
-    """Return the faults of a flight as they are written, the configuration's first."""
+    """Return the faults of a flight as they are written, those of the configuration first."""
     faults = (*schedule.schedule(request.section().faults), *map(schedule.parse, request.faults))
     return tuple(map(str, faults))
 
 
 def corrupted_text(faults: tuple[str, ...], text: str, seed: int | None) -> str:
-    """Return a configuration's text as the requested faults corrupt it; unchanged where none does."""
+    """Return the text of a configuration as the requested faults corrupt it."""
     return corrupted_by(faults, text, seed)
 
 
 def with_host_faults(rig: Rig, section: Simulation) -> Rig:
-    """Return a rig with the faults inside the flight process, where there are any."""
+    """Return a rig with the faults inside the flight process, if there are any."""
     host = host_faults(section, rig.clock, rig.realtime)
     if host is None:
         return rig
@@ -119,26 +195,182 @@ def with_host_faults(rig: Rig, section: Simulation) -> Rig:
     return replace(rig, clock=host.clock(), release=release, host=host)
 
 
-def _served(request: SimulationRequest, config: Config, section: Simulation, stack: ExitStack) -> Rig:
-    """Return devices in a process of their own, in real time."""
-    if request.devices is not None:
-        served = stack.enter_context(remote.running(request.devices))
-    else:
-        served = stack.enter_context(remote.served(request.config_path, section.seed, request.out))
-    opener, where = served.bus
-    reach = CoilReach(opener, where, config.coils.address)
-    faults = [str(fault) for fault in scheduled(section.faults, True)]
+@dataclass(frozen=True, slots=True)
+class LockStep:
+    """The devices in lock-step: clock, wires and release for the flight, the rest for faults and tests."""
+
+    clock: SimClock
+    wires: Wires
+    release: Callable[[int], None]
+    hardware: Hardware
+    line: EmulatedSerialLine
+    gps_line: EmulatedSerialLine | None = None
+
+
+def utc_ns(label: str) -> int:
+    """Return the time since 1970 (ns) of an ISO 8601 time. Raises ValueError."""
+    return round(datetime.fromisoformat(label).timestamp()) * 1_000_000_000
+
+
+def build_lockstep(
+    config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock
+) -> LockStep:
+    """Put the simulated hardware on a clock."""
+    line = EmulatedSerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
+    gps_line = None
+    if config.gps is not None:
+        generator = line_generator(section.seed, GPS_LINE)
+        gps_line = EmulatedSerialLine(clock.now_ns, config.gps.baud_rate, generator)
+    gps_end = None if gps_line is None else gps_line.device
+    hardware = assemble(config, section, clock.now_ns, line.device, truth, gps_line=gps_end)
+    clock.attach(hardware.simulation)
+    gps_port = None if gps_line is None else gps_line.host
+    wires = Wires(line.host, hardware.bus, hardware.camera, gps_port, hardware.orbit.wide)
+    faults = scheduled(section.faults, realtime=False)
+    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), line.host, gps_line=gps_line)
 
     def release(epoch_ns: int) -> None:
-        served.release(epoch_ns, faults)
+        hardware.release(epoch_ns)
+        put(faults, bench, epoch_ns)
 
-    return Rig(served.clock, served.wires, release, True, section.seed, reach=reach)
+    return LockStep(clock, wires, release, hardware, line, gps_line)
 
 
-def _in_lockstep(request: SimulationRequest, config: Config, section: Simulation, stack: ExitStack) -> Rig:
-    """Return devices beside the loop."""
-    if request.devices is not None:
-        raise UsageError("--devices: a server's devices live in real time: give --realtime too")
-    hardware = stack.enter_context(lockstep.opened(config, section, request.out))
-    latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
-    return Rig(hardware.clock, hardware.wires, hardware.release, False, section.seed, latency)
+@contextmanager
+def opened_lockstep(config: Config, section: Simulation, folder: Path) -> Iterator[LockStep]:
+    """Simulate in lock-step, with a log of the truth in `folder`."""
+    clock = SimClock(utc_ns(section.utc))
+    log = FlightLog(folder, "truth", clock=clock, sync_period_ns=None)
+    try:
+        yield build_lockstep(config, section, TruthRecorder(log), clock)
+    finally:
+        log.close()
+
+
+class RemoteFrameSource:
+    """A camera in the server process; it announces its frames, whose pixels are read from a file."""
+
+    def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
+        """Connect to the star camera, number 0, or to a horizon camera, number 1 or more."""
+        self._number = number
+        self._link = DeviceLink(path)
+        self._folder = path.parent
+        self._clock = clock
+
+    def trigger(self, exposure_ns: int) -> None:
+        """Start an exposure without waiting for the answer."""
+        try:
+            self._link.send("trigger", exposure_ns, self._number)
+        except OSError as error:
+            raise NotResponding("camera", f"the emulated devices have ended ({error})") from error
+
+    def poll(self) -> Frame | None:
+        """Return the newest frame announced since the last call. Raises NotResponding."""
+        newest: Frame | None = None
+        try:
+            while self._link.pending() or select.select([self._link], [], [], 0.0)[0]:
+                _, kind, result, text = self._link.receive()
+                if kind == "frame":
+                    newest = self._read(result, text)
+                elif kind != "done":
+                    raise NotResponding("camera", text)
+        except OSError as error:
+            raise NotResponding("camera", f"the emulated devices have ended ({error})") from error
+        return newest
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._link.close()
+
+    def _read(self, description: list[Any], name: str) -> Frame:
+        sequence, start_ns, exposure_ns, shape, dtype = description
+        pixels = np.fromfile(self._folder / name, dtype=dtype).reshape(shape)
+        return Frame(sequence, start_ns, exposure_ns, self._clock.now_ns(), pixels)
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """Devices in a server process."""
+
+    clock: SystemClock
+    wires: Wires
+    bus: RemoteI2cBus
+    socket_path: Path
+
+    def release(self, epoch_ns: int, faults: Sequence[str] = ()) -> None:
+        """Release the body at `epoch_ns` and schedule the faults of the flight."""
+        self.bus.call("release", epoch_ns, list(faults), os.getpid())
+
+
+@contextmanager
+def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
+    """Start a server for a configuration, connect to it, and end it afterwards. Raises NotResponding."""
+    command = [sys.executable, "-m", "sim_hal", "serve", str(config_path), "--folder", str(folder)]
+    process = subprocess.Popen(
+        [*command, "--seed", str(seed), "--patience", str(PATIENCE_S)],
+        stdout=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the flight process, which then ends the server
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )
+    assert process.stdout is not None
+    try:
+        ready, _, _ = select.select([process.stdout], [], [], _START_S)
+        line = process.stdout.readline() if ready else b""
+        if not line:
+            raise NotResponding("emulated devices", f"the server did not start within {_START_S:g} s")
+        with _connected(json.loads(line)) as served:
+            yield served
+    finally:
+        process.terminate()
+        try:
+            process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        process.stdout.close()
+
+
+@contextmanager
+def running_server(facts_path: Path) -> Iterator[Served]:
+    """Connect to a server that runs already, and leave it running. Raises UsageError, NotResponding.
+
+    `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote.
+    """
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(facts_path.open(encoding="utf-8"))
+            facts = json.load(file)
+            facts = {name: facts[name] for name in _FACTS}
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            problem = f"{facts_path} names no server: give a file that `sim_hal serve --facts` wrote"
+            raise UsageError(problem) from error
+        try:
+            lock_bus(file.fileno())
+        except OSError as error:
+            raise NotResponding(str(facts_path), error.strerror or "is locked") from error
+        yield stack.enter_context(_connected(facts))
+
+
+@contextmanager
+def _connected(facts: dict[str, Any]) -> Iterator[Served]:
+    """Connect to the server with these facts."""
+    clock = SystemClock()
+    path = Path(facts["socket"])
+    with ExitStack() as stack:
+        serial = PySerialPort(facts["serial"], facts["baud_rate"], clock)
+        stack.callback(serial.close)
+        try:
+            bus = RemoteI2cBus(path)
+            stack.callback(bus.close)
+            camera = RemoteFrameSource(path, clock) if facts["camera"] else None
+            wide = tuple(RemoteFrameSource(path, clock, number + 1) for number in range(facts["wide"]))
+        except OSError as error:
+            raise NotResponding("emulated devices", f"no server answers on {path} ({error})") from error
+        for source in wide if camera is None else (camera, *wide):
+            stack.callback(source.close)
+        gps = None
+        if facts["gps"] is not None:
+            gps = PySerialPort(facts["gps"], facts["gps_baud_rate"], clock)
+            stack.callback(gps.close)
+        yield Served(clock, Wires(serial, bus, camera, gps, wide), bus, path)

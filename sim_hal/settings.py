@@ -1,9 +1,8 @@
 """The `simulation` section of a configuration: the true properties of the world.
 
 A value that is left out is taken from the flight configuration; a value given here makes the world differ
-from the flight's model. SI units unless the name says otherwise. In `free_body`, each disturbance is a
-multiple of its worst case, so one number each selects 0.1, 0.3 or 1 of the worst case; zero switches the
-disturbance off.
+from the flight's model. Units are SI unless the name states another unit. In `free_body`, each disturbance is
+a multiple of its worst case, so that a number such as 0.1, 0.3 or 1 selects its size; zero switches it off.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
 
 class OrbitSection(Section, frozen=True, kw_only=True):
-    """The orbit at the simulation's time zero; `altitude` m is the semi-major axis above the equator.
+    """The orbit at the simulation's time zero; `altitude` (m) is the semi-major axis less the Earth's radius.
 
-    `local_time` in hours, the mean local time of the ascending node, takes the place of `ascending_node_deg`.
+    `local_time`, the mean local time of the ascending node in hours, overrides `ascending_node_deg`.
     """
 
     altitude: Annotated[float, Meta(ge=200e3, le=1_000e3)] = 500e3
@@ -35,9 +34,9 @@ class OrbitSection(Section, frozen=True, kw_only=True):
 
 
 class CraftSection(Section, frozen=True, kw_only=True):
-    """A craft that is neither of the named ones: a box of `size` m with its origin in the middle.
+    """A craft other than the named ones: a box of `size` (3,) m with its origin at its centre.
 
-    `inertia` kg m^2 is of the principal axes; `dipole_per_ampere` m^2 of every coil.
+    `inertia` (3,) kg m^2 is that of the principal axes; `dipole_per_ampere` (m^2) is that of each coil.
     """
 
     inertia: tuple[Positive, Positive, Positive]
@@ -46,9 +45,9 @@ class CraftSection(Section, frozen=True, kw_only=True):
 
 
 class TipOff(Section, frozen=True, kw_only=True):
-    """How the body is released: `speed` rad/s about an axis that is drawn, or `rate` rad/s, body axes.
+    """The release of the body: `speed` (rad/s) about a random axis, or `rate` (3,) rad/s, body axes.
 
-    `attitude` is ICRS into body, scalar last; without it every attitude is equally likely.
+    `attitude` is ICRS into body, scalar last; without it the attitude is random.
     """
 
     speed: NotNegative = 0.1745
@@ -59,11 +58,12 @@ class TipOff(Section, frozen=True, kw_only=True):
 class Disturbances(Section, frozen=True, kw_only=True):
     """Multiples of the worst cases, and the errors of the coils.
 
-    `drag` and `solar_pressure` of a centre of pressure 2 cm beside the centre of mass; `residual_dipole`
-    of 1e-3 A m^2 that stays, 3e-4 A m^2 in sunlight and a walk of 5e-5 A m^2; `ring_current` of 20 nT,
-    changing by hours; `day_bulge` of the air about its mean, and `walks` of air and dipole.
-    `principal_turn_deg` bounds the turn of the principal axes, drawn between a third of it and the whole.
-    `coil_scale` and `coil_tilt_deg` are standard deviations.
+    The worst case of `drag` and `solar_pressure` is a centre of pressure 2 cm from the centre of mass. That
+    of `residual_dipole` is a constant part of 1e-3 A m^2, a part of 3e-4 A m^2 in sunlight and a random walk
+    of 5e-5 A m^2. That of `ring_current` is 20 nT, changing within hours. `day_bulge` is the variation of the
+    air density about its mean; `walks` are the random walks of air density and dipole. The principal axes are
+    rotated by a third to the whole of `principal_turn_deg`. `coil_scale` and `coil_tilt_deg` are standard
+    deviations.
     """
 
     gravity_gradient: NotNegative = 1.0
@@ -79,7 +79,7 @@ class Disturbances(Section, frozen=True, kw_only=True):
 
 
 class FreeBodySection(Section, frozen=True, kw_only=True):
-    """The whole section; `craft` is one of `sim_hal.worlds.free_body.CRAFTS`, or described in full."""
+    """The section `free_body`; `craft` is a key of `sim_hal.worlds.free_body.CRAFTS`, or a section."""
 
     craft: Literal["knightcube", "cubesat_3u"] | CraftSection = "knightcube"
     orbit: OrbitSection = OrbitSection()
@@ -87,18 +87,15 @@ class FreeBodySection(Section, frozen=True, kw_only=True):
     disturbances: Disturbances = Disturbances()
 
 
-Row = tuple[float, float, float]
-
-
 class Release(Section, frozen=True, kw_only=True):
-    """The release of the testbed's body: q2 and rate about the thread at mission time zero."""
+    """The release of the testbed's body: q2 and rate (rad/s) about the thread at mission time zero."""
 
     q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
     rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
 
 
 class Thread(Section, frozen=True, kw_only=True):
-    """The thread: N m/rad and N m s/rad."""
+    """Stiffness (N m/rad) and damping (N m s/rad) of the thread."""
 
     stiffness: NotNegative = 0.0
     damping: NotNegative = 0.0
@@ -107,27 +104,27 @@ class Thread(Section, frozen=True, kw_only=True):
 class ImuNoise(Section, frozen=True, kw_only=True):
     """Noise of the inertial unit: uniform bounds on the quaternion and the rate, and a constant gyro bias.
 
-    `profile: datasheet` adds the white noise of the unit's data sheet and a bias drawn at each start;
-    `field_bias` T is the magnetometer's, body axes.
+    `profile: datasheet` adds the white noise of the unit's data sheet and a bias drawn at each start.
+    `field_bias` (3,) T is the bias of the magnetometer, body axes.
     """
 
     profile: Literal["bounds", "datasheet"] = "bounds"
     quaternion_noise: NotNegative = 0.0
     rate_noise: NotNegative = 0.0
-    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    field_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_bias: Vector = (0.0, 0.0, 0.0)
+    field_bias: Vector = (0.0, 0.0, 0.0)
     clock_ppm: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
 
 
 class Latency(Section, frozen=True, kw_only=True):
-    """Latency of the workers' results in lock-step, s."""
+    """Latency (s) of the workers' results in lock-step."""
 
     planner: NotNegative = 0.05
     vision: NotNegative = 0.25
 
 
 class Truth(Section, frozen=True, kw_only=True):
-    """True constants where they differ from the flight configuration's."""
+    """True constants that differ from those of the flight configuration."""
 
     inertia: Positive | None = None
     field: Positive | None = None
@@ -136,9 +133,9 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class CageTruth(Section, frozen=True, kw_only=True):
-    """What the simulated cage plays: the orbit at the simulation's time zero.
+    """The field of the simulated cage; `orbit` is that at the simulation's time zero.
 
-    `gain` is what its coils make of the field that is asked of them; `ring_current` a multiple of 20 nT.
+    `gain` is the field of its coils relative to the commanded field; `ring_current` is a multiple of 20 nT.
     """
 
     orbit: OrbitSection = OrbitSection()
@@ -147,7 +144,7 @@ class CageTruth(Section, frozen=True, kw_only=True):
 
 
 class SkySection(Section, frozen=True, kw_only=True):
-    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
+    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis uses `bilinear` and `uniform`."""
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
@@ -162,7 +159,7 @@ class SkySection(Section, frozen=True, kw_only=True):
 
 
 class Tumble(Section, frozen=True, kw_only=True):
-    """How an object's brightness varies: by +-`amplitude` magnitudes, once in `period` s."""
+    """A periodic variation of brightness by +-`amplitude` magnitudes with a period of `period` s."""
 
     period: Positive
     amplitude: Annotated[float, Meta(ge=0.0, le=5.0)]
@@ -170,10 +167,10 @@ class Tumble(Section, frozen=True, kw_only=True):
 
 
 class LineOfSight(Section, frozen=True, kw_only=True):
-    """A great circle among the stars: where the object is at `at` s of mission time, and how it moves.
+    """A motion along a great circle among the stars, from a position at `at` s of mission time.
 
-    `rate_deg` deg/s towards the position angle `towards_deg`, from north through east;
-    `acceleration_deg` deg/s^2 along the circle.
+    `rate_deg` (deg/s) is the rate towards the position angle `towards_deg`, from north through east;
+    `acceleration_deg` (deg/s^2) is the acceleration along the circle.
     """
 
     right_ascension_deg: Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -185,16 +182,16 @@ class LineOfSight(Section, frozen=True, kw_only=True):
 
 
 class ObjectState(Section, frozen=True, kw_only=True):
-    """Position m and velocity m/s of an object at `simulation.utc`, ICRS, about the Earth's centre."""
+    """Geocentric position (3,) m and velocity (3,) m/s of an object at `simulation.utc`, ICRS."""
 
-    position: Row
-    velocity: Row
+    position: Vector
+    velocity: Vector
 
 
 class SkyObject(Section, frozen=True, kw_only=True):
-    """An object in the sky of the star camera: a `line_of_sight` or an orbit's `state`, one of the two.
+    """An object in the sky of the star camera, with either a `line_of_sight` or the `state` of an orbit.
 
-    `magnitude` is Johnson V, of an orbit in full sunlight.
+    `magnitude` is Johnson V; for an object in orbit it is that in full sunlight.
     """
 
     magnitude: Annotated[float, Meta(ge=-10.0, le=20.0)]
@@ -204,10 +201,11 @@ class SkyObject(Section, frozen=True, kw_only=True):
 
 
 class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
-    """Errors of the devices of an orbit.
+    """Errors of the devices in orbit.
 
-    GPS: m of the slow and the white error of each axis, s from power to the first fix. Strings: relative
-    spread of their gains, A of noise, and the Earth's albedo.
+    `gps_walk` and `gps_noise` (m) are the slow and the white error of each axis; `gps_start` (s) is the time
+    from power-on to the first fix. `string_gain` is the relative spread of the gains of the solar strings,
+    `string_noise` (A) their noise; `albedo` is that of the Earth.
     """
 
     gps_walk: NotNegative = 2.0
@@ -219,9 +217,9 @@ class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
 
 
 class FaultEntry(Section, frozen=True, kw_only=True):
-    """A fault and when: `at` in s of mission time, `for` in s.
+    """A fault that begins at `at` (s of mission time) and lasts `for` (s).
 
-    Without `at` it begins at 0, without `for` it lasts to the end. `sim_hal.faults.schedule` reads `fault`.
+    Without `at` it begins at 0, without `for` it lasts to the end. `sim_hal.faults.schedule` parses `fault`.
     """
 
     fault: str
@@ -230,9 +228,9 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The whole section; `world` is one of `sim_hal.worlds.world.WORLDS`, or `module:factory`.
+    """The section `simulation`; `world` is a key of `sim_hal.worlds.world.WORLDS`, or `module:factory`.
 
-    `coil_field` is the field of the coils at the magnetometer, (3, 3) T/A, from currents to body axes.
+    `coil_field` (3, 3) T/A is the field of the coils at the magnetometer, from currents to body axes.
     """
 
     seed: Annotated[int, Meta(ge=0)] = 1
@@ -241,7 +239,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     release: Release | None = None
     thread: Thread = Thread()
     current_noise: NotNegative = 0.0
-    coil_field: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
+    coil_field: tuple[Vector, Vector, Vector] = ((0.0, 0.0, 0.0),) * 3
     imu: ImuNoise = ImuNoise()
     sky: SkySection = SkySection()
     objects: Annotated[tuple[SkyObject, ...], Meta(max_length=32)] = ()

@@ -3,32 +3,13 @@
     model = EarthCameraModel.fuga15d(seed=1)
     scene = EarthScene(position, attitude, sun_position(julian_date))
     frame = render(model, scene, generator)
-    truth = limb_truth(scene, model)          # the true limb, and the Sun's elevation there
 
-`model` holds the camera's parameters, `scene` the positions of camera, Earth and Sun, and the atmosphere.
-`radiance` gives the radiance along lines of sight, the Sun's disc and its glare; `image` adds optics and
-detector. `truth` gives the true nadir, Sun direction and limb. Radiance is in units of that of a white matt
-surface with the Sun at the zenith; the radiance of the Sun's disc is 46,000.
+`scene` has the positions of camera, Earth and Sun, the atmosphere, and the radiance along lines of sight.
+`image` has the camera's parameters and adds optics, the Sun's disc and the detector. Radiance is in units of
+that of a white matt surface with the Sun at the zenith; the radiance of the Sun's disc is 46,000.
 """
 
-from sim_hal.earth_camera.image import expected_radiance, render
-from sim_hal.earth_camera.model import EarthCameraModel
-from sim_hal.earth_camera.scene import Atmosphere, EarthScene
-from sim_hal.earth_camera.truth import LimbTruth, limb_truth, nadir, sun_direction, sun_point
+from sim_hal.earth_camera.image import EarthCameraModel, expected_radiance, render
+from sim_hal.earth_camera.scene import Atmosphere, EarthScene, nadir
 
-APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height
-"""Height (m) above the ellipsoid at which a sunlit limb has half its brightness (default atmosphere)."""
-
-__all__ = [
-    "APPARENT_LIMB_HEIGHT",
-    "Atmosphere",
-    "EarthCameraModel",
-    "EarthScene",
-    "LimbTruth",
-    "expected_radiance",
-    "limb_truth",
-    "nadir",
-    "render",
-    "sun_direction",
-    "sun_point",
-]
+__all__ = ["Atmosphere", "EarthCameraModel", "EarthScene", "expected_radiance", "nadir", "render"]

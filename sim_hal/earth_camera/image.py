@@ -1,32 +1,261 @@
-"""Frames of Earth and Sun: the radiance through optics and detector.
+"""The camera that views Earth and Sun: its parameters, optics and detector.
 
 The optics blur the Earth's image by a narrow Gaussian and scatter a little light over the whole frame. The
-detector has a response, noise and a fixed pattern of its pixels, and gives counts.
+Sun's disc is darker at the rim, hidden by the Earth, and dimmed by the air; its glare arises in the optics.
+The detector has a response, noise and a fixed pattern of its pixels, and gives counts.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
+from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro.arrays import FloatArray, Image, IntArray
-from sim_hal.earth_camera.model import EarthCameraModel, pixel_rays
-from sim_hal.earth_camera.radiance import add_disc, add_glare, look, radiance
-from sim_hal.earth_camera.scene import EarthScene
+from knightcube.astro.directions import tangent_basis
+from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
+from sim_hal.earth_camera.scene import (
+    EarthScene,
+    Float32Array,
+    darkening,
+    look,
+    radiance,
+    towards_sun,
+    transmission,
+    visible_share,
+)
 
-Float32Array = npt.NDArray[np.float32]
+DEVICE = "Earth camera model"
+
+# Minimum, maximum and unit of each parameter.
+_LIMITS: dict[str, tuple[float, float, str]] = {
+    "rows": (1, 16_384, "px"),
+    "columns": (1, 16_384, "px"),
+    "bits": (1, 16, "bit"),
+    "decades": (0.1, 12.0, ""),
+    "darkest": (1e-6, 1e3, ""),
+    "sensitivity": (1e-3, 1e12, "e-"),
+    "full_well": (1.0, 1e9, "e-"),
+    "gain": (1e-3, 1e5, "e-/count"),
+    "read_noise": (0.0, 1e5, "e-"),
+    "pedestal": (0.0, 65_535.0, "counts"),
+    "noise": (0.0, 1e4, "counts"),
+    "fixed_pattern": (0.0, 1e4, "counts"),
+    "response_spread": (0.0, 1.0, ""),
+    "dead_pixels": (0, 1 << 20, "px"),
+    "hot_pixels": (0, 1 << 20, "px"),
+    "blur": (0.0, 10.0, "px"),
+    "scatter": (0.0, 0.5, ""),
+    "scatter_angle": (1e-4, 0.5, "rad"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EarthCameraModel:
+    """A wide-angle CMOS camera; radiance is in units of a white matt surface's with the Sun overhead.
+
+    Attributes:
+        lens: geometry of the pixels: a `Pinhole`, or a `Lens` with distortion.
+        rows: pixels down, as in the lens.
+        columns: pixels across, as in the lens.
+        bits: resolution of the converter.
+        response: "logarithmic" (counts proportional to the logarithm of light plus `darkest`) or "linear".
+        decades: decades of radiance between `darkest` and the highest count; logarithmic only.
+        darkest: radiance equivalent to the dark current; logarithmic only.
+        sensitivity: e- per frame at a radiance of one; linear only.
+        full_well: e-, capacity of a pixel; linear only.
+        gain: e- per count; linear only.
+        read_noise: e-, standard deviation; linear only.
+        blooming: whether charge beyond the full well spills along its column; linear only.
+        pedestal: counts without light.
+        noise: counts, standard deviation, independent in each pixel and frame; logarithmic only.
+        fixed_pattern: counts, standard deviation of the pixels' constant offsets after calibration.
+        response_spread: relative standard deviation of the pixels' sensitivities; linear only.
+        dead_pixels: number of pixels that always read zero.
+        hot_pixels: number of pixels that always read a bright value.
+        seed: seed of the fixed pattern and of the dead and hot pixels.
+        blur: px, standard deviation of the optics' Gaussian.
+        scatter: fraction of the light that the optics scatter widely.
+        scatter_angle: rad, angle at which scattered light has half its central radiance.
+
+    Raises OutOfRange for values out of range, ValueError for a lens of another size.
+    """
+
+    lens: CameraModel
+    rows: int = 512
+    columns: int = 512
+    bits: int = 8
+    response: Literal["logarithmic", "linear"] = "logarithmic"
+    decades: float = 6.0
+    darkest: float = 0.01
+    sensitivity: float = 16_000.0
+    full_well: float = 20_000.0
+    gain: float = 80.0
+    read_noise: float = 20.0
+    blooming: bool = False
+    pedestal: float = 8.0
+    noise: float = 0.7
+    fixed_pattern: float = 1.0
+    response_spread: float = 0.01
+    dead_pixels: int = 10
+    hot_pixels: int = 10
+    seed: int = 0
+    blur: float = 0.6
+    scatter: float = 0.01
+    scatter_angle: float = math.radians(0.5)
+
+    def __post_init__(self) -> None:
+        check_limits(DEVICE, self, _LIMITS)
+        if self.response not in ("logarithmic", "linear"):
+            raise ValueError(f"{DEVICE}: response = {self.response!r}: use logarithmic or linear")
+        if (self.lens.rows, self.lens.columns) != (self.rows, self.columns):
+            raise ValueError(
+                f"{DEVICE}: {self.rows} x {self.columns} pixels behind a lens of "
+                f"{self.lens.rows} x {self.lens.columns}: give both the same"
+            )
+        if self.pedestal >= self.highest_count:
+            raise OutOfRange(DEVICE, "pedestal", self.pedestal, 0.0, self.highest_count - 1.0, "counts")
+        if self.dead_pixels + self.hot_pixels > self.rows * self.columns:
+            raise ValueError(f"{DEVICE}: more dead and hot pixels than pixels")
+
+    @classmethod
+    def fuga15d(
+        cls,
+        field_of_view: float = math.radians(67.0),
+        centre: tuple[float, float] | None = None,
+        k1: float = 0.0,
+        k2: float = 0.0,
+        **numbers: Any,
+    ) -> Self:
+        """Return the camera of Meller et al.: 512 x 512, 8 bits, logarithmic over six decades, 67 deg.
+
+        `field_of_view` (rad) is without distortion, edge to edge. `k1`, `k2` and `centre` are those of
+        `knightcube.vision.camera.lens.Lens`. `numbers` are other attributes, such as `response="linear"`.
+        """
+        rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
+        ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)
+        lens = Lens(columns, rows, ideal.focal_length, centre or ideal.centre, k1, k2)
+        return cls(lens=lens, **numbers)
+
+    @property
+    def highest_count(self) -> int:
+        """The count at which the converter saturates."""
+        return int((1 << self.bits) - 1)
+
+    @property
+    def count_type(self) -> type[np.uint8] | type[np.uint16]:
+        """The smallest unsigned integer that holds a count."""
+        return np.uint8 if self.bits <= 8 else np.uint16
+
+    @property
+    def counts_per_decade(self) -> float:
+        """Increase of the counts for ten times the light in the logarithmic camera."""
+        return (self.highest_count - self.pedestal) / self.decades
+
+
+def pixel_rays(lens: CameraModel) -> FloatArray:
+    """Return the read-only unit vectors (rows x columns, 3), camera axes, of the pixels."""
+    return _pixel_rays(Lens.of(lens))
+
+
+@lru_cache(maxsize=4)
+def _pixel_rays(lens: Lens) -> FloatArray:
+    rows, columns = np.mgrid[0 : lens.rows, 0 : lens.columns]
+    rays = lens.unit_vectors(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
+    rays.setflags(write=False)
+    return rays
+
+
+_SUBPIXELS = 6
+"""Sampling points of the Sun's disc per pixel and axis."""
+
+
+def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
+    """Add the disc's radiance, blurred, to `image` (rows, columns)."""
+    axis, radius = towards_sun(scene)
+    window = _window(model.lens, axis, radius, math.ceil(4.0 * model.blur) + 1)
+    if window is None:
+        return
+    left, top, width, height = window
+    grid = (np.arange(max(width, height) * _SUBPIXELS) + 0.5) / _SUBPIXELS - 0.5
+    x, y = np.meshgrid(left + grid[: width * _SUBPIXELS], top + grid[: height * _SUBPIXELS])
+    rays = model.lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1))
+    # Squares of chords are more accurate than cosines of such small angles.
+    share = np.sum((rays - axis) ** 2, axis=1) / (2.0 * math.sin(0.5 * radius)) ** 2
+    fine = np.zeros(len(rays))
+    # Rays outside the field of the lens are NaN, for which the comparison is false.
+    inside = np.flatnonzero(share < 1.0)
+    fine[inside] = darkening(share[inside]) * transmission(scene, rays[inside])
+    fine *= (1.0 - model.scatter) / math.sin(radius) ** 2
+    blurred = gaussian_filter(fine.reshape(x.shape), model.blur * _SUBPIXELS, mode="constant", truncate=4.0)
+    patch = blurred.reshape(height, _SUBPIXELS, width, _SUBPIXELS).mean(axis=(1, 3))
+    rows = slice(max(top, 0), min(top + height, model.rows))
+    columns = slice(max(left, 0), min(left + width, model.columns))
+    if rows.start < rows.stop and columns.start < columns.stop:
+        image[rows, columns] += patch[
+            rows.start - top : rows.stop - top, columns.start - left : columns.stop - left
+        ]
+
+
+def add_glare(scene: EarthScene, model: EarthCameraModel, image: Float32Array) -> None:
+    """Add the sunlight that the optics scatter to `image` (rows, columns).
+
+    The scattered radiance falls from its centre as 1/(1 + (s/s0)^2) with the chord s: the shape of Harvey and
+    Shack for polished optics, with a slope of two. Over the hemisphere it has the fraction `scatter` of the
+    light. The lens has no hood: sunlight reaches it from the whole half space in front of it.
+    """
+    axis, _ = towards_sun(scene)
+    if axis[2] <= 0.0 or model.scatter == 0.0:
+        return
+    light = visible_share(scene) * float(axis[2]) * scatter_centre(model)
+    squares = 2.0 - 2.0 * (pixel_rays(model.lens) @ axis).reshape(image.shape)
+    image += (light / (1.0 + squares / model.scatter_angle**2)).astype(np.float32)
+
+
+def scatter_centre(model: EarthCameraModel) -> float:
+    """Return the radiance at the centre of the scattered sunlight.
+
+    The integral of 1/(1 + (s/s0)^2) over the hemisphere is pi s0^2 ln(1 + 2/s0^2), and the irradiance of the
+    Sun is pi in these units.
+    """
+    square = model.scatter_angle**2
+    return model.scatter / (square * math.log(1.0 + 2.0 / square))
+
+
+def _window(
+    lens: CameraModel, axis: FloatArray, radius: float, margin: int
+) -> tuple[int, int, int, int] | None:
+    """Return left, top, width and height of the pixels in reach of disc and blur, or None."""
+    angle = np.arange(16) * (np.pi / 8.0)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(axis)
+    # A polygon of 16 sides contains the disc if it is wider by 1/cos(pi/16).
+    rim = lens.project(axis + math.tan(radius) / math.cos(np.pi / 16.0) * ring)
+    rim = rim[~np.isnan(rim[:, 0])]
+    if not len(rim):
+        return None
+    # Clipped before the cast, because near 90 deg from the axis the rim exceeds any integer.
+    outer = np.array([lens.columns, lens.rows]) - 1 + margin
+    low = np.maximum(np.floor(rim.min(axis=0)) - margin, -margin)
+    high = np.minimum(np.ceil(rim.max(axis=0)) + margin, outer)
+    if np.any(low > high):
+        return None
+    (left, top), (width, height) = low.astype(int).tolist(), (high - low).astype(int).tolist()
+    return left, top, width + 1, height + 1
+
 
 _BIN = 8
-"""px: scattered light is so smooth that it is reckoned on bins."""
+"""Edge (px) of the bins in which the smooth scattered light is computed."""
 
 
 def blurred(model: EarthCameraModel, image: Float32Array) -> Float32Array:
-    """Return `image` (rows, columns) through the optics; beyond its edges it is taken to go on."""
+    """Return `image` (rows, columns) through the optics; its edge values continue outside."""
     narrow = gaussian_filter(image, model.blur, mode="nearest", truncate=4.0) if model.blur > 0.0 else image
     if model.scatter == 0.0:
         return np.asarray(narrow)
@@ -48,13 +277,13 @@ def _scattered(model: EarthCameraModel, image: Float32Array) -> Float32Array:
 def _kernel(
     down: int, across: int, scatter: float, angle: float, focal_length: float
 ) -> tuple[npt.NDArray[np.complex64], tuple[int, int]]:
-    """Return the transform of scattering from bin to bin, and its shape.
+    """Return the transform of the scattering between bins, and its shape.
 
-    The law of `sun_disc.add_glare` with distances in the image over the focal length for angles.
+    The law is that of `add_glare`, with image distances over the focal length as angles.
     """
     shape = (next_fast_len(2 * down), next_fast_len(2 * across))
     y, x = (np.minimum(np.arange(n), n - np.arange(n)) * (_BIN / focal_length) for n in shape)
-    # Points of one bin are apart, too: in the mean square by a third of its width's square.
+    # Two points of one bin have a mean squared distance of a third of its squared width.
     squares = y[:, None] ** 2 + x**2 + (_BIN / focal_length) ** 2 / 3.0
     share = scatter / (math.pi * angle**2 * math.log(1.0 + 2.0 / angle**2))
     kernel = share * (_BIN / focal_length) ** 2 / (1.0 + squares / angle**2)
@@ -62,7 +291,7 @@ def _kernel(
 
 
 def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random.Generator) -> Image:
-    """Return the frame (rows, columns) that `radiance` (rows, columns) gives."""
+    """Return the frame (rows, columns) of counts for `radiance` (rows, columns)."""
     offsets, spread, dead, hot, hot_counts = _pattern(model)
     if model.response == "logarithmic":
         signal = np.log10(1.0 + radiance * np.float32(1.0 / model.darkest))
@@ -77,7 +306,7 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
         charge += _normal(model, model.read_noise, generator)
         signal = charge / np.float32(model.gain)
     signal += offsets + np.float32(model.pedestal)
-    # A pixel that works no more has no noise of the light's.
+    # Dead and hot pixels have no noise.
     flat = signal.reshape(-1)
     flat[dead] = 0.0
     flat[hot] = hot_counts
@@ -89,24 +318,20 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
 def spill(charge: Float32Array, full_well: float) -> None:
     """Spread charge beyond the full well along each column of `charge` (rows, columns), half up, half down.
 
-    Each pixel on the way fills to the brim before the next one gets any; what reaches an edge is lost.
+    Each pixel fills up before the next one receives charge; charge that reaches an edge is lost.
     """
     for column in np.flatnonzero(np.any(charge > full_well, axis=0)):
         line = charge[:, column]
         over = np.maximum(line - full_well, 0.0)
         np.minimum(line, full_well, out=line)
         for way in (slice(None), slice(None, None, -1)):
-            _pour(line[way], 0.5 * over[way], full_well)
-
-
-def _pour(line: Float32Array, over: Float32Array, full_well: float) -> None:
-    carried = 0.0
-    for row, excess in enumerate(over.tolist()):
-        carried += excess
-        if carried > 0.0:
-            taken = min(carried, full_well - float(line[row]))
-            line[row] += taken
-            carried -= taken
+            pixels, carried = line[way], 0.0
+            for row, excess in enumerate((0.5 * over[way]).tolist()):
+                carried += excess
+                if carried > 0.0:
+                    taken = min(carried, full_well - float(pixels[row]))
+                    pixels[row] += taken
+                    carried -= taken
 
 
 def _normal(model: EarthCameraModel, sigma: float, generator: np.random.Generator) -> Float32Array:
@@ -117,7 +342,7 @@ def _normal(model: EarthCameraModel, sigma: float, generator: np.random.Generato
 def _pattern(
     model: EarthCameraModel,
 ) -> tuple[Float32Array, Float32Array, IntArray, IntArray, Float32Array]:
-    """Return offsets in counts, departures of sensitivity, dead and hot pixels, the hot ones' counts."""
+    """Return offsets (counts), sensitivity errors, dead pixels, hot pixels, and counts of hot pixels."""
     rng = np.random.default_rng(model.seed)
     size = model.rows * model.columns
     offsets = _normal(model, model.fixed_pattern, rng)
@@ -129,13 +354,13 @@ def _pattern(
 
 
 _FINE = np.sqrt(1.0 / 12.0) * np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
-"""px from a pixel's centre, (4, 2): Gauss and Legendre's two points, exact for cubics along each axis."""
+"""Offsets (4, 2), px, from a pixel's centre: two Gauss-Legendre points along each axis."""
 
 
 def render(model: EarthCameraModel, scene: EarthScene, generator: np.random.Generator) -> Image:
-    """Return the frame (rows, columns) that the camera gives: uint8 to 8 bits, uint16 above.
+    """Return the camera's frame (rows, columns): uint8 for up to 8 bits, else uint16.
 
-    All noise that changes from frame to frame is drawn from `generator`.
+    The noise of the frame is drawn from `generator`.
     """
     return counts(model, _light(model, scene), generator)
 
@@ -158,7 +383,7 @@ def _earth(model: EarthCameraModel, scene: EarthScene) -> Float32Array:
     sight = look(scene, rays)
     light = radiance(scene, rays, sight)
     limb = (~sight.hits & (light > 0.0)).reshape(model.rows, model.columns)
-    # Of the ground's pixels those count, too, that reach over the limb.
+    # Pixels of the ground next to the limb may extend beyond it.
     at_limb = np.flatnonzero(binary_dilation(limb, np.ones((3, 3), dtype=bool)))
     if len(at_limb):
         pixels = np.stack([at_limb % model.columns, at_limb // model.columns], axis=1)

@@ -1,32 +1,44 @@
-"""The positions of camera, Earth and Sun when a frame is taken, and the Earth's atmosphere.
+"""The scene of a camera that views Earth and Sun from a low orbit, and the radiance along lines of sight.
 
-The air thins exponentially and scatters sunlight once, which gives the soft limb, twilight, and haze over
-the ground. The optical depth along an oblique path is the vertical one times Chapman's function, here the
-limit for a scale height far below the Earth's radius, sqrt(pi X/2) exp(X mu^2/2) erfc(mu sqrt(X/2)) with X
-their ratio and mu the cosine from the zenith (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709).
-The formula is also valid with the Sun below the horizon, and gives twilight. Not modelled: refraction (which
-would raise the apparent limb by 0.2 km, 0.004 deg), ozone, and clouds above the limb.
+Radiance is in units of that of a white matt surface with the Sun at the zenith.
+
+The air thins exponentially and scatters sunlight once, which gives the soft limb, twilight, and haze over the
+ground. The optical depth along an oblique path is the vertical one times Chapman's function, here the limit
+for a scale height far below the Earth's radius, sqrt(pi X/2) exp(X mu^2/2) erfc(mu sqrt(X/2)) with X their
+ratio and mu the cosine from the zenith (Huestis 2001, J. Quant. Spectrosc. Radiat. Transfer 69, 709). The
+formula is also valid for a Sun below the horizon. Not modelled: refraction (which would raise the apparent
+limb by 0.2 km, 0.004 deg), ozone, and clouds above the limb.
+
+Lines of sight are intersected with the WGS 84 ellipsoid exactly, in axes scaled so that it is the unit
+sphere. The ground is matt (Lambert); direct sunlight reaches it through the air, and its light passes the
+air again. Land, sea and cloud are noise with a power-law spectrum, sampled on a sphere in a periodic volume
+at two scales: continents and weather, and coasts and single clouds. The map is not the real Earth, but has
+the bright edges inside the limb that disturb a horizon detector.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erfcx
+from scipy.ndimage import map_coordinates
+from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, semi_axes
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
 Float32Array = npt.NDArray[np.float32]
 
 ATMOSPHERE = "atmosphere"
 _DEEPEST = -9.0
-"""Below it the Sun's rays pass through optical depths of 1e35: dark."""
+"""Smallest argument of erfcx, at which the optical depth is 1e35."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +47,8 @@ class Atmosphere:
 
     Attributes:
         scale_height: m.
-        optical_depth: vertical, of the whole of it; Rayleigh's at 550 nm (Bucholtz 1995, Appl. Opt. 34).
-        multiple: brightness of light scattered any number of times over that of light scattered once.
+        optical_depth: vertical; that of Rayleigh scattering at 550 nm (Bucholtz 1995, Appl. Opt. 34).
+        multiple: brightness of all scattered light relative to that of light scattered once.
     """
 
     scale_height: float = 8000.0
@@ -57,42 +69,42 @@ class Atmosphere:
 
     @property
     def limb_depth(self) -> float:
-        """The optical depth of a line that touches the ground, end to end: some 70 times the vertical."""
+        """Optical depth of a line that touches the ground, about 70 times the vertical one."""
         return self.optical_depth * math.sqrt(2.0 * math.pi * self._ratio)
 
     @property
     def apparent_limb_height(self) -> float:
-        """The tangent height in m at which a sunlit limb has half the brightness it tends to further down.
+        """Tangent height (m) at which a sunlit limb has half its full brightness.
 
         There 1 - exp(-depth) is 1/2, and the depth is `limb_depth` exp(-height/scale height).
         """
         return self.scale_height * math.log(self.limb_depth / math.log(2.0))
 
     def tangent_depth(self, heights: Float32Array) -> Float32Array:
-        """Return the optical depth right through along lines whose tangent heights (...) m are given."""
+        """Return the optical depth of whole lines of sight with tangent heights (...) m."""
         return np.asarray(self.limb_depth * np.exp(-heights / self.scale_height))
 
     def slant_depth(self, cosines: Float32Array) -> Float32Array:
-        """Return the optical depth from the ground out, at cosines (...) from the zenith, of either sign."""
+        """Return the optical depth to space at cosines (...) from the zenith, of either sign."""
         root = math.sqrt(0.5 * self._ratio)
         argument = np.maximum(cosines * root, _DEEPEST)
         return np.asarray(self.optical_depth * math.sqrt(math.pi) * root * erfcx(argument))
 
     def scattered(self, depth: Float32Array, bottom: Float32Array, sunward: Float32Array) -> Float32Array:
-        """Return the share of sunlight scattered along lines of sight, before the phase function.
+        """Return the fraction of sunlight scattered along lines of sight, before the phase function.
 
-        `depth` (...) is the optical depth along the line; `bottom` (...) the density at its lowest point over
-        that at the ground; `sunward` (...) the optical depth from the ground below there towards the Sun.
-        Light comes from above where the line's own depth reaches one, and the Sun's attenuation is averaged
-        over the air above that (exponential in the density, so its mean is (1 - exp(-x))/x).
+        `depth` (...) is the optical depth along the line; `bottom` (...) the density at its lowest point
+        relative to the ground; `sunward` (...) the optical depth from the ground below that point towards the
+        Sun. The scattered light comes from the air above the point where the line's depth reaches one. The
+        attenuation of sunlight is averaged over that air; its mean is (1 - exp(-x))/x.
         """
         x = np.maximum(sunward * bottom / (1.0 + depth), 1e-6)
         return np.asarray(np.expm1(-depth) * np.expm1(-x) / x)
 
     def phase(self, cosines: Float32Array) -> Float32Array:
-        """Return the radiance of endless sunlit air at cosines (...) of the angle from the Sun's rays.
+        """Return the radiance of thick sunlit air at cosines (...) of the angle from the Sun's rays.
 
-        Rayleigh's phase function over four (a white matt surface being 1), times `multiple`.
+        This is a quarter of Rayleigh's phase function times `multiple`.
         """
         return np.asarray(self.multiple * 0.1875 * (1.0 + cosines * cosines))
 
@@ -106,18 +118,18 @@ def _icrs_pole() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarthScene:
-    """Camera, Earth and Sun at one instant.
+    """Camera, Earth and Sun at one time.
 
     Attributes:
         position: of the camera, (3,) m, geocentric, ICRS.
         attitude: quaternion (4,), ICRS into camera.
         sun: the Sun's position, (3,) m, geocentric, ICRS.
-        pole: the Earth's pole, (3,) unit, ICRS; 0.15 deg from the default by now.
-        rotation: rad, the Earth's turn about its pole: it carries the ground with it.
-        texture: the seed of land, sea and cloud.
+        pole: the Earth's pole, (3,) unit, ICRS; in 2026 the true pole is 0.15 deg from the default.
+        rotation: rad, rotation of the Earth about its pole.
+        texture: seed of land, sea and cloud.
         atmosphere: the air.
 
-    Raises OutOfRange for a camera inside the Earth, ValueError for arrays of another shape or not finite.
+    Raises OutOfRange for a camera inside the Earth, ValueError for arrays of wrong shape or not finite.
     """
 
     position: FloatArray
@@ -152,7 +164,7 @@ class EarthScene:
     @property
     def earth_matrix(self) -> FloatArray:
         """The matrix (3, 3) from ICRS into axes fixed to the Earth, its pole last."""
-        # The axis that the pole is least along makes the sounder cross product.
+        # The axis farthest from the pole gives the most accurate cross product.
         aside = np.cross(self.pole, np.eye(3)[int(np.argmin(np.abs(self.pole)))])
         first = np.cross(aside / np.linalg.norm(aside), self.pole)
         second = np.cross(self.pole, first)
@@ -162,3 +174,181 @@ class EarthScene:
     def in_earth(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (..., 3), ICRS, in axes fixed to the Earth."""
         return np.asarray(vectors @ self.earth_matrix.T)
+
+
+OCEAN, LAND, CLOUD = 0.06, 0.22, 0.65
+"""Albedo; sea reflects 0.05 to 0.1 of visible light, soil and plants 0.1 to 0.3, cloud up to 0.8."""
+LAND_SHARE, CLOUD_SHARE = 0.29, 0.55
+"""Fractions of the Earth covered by land and by cloud."""
+
+_CELLS = 96
+"""Edge of the noise volume (cells)."""
+_SLOPE = -2.3
+"""Exponent of the noise amplitude by wave number, near the spectrum of clouds."""
+_RADIUS = 0.42 * _CELLS
+"""Radius of the Earth (cells); the sphere fits in the volume."""
+_MAGNIFICATION, _FINE = 11.0, 0.5
+"""Scale and amplitude of the fine noise relative to the coarse noise."""
+_SOFT = 0.1
+"""Width of a coast or a cloud's edge (standard deviations of the noise)."""
+
+
+def albedo(directions: FloatArray, seed: int) -> Float32Array:
+    """Return the ground's albedo (n,) below Earth-fixed unit directions (n, 3)."""
+    places = np.ascontiguousarray(directions.T, dtype=np.float32)
+    places *= _RADIUS
+    places += 0.5 * _CELLS
+    land, cloud = (
+        _covered(volume, places, share)
+        for volume, share in zip(_volumes(seed), (LAND_SHARE, CLOUD_SHARE), strict=True)
+    )
+    ground = OCEAN + (LAND - OCEAN) * land
+    return np.asarray(ground + (CLOUD - ground) * cloud)
+
+
+def _covered(volume: Float32Array, places: Float32Array, share: float) -> Float32Array:
+    """Return the cover (n,), 0 .. 1, at `places` (3, n); `share` is its mean over the Earth."""
+    coarse = _read(volume, places)
+    fine = _read(volume, places * np.float32(_MAGNIFICATION))
+    height = (coarse + _FINE * fine) / np.hypot(1.0, _FINE)
+    return np.asarray(np.clip((height - ndtri(1.0 - share)) / _SOFT + 0.5, 0.0, 1.0), dtype=np.float32)
+
+
+def _read(volume: Float32Array, places: Float32Array) -> Float32Array:
+    return np.asarray(map_coordinates(volume, places, order=1, mode="grid-wrap"))
+
+
+@lru_cache(maxsize=4)
+def _volumes(seed: int) -> tuple[Float32Array, Float32Array]:
+    """Return two independent periodic volumes of zero mean and unit variance, for land and for cloud."""
+    across = np.fft.fftfreq(_CELLS, 1.0 / _CELLS).astype(np.float32)
+    wave = np.sqrt(across[:, None, None] ** 2 + across[None, :, None] ** 2 + across**2)
+    amplitude = np.where(wave >= 1.5, np.maximum(wave, 1.5) ** _SLOPE, 0.0)
+    rng = np.random.default_rng(seed)
+    shape = (_CELLS, _CELLS, _CELLS)
+    white = rng.standard_normal(shape, np.float32) + 1j * rng.standard_normal(shape, np.float32)
+    # The transform of white noise is white noise, with independent real and imaginary parts.
+    noise = np.fft.ifftn(white * amplitude)
+    land, cloud = noise.real, noise.imag
+    return (land / land.std()).astype(np.float32), (cloud / cloud.std()).astype(np.float32)
+
+
+TOP = 120e3
+"""Height (m) above which air is invisible (a millionth of the limb's brightness)."""
+_DARKEST = -0.2
+"""Cosine of the Sun's zenith angle, 11.5 deg below the horizon, at which only air above `TOP` is lit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarthIntersection:
+    """The first intersections of n lines of sight with the ellipsoid, or their nearest points to it.
+
+    Attributes:
+        hits: which lines (n,) meet the ground.
+        heights: m (n,), height of the nearest point above the ellipsoid; 0 for lines that meet the ground,
+            infinite if the Earth is behind the camera.
+        places: points (n, 3) in Earth-fixed axes scaled to the unit sphere.
+    """
+
+    hits: BoolArray
+    heights: Float32Array
+    places: FloatArray
+
+
+def look(scene: EarthScene, rays: FloatArray) -> EarthIntersection:
+    """Return the intersections of `rays` (n, 3), of any length, in camera axes, with the Earth."""
+    axes = semi_axes()
+    origin = scene.in_earth(scene.position) / axes
+    into_earth = (scene.camera_matrix @ scene.earth_matrix.T) / axes
+    scaled = rays @ into_earth
+    squares = np.einsum("ij,ij->i", scaled, scaled)
+    along = scaled @ origin
+    # Distance of the nearest point from the centre, without the cancellation of b^2 - ac.
+    step = -along / squares
+    nearest = origin + step[:, None] * scaled
+    distance = np.einsum("ij,ij->i", nearest, nearest)
+    ahead = along < 0.0
+    hits = ahead & (distance <= 1.0)
+    back = np.sqrt(np.maximum(1.0 - distance, 0.0) / squares)
+    places = nearest - np.where(hits, back, 0.0)[:, None] * scaled
+    length = np.sqrt(distance)
+    local = np.sqrt(nearest**2 @ axes**2) / length
+    heights = np.where(ahead, np.maximum(length - 1.0, 0.0) * local, np.inf).astype(np.float32)
+    return EarthIntersection(np.asarray(hits), heights, places)
+
+
+def radiance(scene: EarthScene, rays: FloatArray, sight: EarthIntersection) -> Float32Array:
+    """Return the radiance (n,), without the Sun's disc, along unit `rays` (n, 3) in camera axes.
+
+    `sight` gives the intersections of the rays.
+    """
+    result = np.zeros(len(rays), dtype=np.float32)
+    seen = np.flatnonzero(sight.heights < TOP)
+    normals = _unit(sight.places[seen] / semi_axes())
+    to_earth = scene.earth_matrix @ scene.camera_matrix.T
+    distance = float(np.linalg.norm(scene.sun))
+    sun = scene.in_earth(scene.sun / distance)
+    sunward = normals @ sun
+    lit = np.flatnonzero(sunward > _DARKEST)
+    seen, normals = seen[lit], normals[lit]
+    solar = sunward[lit].astype(np.float32)
+    directions = rays[seen]
+    upward = np.maximum(-np.einsum("ij,ij->i", directions, normals @ to_earth), 0.0).astype(np.float32)
+    # Cosine of the scattering angle: 1, forward, for a line of sight towards the Sun.
+    turned = (directions @ (to_earth.T @ sun)).astype(np.float32)
+    air, hits = scene.atmosphere, sight.hits[seen]
+    bottom = np.exp(-sight.heights[seen] / air.scale_height)
+    depth = np.where(hits, air.slant_depth(upward), air.limb_depth * bottom)
+    towards = air.slant_depth(solar)
+    light = air.phase(turned) * air.scattered(depth, bottom, towards)
+    ground = np.flatnonzero(hits & (solar > 0.0))
+    matt = albedo(_unit(sight.places[seen[ground]] * semi_axes()), scene.texture) * solar[ground]
+    light[ground] += matt * np.exp(-depth[ground] - towards[ground])
+    result[seen] = light * np.float32((ASTRONOMICAL_UNIT / distance) ** 2)
+    return result
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+RIM_DARKENING = 0.6
+"""Linear coefficient of limb darkening near 550 nm (Cox 2000, Allen's Astrophysical Quantities)."""
+_RINGS, _SPOKES = 24, 48
+"""Sampling points of the Sun's disc."""
+
+
+def nadir(scene: EarthScene) -> FloatArray:
+    """Return the unit vector (3,) in camera axes to the Earth's centre."""
+    return np.asarray(scene.camera_matrix @ (-scene.position / np.linalg.norm(scene.position)))
+
+
+def towards_sun(scene: EarthScene) -> tuple[FloatArray, float]:
+    """Return the unit vector (3,) in camera axes from the camera to the Sun, and its disc's radius in rad."""
+    offset = scene.sun - scene.position
+    distance = float(np.linalg.norm(offset))
+    return scene.camera_matrix @ offset / distance, math.asin(SUN_RADIUS / distance)
+
+
+def visible_share(scene: EarthScene) -> float:
+    """Return the fraction of the Sun's light that passes Earth and air to the camera, 0 .. 1."""
+    axis, radius = towards_sun(scene)
+    share = np.sqrt((np.arange(_RINGS) + 0.5) / _RINGS)
+    angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(axis)
+    rays = axis + math.tan(radius) * (share[:, None, None] * spokes).reshape(-1, 3)
+    weights = np.repeat(darkening(share**2), _SPOKES)
+    return float(transmission(scene, rays) @ weights / weights.sum())
+
+
+def darkening(share: FloatArray) -> FloatArray:
+    """Return the brightness of the disc, relative to its mean, at squared radii (...), 0 .. 1."""
+    rim = 1.0 - RIM_DARKENING * (1.0 - np.sqrt(np.maximum(1.0 - share, 0.0)))
+    return np.asarray(rim / (1.0 - RIM_DARKENING / 3.0))
+
+
+def transmission(scene: EarthScene, rays: FloatArray) -> FloatArray:
+    """Return the fraction (n,) of sunlight that passes Earth and air along `rays` (n, 3), camera axes."""
+    sight = look(scene, rays)
+    through = np.exp(-scene.atmosphere.tangent_depth(sight.heights))
+    return np.where(sight.hits, 0.0, through)

@@ -1,14 +1,14 @@
-"""A star camera that exposes along the body's true motion and delivers its frame after the read-out.
+"""A camera that exposes along the body's true motion and delivers its frame after the read-out.
 
-While an exposure lasts the attitude is sampled every 10 ms; the renderer then integrates the stars' light
-along it. `expose` gives a future, so that in real time a frame is made beside the devices that keep time.
+During an exposure the attitude is sampled every 10 ms; the renderer then integrates the light along it. The
+renderer returns a future, so that in real time another process can render while the devices keep time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 SAMPLE_NS = 10_000_000
 
 Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
-"""Renders frame number, times (k,) s from the start, camera attitudes (k, 4) and the tracks of objects."""
+"""Renders a frame from its number, times (k,) s, camera attitudes (k, 4), and the tracks of objects."""
 Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
-"""Returns the tracks of objects over an exposure that began at a time, ns, at times (k,) s after it."""
+"""Returns the tracks of objects over an exposure from its start (ns) and times (k,) s since then."""
 
 
 def no_objects(_: int, __: FloatArray) -> Sequence[SourceTrack]:
-    """Return no track: a sky of stars alone."""
+    """Return no tracks, for a sky without moving objects."""
     return ()
 
 
@@ -55,9 +55,9 @@ class EmulatedCamera:
     """A FrameSource and an emulated device.
 
     Attributes:
-        fault: "off", "frozen", "torn", one of `SPOILT`, or none.
-        late_ns: how much later than its read-out a frame comes.
-        one_of: it exposes on one trigger of this many and ignores the others.
+        fault: "off", "frozen", "torn" or a key of `SPOILT`; empty for a sound camera.
+        late_ns: additional delay of frames.
+        one_of: number of triggers of which the camera obeys only the last.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class EmulatedCamera:
         scan_ns: int = 0,
         moving: Moving = no_objects,
     ) -> None:
-        """Take the camera's wiring; `scan_ns` is how much later the last row of a rolling shutter exposes."""
+        """Connect the camera; `scan_ns` is the delay of the last row of a rolling shutter."""
         self._motion = motion
         self._expose = expose
         self._now_ns = now_ns
@@ -99,16 +99,11 @@ class EmulatedCamera:
         self.advance(self._now_ns())
 
     def poll(self) -> Frame | None:
-        """Return the frame once its read-out is over."""
-        exposure = self._exposure
-        now_ns = self._now_ns()
-        if (
-            exposure is None
-            or exposure.image is None
-            or now_ns < exposure.end_ns + self._readout_ns + self.late_ns
-        ):
+        """Return the frame after its read-out, once."""
+        exposure, now_ns = self._exposure, self._now_ns()
+        if exposure is None or exposure.image is None or not exposure.image.done():
             return None
-        if not exposure.image.done():
+        if now_ns < exposure.end_ns + self._readout_ns + self.late_ns:
             return None
         self._exposure = None
         if self.fault == "off":
@@ -130,7 +125,7 @@ class EmulatedCamera:
         return min(exposure.times[-1] + SAMPLE_NS, exposure.end_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Sample the attitude; at the end of the exposure have the image made."""
+        """Sample the attitude; at the end of the exposure start the rendering."""
         while (event_ns := self.next_event_ns()) <= now_ns:
             exposure = self._exposure
             assert exposure is not None
@@ -149,23 +144,14 @@ class EmulatedCamera:
     def _alter(self, frame: Frame) -> Frame:
         """Apply the fault that is set."""
         if self.fault == "frozen" and self._last is not None:
-            return Frame(
-                self._last.sequence,
-                frame.exposure_start_ns,
-                frame.exposure_ns,
-                frame.arrival_ns,
-                self._last.pixels,
-            )
+            return replace(frame, sequence=self._last.sequence, pixels=self._last.pixels)
         if self.fault == "torn" and self._last is not None:
             middle = len(frame.pixels) // 2
-            return _with_pixels(frame, np.concatenate([self._last.pixels[:middle], frame.pixels[middle:]]))
+            pixels = np.concatenate([self._last.pixels[:middle], frame.pixels[middle:]])
+            return replace(frame, pixels=pixels)
         if self.fault in SPOILT:
-            return _with_pixels(frame, SPOILT[self.fault](frame.pixels, frame.sequence))
+            return replace(frame, pixels=SPOILT[self.fault](frame.pixels, frame.sequence))
         return frame
-
-
-def _level(pixels: Image, count: int) -> Image:
-    return np.full_like(pixels, count)
 
 
 def _garbage(pixels: Image, seed: int) -> Image:
@@ -174,7 +160,7 @@ def _garbage(pixels: Image, seed: int) -> Image:
 
 
 def blinded(pixels: Image, seed: int) -> Image:
-    """Return a frame with the stray light of a Sun beside the field: saturated there, falling off from it."""
+    """Return a frame with stray light that is saturated at one edge and falls off across the frame."""
     rows, columns = pixels.shape
     top = np.iinfo(pixels.dtype).max
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
@@ -185,14 +171,10 @@ def blinded(pixels: Image, seed: int) -> Image:
 
 
 SPOILT: dict[str, Callable[[Image, int], Image]] = {
-    "black": lambda pixels, _: _level(pixels, 0),
-    "saturated": lambda pixels, _: _level(pixels, np.iinfo(pixels.dtype).max),
+    "black": lambda pixels, _: np.zeros_like(pixels),
+    "saturated": lambda pixels, _: np.full_like(pixels, np.iinfo(pixels.dtype).max),
     "blinded": blinded,
     "garbage": _garbage,
     "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
 }
-"""What each fault makes of the pixels (rows, columns) of a frame with this number."""
-
-
-def _with_pixels(frame: Frame, pixels: Image) -> Frame:
-    return Frame(frame.sequence, frame.exposure_start_ns, frame.exposure_ns, frame.arrival_ns, pixels)
+"""The faulty pixels (rows, columns) of each fault, from those of a frame and its number."""

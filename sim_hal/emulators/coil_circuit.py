@@ -1,4 +1,6 @@
-"""Coil currents from the PWM chip's outputs through SN754410 bridges (Sease 2013 ch. 5, Table 5.2).
+"""Coil currents from the PWM chip's outputs through SN754410 bridges, and the INA219 that measures them.
+
+The circuit is that of Sease 2013 ch. 5, Table 5.2.
 
 The mean current over a PWM period moves the body: coil L/R is 0.1 ms, the period 20 ms (SN754410 and PCA9685
 data sheets). While the two inputs of a bridge differ, V/R drives the coil in one direction. Equal inputs
@@ -6,6 +8,10 @@ brake the coil.
 
 The supply's current is chopped: a bridge draws its coil's current only while its inputs differ.
 `ChoppedSupply` integrates the current of three bridges exactly over any window.
+
+The emulated INA219 has registers and converts at its own pace (TI SBOS448G). Each conversion is the mean of
+the supply over the conversion window, computed when the bus reads its result. Noise, gain error and the input
+filter are not modelled.
 """
 
 from __future__ import annotations
@@ -18,15 +24,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hal.drivers.coils import CoilSettings, CoilWiring
+from hal.drivers.coils import CoilSettings
 from hal.drivers.pca9685 import COUNTS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 
 Pulse = tuple[int, int]
-"""When in a period an output is high: (first count, how many counts)."""
+"""The high time of an output in a period: (first count, number of counts)."""
 
 _HISTORY_NS = 500_000_000
+"""Time over which the supply's current is recorded."""
 
 
 class Bridge(NamedTuple):
@@ -36,11 +43,11 @@ class Bridge(NamedTuple):
     b: Pulse
 
     def net_counts(self) -> int:
-        """Return for how many counts of a period, signed, the coil is driven; both inputs high brake."""
+        """Return the signed number of counts of a period in which the coil is driven."""
         return self.a[1] - self.b[1]
 
     def driven(self) -> list[tuple[int, int]]:
-        """Return the spans of counts [begin, end) in which the coil is driven either way."""
+        """Return the spans of counts [begin, end) in which the coil is driven."""
         if self.a == self.b:
             return []
         edges = {0, COUNTS}
@@ -59,10 +66,10 @@ class Chopping(NamedTuple):
     """The supply's current from `since_ns` on.
 
     Attributes:
-        since_ns: when these outputs began.
-        origin_ns: when the PWM counter was zero.
-        period_ns: of the PWM.
-        drawn: of each bridge the pulses, and the current in A while it is driven.
+        since_ns: time of the change of the outputs.
+        origin_ns: a time at which the PWM counter was zero.
+        period_ns: PWM period.
+        drawn: pulses of each bridge, and its current (A) while driven.
     """
 
     since_ns: int
@@ -89,7 +96,7 @@ class ChoppedSupply:
         self._history: deque[Chopping] = deque()
 
     def note(self, chopping: Chopping) -> None:
-        """Note that the outputs changed."""
+        """Record a change of the outputs."""
         self._history.append(chopping)
         while len(self._history) > 1 and self._history[1].since_ns < chopping.since_ns - _HISTORY_NS:
             self._history.popleft()
@@ -108,7 +115,7 @@ class ChoppedSupply:
 
 
 CURRENT_UNCERTAINTY = 3.5e-3
-"""A; the thesis's bound on the error of a coil's current."""
+"""Bound of the error of a coil's current (A) in the thesis."""
 
 _LOW, _HIGH = (0, 0), (0, COUNTS)
 _OFF = Bridge(_LOW, _LOW)
@@ -134,11 +141,11 @@ _STUCK: dict[CoilCondition, tuple[Pulse | None, Pulse | None]] = {
     CoilCondition.B_HIGH: (None, _HIGH),
     CoilCondition.B_LOW: (None, _LOW),
 }
-"""The pulses of the legs A and B that do not follow their inputs."""
+"""Constant pulses of the legs A and B of each condition; None for a leg that follows its input."""
 
 
 class CoilCircuit:
-    """Three coils on one chip; updates at every I2C STOP that may have changed outputs."""
+    """Three coils on one PWM chip, updated at every I2C STOP that may have changed outputs."""
 
     def __init__(
         self,
@@ -149,10 +156,10 @@ class CoilCircuit:
         uncertainty: float = CURRENT_UNCERTAINTY,
         bus_voltage: float | None = None,
     ) -> None:
-        """Connect the coils by their true wiring, which may differ from the driver's.
+        """Connect the coils with their true properties.
 
-        `uncertainty` bounds a uniform error in A, drawn at each write of a coil's channels, none at zero;
-        `bus_voltage` is the voltage at a monitor in the supply, V, by default the coils' supply voltage.
+        `uncertainty` (A) bounds a uniform error that is drawn at each write of a coil's channels.
+        `bus_voltage` (V) is the voltage at a monitor in the supply, by default the coils' supply voltage.
         """
         self._chip = chip
         self._coils = tuple(
@@ -195,7 +202,9 @@ class CoilCircuit:
         """Update the currents after a STOP; `written` is the mask of the channels that were written."""
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
-            bridge = self._bridge(coil, *self._stuck[axis])
+            stuck_a, stuck_b = self._stuck[axis]
+            pulse_a = stuck_a or self._chip.high(coil.channel_a)
+            bridge = Bridge(pulse_a, stuck_b or self._chip.high(coil.channel_b))
             if bridge == self._bridges[axis] and not written & channels:
                 continue
             self._bridges[axis] = bridge
@@ -206,34 +215,195 @@ class CoilCircuit:
                 current = min(limit, max(-limit, current))
                 drawn = abs(current) * COUNTS / abs(counts)
             match self._conditions[axis]:
-                case CoilCondition.SOUND:
-                    pass
                 case CoilCondition.OPEN:
                     current, drawn = 0.0, 0.0
                 case CoilCondition.SHORTED:
                     current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
                 case CoilCondition.REVERSED:
                     current = -current
-                case _:
-                    pass
             self._drawn[axis] = drawn
             self._values[axis] = current
         self._currents = np.array(self._values)
-        self._remember()
+        # Without a clock the outputs are constant, and any period is right.
+        period_ns = 1e9 / (self._chip.frequency or 1.0)
+        pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
+        self._supply.note(Chopping(self._now_ns(), self._chip.counter_start_ns, period_ns, pulses))
 
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the mean bus voltage (V) and mean current of all coils together (A) over a recent window.
 
-        A bridge takes |I| from the supply while its coil is driven, whichever way. The history spans 0.5 s.
+        A bridge draws |I| from the supply while its coil is driven. The window must be within the last 0.5 s.
         """
         return self._bus_voltage, self._supply.charge(start_ns, end_ns) / (end_ns - start_ns)
 
-    def _bridge(self, coil: CoilWiring, stuck_a: Pulse | None, stuck_b: Pulse | None) -> Bridge:
-        """Return the pulses that a bridge's legs follow: their inputs', or those at which they are stuck."""
-        return Bridge(stuck_a or self._chip.high(coil.channel_a), stuck_b or self._chip.high(coil.channel_b))
 
-    def _remember(self) -> None:
-        # Without a clock the outputs are constant, and any frequency is right.
-        period_ns = 1e9 / (self._chip.frequency or 1.0)
-        pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
-        self._supply.note(Chopping(self._now_ns(), self._chip.counter_start_ns, period_ns, pulses))
+CONFIG = 0x00
+POWER = 0x03
+CALIBRATION = 0x05
+
+POWER_ON_CONFIG = 0x399F
+_RESET = 0x8000
+_BUS_32V = 0x2000
+_SHUNT_STEP_V = 10e-6
+_BUS_STEP_V = 4e-3
+_READY, _OVERFLOW = 0b10, 0b01
+_RESERVED = 0x4000  # of Config; reads zero
+_CALIBRATION_BITS = 0xFFFE
+_REMEMBERED_NS = 60_000_000_000
+
+# Nanoseconds by ADC code: 9 to 12 bits, then 12 bits averaged 2 to 128 times.
+_SINGLE_NS = (84_000, 148_000, 276_000, 532_000)
+_AVERAGED_NS = (532_000, 1_060_000, 2_130_000, 4_260_000, 8_510_000, 17_020_000, 34_050_000, 68_100_000)
+
+
+def conversion_ns(code: int) -> int:
+    """Return the time of one conversion with a 4-bit ADC code."""
+    return _AVERAGED_NS[code & 7] if code & 8 else _SINGLE_NS[code & 3]
+
+
+class EmulatedIna219:
+    """One monitor; `measure(start_ns, end_ns)` returns mean bus voltage (V) and current (A) of a window.
+
+    Attributes:
+        gain: gain error of its current measurement, for faults; 1 is sound.
+        frozen: constant content of registers, for faults.
+        lag_ns: age of the conversions that it reports, up to a minute, for faults.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        now_ns: Callable[[], int],
+        measure: Callable[[int, int], tuple[float, float]],
+        shunt_ohm: float = 0.1,
+    ) -> None:
+        self.address = address
+        self._now_ns = now_ns
+        self._measure = measure
+        self._ohm = shunt_ohm
+        self.gain = 1.0
+        self.frozen: dict[int, int] = {}
+        self.lag_ns = 0
+        self._calibration = 0
+        self._past: deque[tuple[int, int, int]] = deque()  # (time, shunt, bus) of conversions, oldest first
+        self.brown_out()
+
+    def brown_out(self) -> None:
+        """Interrupt the supply: every register returns to its power-on value."""
+        self._pointer = 0
+        self._calibration = 0
+        self._shunt = 0
+        self._bus = 0
+        self._ready = False
+        self._past.clear()
+        self._configure(POWER_ON_CONFIG)
+
+    def upset(self, register: int, bit: int) -> None:
+        """Flip a bit of Config or Calibration, as radiation does; unused bits stay zero."""
+        if register == CONFIG:
+            self._convert()
+            self._configure((self._config ^ 1 << bit) & 0xFFFF)
+        elif register == CALIBRATION:
+            self._calibration = (self._calibration ^ 1 << bit) & _CALIBRATION_BITS
+
+    def register(self, register: int) -> int:
+        """Return a register's word without the side effects of a bus read."""
+        if register in self.frozen:
+            return self.frozen[register]
+        self._convert()
+        current, power, overflow = self._products()
+        shunt, volts = self._shown()
+        bus = volts << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
+        words = (self._config, shunt, bus, power, current, self._calibration)
+        return words[register] & 0xFFFF if register < len(words) else 0
+
+    def answers(self, address: int) -> bool:
+        """Return whether the chip acknowledges this address."""
+        return address == self.address
+
+    def write(self, address: int, data: bytes) -> None:
+        """Accept a register pointer, and a word (big-endian) for Config or Calibration."""
+        self._pointer = data[0]
+        if len(data) < 3:
+            return
+        word = data[1] << 8 | data[2]
+        if self._pointer == CONFIG:
+            self._convert()
+            self._configure(word)
+        elif self._pointer == CALIBRATION:
+            self._calibration = word & _CALIBRATION_BITS
+
+    def read(self, count: int) -> bytes:
+        """Return the word at the register pointer, big-endian; bytes beyond it read 0xFF."""
+        word = self.register(self._pointer)
+        if self._pointer == POWER:
+            self._ready = False
+        return word.to_bytes(2, "big")[:count] + b"\xff" * (count - 2)
+
+    def _configure(self, word: int) -> None:
+        if word & _RESET:
+            self.brown_out()
+            return
+        self._config = word & ~_RESERVED
+        mode = word & 0b111
+        shunt_wanted, bus_wanted = mode & 0b001, mode & 0b010
+        self._continuous = bool(mode & 0b100)
+        self._shunt_ns = conversion_ns(word >> 3 & 0xF) if shunt_wanted else 0
+        self._bus_ns = conversion_ns(word >> 7 & 0xF) if bus_wanted else 0
+        self._begin_ns = self._now_ns()
+        self._done = 0
+        # Power-down and "ADC off" leave the flag as it is.
+        if shunt_wanted or bus_wanted:
+            self._ready = False
+
+    def _convert(self) -> None:
+        """Take the newest finished conversion: first the shunt, then the bus."""
+        cycle_ns = self._shunt_ns + self._bus_ns
+        if cycle_ns == 0:
+            return
+        ended = (self._now_ns() - self._begin_ns) // cycle_ns
+        if not self._continuous:
+            ended = min(ended, 1)
+        if ended <= self._done:
+            return
+        self._done = ended
+        self._ready = True
+        start = self._begin_ns + (ended - 1) * cycle_ns
+        middle = start + self._shunt_ns
+        if self._shunt_ns:
+            _, amps = self._measure(start, middle)
+            gain = 1 << (self._config >> 11 & 0b11)
+            code = self._config >> 3 & 0xF
+            self._shunt = _digitised(
+                amps * self.gain * self._ohm / _SHUNT_STEP_V, code, -4000 * gain, 4000 * gain
+            )
+        if self._bus_ns:
+            volts, _ = self._measure(middle, middle + self._bus_ns)
+            top = 8000 if self._config & _BUS_32V else 4000
+            self._bus = _digitised(volts / _BUS_STEP_V, self._config >> 7 & 0xF, 0, top)
+        now_ns = self._now_ns()
+        self._past.append((now_ns, self._shunt, self._bus))
+        while self._past[0][0] < now_ns - _REMEMBERED_NS:
+            self._past.popleft()
+
+    def _shown(self) -> tuple[int, int]:
+        """Return the reported conversions of shunt and bus: the newest, or with `lag_ns` older ones."""
+        if not self.lag_ns or not self._past:
+            return self._shunt, self._bus
+        until_ns = self._now_ns() - self.lag_ns
+        old = next((one for one in reversed(self._past) if one[0] <= until_ns), self._past[0])
+        return old[1:]
+
+    def _products(self) -> tuple[int, int, bool]:
+        """Return Current, Power, and whether either exceeds its register."""
+        shunt, volts = self._shown()
+        current = abs(shunt) * self._calibration // 4096
+        power = current * volts // 5000
+        overflow = current > 0x7FFF or power > 0xFFFF
+        return (-current if shunt < 0 else current), power, overflow
+
+
+def _digitised(steps: float, code: int, low: int, high: int) -> int:
+    """Return the register value of a voltage in 12-bit steps, at the resolution of the ADC code, clipped."""
+    coarse = 1 if code & 8 else 1 << (3 - (code & 3))
+    return min(high, max(low, round(steps / coarse) * coarse))

@@ -1,8 +1,8 @@
 """A u-blox GPS receiver: UBX in and out on a serial line, with the errors of a receiver in orbit.
 
-It begins with its set-up lost: sentences of NMEA, until it is asked for NAV-PVT. A fix is of a whole step of
-UTC, and its frame leaves `latency` later. Errors: a walk of the position (ionosphere, ephemerides) and white
-noise of position and velocity.
+It starts without its set-up and sends sentences of NMEA until a message enables NAV-PVT. Fixes are taken at
+whole periods of UTC, and their frames are sent `latency` later. The errors are a random walk of the position
+(ionosphere, ephemerides) and white noise of position and velocity.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from knightcube.astro.earth.orientation import (
     geodetic,
     north_east_down,
 )
+from knightcube.astro.earth.sun import DAY
 from sim_hal.clock import NEVER, SerialEnd
-from sim_hal.worlds.world import OrbitingWorld
+from sim_hal.worlds.world import UNIX_EPOCH, OrbitingWorld
 
-UNIX_EPOCH = 2_440_587.5
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
 _UNKNOWN = 0xFFFF_FFFF
 
@@ -49,9 +49,12 @@ class GpsErrors:
     """The receiver's errors and delays.
 
     Attributes:
-        walk: m, standard deviation of the slow error of each axis; `walk_time` s.
-        noise: m, of each axis. velocity_noise: m/s, of each axis.
-        latency: s from the epoch to the frame. start: s from power to the first fix.
+        walk: m, standard deviation of the random walk of each axis.
+        walk_time: s, correlation time of the random walk.
+        noise: m, standard deviation of each axis.
+        velocity_noise: m/s, standard deviation of each axis.
+        latency: s, from the epoch to the frame.
+        start: s, from power-on to the first fix.
     """
 
     walk: float = 2.0
@@ -66,8 +69,10 @@ class EmulatedGps:
     """The receiver; an emulated device.
 
     Attributes:
-        shift: (3,) m, ITRS, by which it reports a false place. clock_ns: by which its time is wrong.
-        blind: no satellite is received. frozen: the first frame is repeated.
+        shift: (3,) m, ITRS, error of the reported position, for faults.
+        clock_ns: error of the reported time, for faults.
+        blind: whether no satellite is received.
+        frozen: whether the last fix is repeated.
     """
 
     def __init__(
@@ -78,7 +83,7 @@ class EmulatedGps:
         errors: GpsErrors,
         now_ns: int = 0,
     ) -> None:
-        """Take a receiver that has been on for long."""
+        """Connect a receiver that has been switched on long ago."""
         self.shift: FloatArray = np.zeros(3)
         self.clock_ns = 0
         self.blind = False
@@ -96,11 +101,11 @@ class EmulatedGps:
         self._sending.clear()
 
     def switch_on(self, now_ns: int) -> None:
-        """Apply power: the set-up is lost, and satellites are searched."""
+        """Apply power: the set-up is lost, and the search for satellites starts."""
         self._power(now_ns, self._errors.start)
 
     def next_event_ns(self) -> int:
-        """Return when the receiver next takes an epoch, sends, or receives."""
+        """Return when the receiver next measures, sends, or receives."""
         sends_ns = self._sending[0][0] if self._sending else NEVER
         return min(self._epoch_ns, sends_ns, self._line.next_arrival_ns())
 
@@ -109,11 +114,11 @@ class EmulatedGps:
         if self._line.next_arrival_ns() <= now_ns:
             data = self._line.read(now_ns)
             for kind, payload, _ in self._parser.feed(data) if self._epoch_ns != NEVER else ():
-                self._obey(kind, payload, now_ns)
+                self._execute(kind, payload, now_ns)
         while self._epoch_ns <= now_ns:
             epoch_ns = self._epoch_ns
             self._epoch_ns += self._period_ns
-            data = frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._asked else NMEA
+            data = frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._enabled else NMEA
             self._sending.append((epoch_ns + round(self._errors.latency * SECOND_NS), data))
         while self._sending and self._sending[0][0] <= now_ns:
             sent_ns, data = self._sending.pop(0)
@@ -122,15 +127,15 @@ class EmulatedGps:
     def _power(self, now_ns: int, start: float) -> None:
         self._parser = UbxParser()
         self._sending: list[tuple[int, bytes]] = []
-        self._asked = False
+        self._enabled = False
         self._found_ns = now_ns + round(start * SECOND_NS)
         utc_ns = now_ns + self._utc_offset_ns
         self._epoch_ns = now_ns + (-utc_ns) % self._period_ns
 
-    def _obey(self, kind: Kind, payload: bytes, now_ns: int) -> None:
+    def _execute(self, kind: Kind, payload: bytes, now_ns: int) -> None:
         known = kind in {CFG_PRT, CFG_RATE, CFG_MSG}
         if kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
-            self._asked = payload[-1] > 0
+            self._enabled = payload[-1] > 0
         if kind == CFG_RATE:
             self._period_ns = max(100, int.from_bytes(payload[:2], "little")) * 1_000_000
         self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
@@ -143,7 +148,7 @@ class EmulatedGps:
         keep = math.exp(-self._period_ns / SECOND_NS / errors.walk_time)
         self._walk = keep * self._walk + math.sqrt(1.0 - keep * keep) * self._generator.standard_normal(3)
         noise = self._generator.standard_normal(6)
-        date = UNIX_EPOCH + utc_ns * 1e-9 / 86_400.0
+        date = UNIX_EPOCH + utc_ns * 1e-9 / DAY
         around = self._world.surroundings()
         to_ground = celestial_to_terrestrial(date)
         exact = to_ground @ np.array(around.position)

@@ -11,9 +11,11 @@ reads whose length the part sends, packet error checking and ten-bit addresses a
 from __future__ import annotations
 
 import errno
+import operator
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Protocol
 
 
@@ -41,7 +43,7 @@ class Message:
 
 @dataclass(slots=True)
 class _Fault:
-    """One pending fault; `code` 0 is a bit flip, `left` None lasts until `clear_faults`."""
+    """A fault that is due `left` times (None: until it is removed); `code` 0 is a bit flip."""
 
     code: int
     text: str
@@ -62,7 +64,7 @@ class EmulatedI2cBus:
         timeout_ns: int = 20_000_000,
         wait: Callable[[int], None] | None = None,
     ) -> None:
-        """Connect the parts; `wait` advances time by a time-out's ns, without it no time passes."""
+        """Connect the parts; `wait` advances time by a time-out (ns); without `wait` no time passes."""
         self._parts = list(parts)
         self._timeout_ns = timeout_ns
         self._wait = wait
@@ -126,8 +128,8 @@ class EmulatedI2cBus:
     def transfer(self, messages: Sequence[Message]) -> list[bytes]:
         """Send messages joined by repeated STARTs; return what each read gives.
 
-        At most one fault meets a part in a transaction. Its flipped bits are of the data read where something
-        is read, else of the data written after the register byte.
+        At most one fault acts on a part in a transaction. It flips bits of the data read, or in a transaction
+        without reads of the data written after the register byte.
         """
         reads = any(message.count is not None for message in messages)
         given: list[bytes] = []
@@ -146,9 +148,10 @@ class EmulatedI2cBus:
                     written = message.data if reads else _flipped(message.data, fault, 1)
                     self._deliver(parts, address, written)
                 else:
-                    # Outputs are open drain: of several parts that answer, the zeros win.
+                    # Outputs are open drain: if several parts answer, zeros dominate.
                     answers = zip(*(part.read(message.count) for part in parts), strict=True)
-                    given.append(_flipped(bytes(map(_wired_and, answers)), fault, 0))
+                    wired = bytes(reduce(operator.and_, column) for column in answers)
+                    given.append(_flipped(wired, fault, 0))
         return given
 
     def nack(
@@ -158,21 +161,21 @@ class EmulatedI2cBus:
         after: int = 0,
         chance: Callable[[], bool] | None = None,
     ) -> Callable[[], None]:
-        """Let a part (None: all) refuse `times` transactions (None: until lifted or cleared).
+        """Let a part (None: all parts) refuse `times` transactions (None: until removed or cleared).
 
-        A write is refused after `after` bytes taken, the register byte the first of them; with `chance` only
-        where it says so. Returns what lifts the fault, as all of these do.
+        A write is refused after `after` bytes, of which the register byte is the first. With `chance` the
+        fault acts only if it returns True. Returns the removal of the fault, as the other faults do.
         """
         return self._add(
             _Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after, chance=chance)
         )
 
     def hang(self, times: int | None = None) -> Callable[[], None]:
-        """Hold the clock line low: each transaction takes the time-out and fails."""
+        """Hold the clock line low: each transaction lasts the time-out and fails."""
         return self._add(_Fault(errno.ETIMEDOUT, "time-out, the clock line is held low", None, times))
 
     def time_out(self, address: int, chance: Callable[[], bool]) -> Callable[[], None]:
-        """Let a part stretch the clock beyond the time-out where `chance` says so."""
+        """Let a part stretch the clock beyond the time-out if `chance` returns True."""
         return self._add(
             _Fault(errno.ETIMEDOUT, "time-out, the clock is stretched", address, None, chance=chance)
         )
@@ -193,12 +196,12 @@ class EmulatedI2cBus:
     def _add(self, fault: _Fault) -> Callable[[], None]:
         with self._lock:
             self._faults.append(fault)
-        return lambda: self._lift(fault)
 
-    def _lift(self, fault: _Fault) -> None:
-        with self._lock:
-            # By identity: equal faults are distinct.
-            self._faults = [other for other in self._faults if other is not fault]
+        def remove() -> None:
+            with self._lock:  # by identity, because equal faults are distinct
+                self._faults = [other for other in self._faults if other is not fault]
+
+        return remove
 
     def _read(self, address: int, register: int, count: int) -> bytes:
         return self.transfer((Message(address, bytes((register,))), Message(address, count=count)))[0]
@@ -235,15 +238,8 @@ class EmulatedI2cBus:
                 part.write(address, data)
 
 
-def _wired_and(column: tuple[int, ...]) -> int:
-    value = 0xFF
-    for byte in column:
-        value &= byte
-    return value
-
-
 def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
-    """Return the data with the bits that a fault flips, counted from byte `first` on."""
+    """Return the data with the bits flipped by a fault, whose index counts from byte `first`."""
     if fault is None or first + fault.index >= len(data):
         return data
     index = first + fault.index
@@ -267,9 +263,9 @@ FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
 def smbus(
     bus: EmulatedI2cBus, address: int, reading: bool, command: int, size: int, data: bytes = b""
 ) -> bytes:
-    """Carry out one transfer of ioctl I2C_SMBUS; return the union's new content, unpadded, empty for a write.
+    """Execute one transfer of ioctl I2C_SMBUS; return the new content of the union, empty for a write.
 
-    Raises OSError as a bus does, and with EOPNOTSUPP or EINVAL as an adapter does.
+    Raises OSError of the bus, or with EOPNOTSUPP or EINVAL as an adapter does.
     """
     head = bytes((command,))
     match size:
@@ -291,8 +287,8 @@ def smbus(
 
 
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
-    """Carry out a block transfer; on the wire an SMBus block carries its length, an I2C block does not."""
-    # Programs that ask for a block by its old number read a whole one.
+    """Execute a block transfer; on the wire an SMBus block includes its length, an I2C block does not."""
+    # With the old number of the transfer a program reads a block of full length.
     length = BLOCK_MAX if size == _OLD_I2C_BLOCK and reading else data[0]
     if not 1 <= length <= BLOCK_MAX:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")

@@ -1,7 +1,7 @@
 """An emulated PCA9685: its registers alone determine its outputs (NXP data sheet).
 
-What the data sheet forbids or leaves open is done in the way that does least, and noted in `violations`.
-Not modelled: oscillator tolerance and the phase of the counter; a change takes effect at the STOP.
+Accesses that the data sheet forbids or leaves undefined have the least effect, and are noted in `violations`.
+Not modelled: oscillator tolerance and the phase of the counter. A change takes effect at the STOP.
 """
 
 from __future__ import annotations
@@ -38,29 +38,21 @@ _ALL_CHANNELS = (1 << CHANNELS) - 1
 _EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
 
 
-def _writable_bits() -> bytes:
-    """Return the writable bits of each register; reserved bits read zero."""
-    bits = bytearray(256)
-    bits[MODE1] = 0x7F
-    bits[MODE2] = 0x1F
-    bits[0x02:0x06] = b"\xfe" * 4
-    bits[LED0_ON_L:_LED_END] = b"\xff\x1f\xff\x1f" * CHANNELS
-    bits[PRE_SCALE] = 0xFF
-    return bytes(bits)
+_WRITABLE = bytearray(256)
+"""Writable bits of each register; reserved bits read zero."""
+_WRITABLE[MODE1] = 0x7F
+_WRITABLE[MODE2] = 0x1F
+_WRITABLE[0x02:0x06] = b"\xfe" * 4
+_WRITABLE[LED0_ON_L:_LED_END] = b"\xff\x1f\xff\x1f" * CHANNELS
+_WRITABLE[PRE_SCALE] = 0xFF
 
-
-def _power_on_values() -> bytes:
-    values = bytearray(256)
-    values[MODE1] = SLEEP | _ALL_CALL
-    values[MODE2] = 0x04
-    values[0x02:0x06] = b"\xe2\xe4\xe8\xe0"
-    values[LED0_ON_L:_LED_END] = b"\x00\x00\x00\x10" * CHANNELS
-    values[PRE_SCALE] = 0x1E
-    return bytes(values)
-
-
-_WRITABLE = _writable_bits()
-_POWER_ON = _power_on_values()
+_POWER_ON = bytearray(256)
+"""Content of each register after power-on."""
+_POWER_ON[MODE1] = SLEEP | _ALL_CALL
+_POWER_ON[MODE2] = 0x04
+_POWER_ON[0x02:0x06] = b"\xe2\xe4\xe8\xe0"
+_POWER_ON[LED0_ON_L:_LED_END] = b"\x00\x00\x00\x10" * CHANNELS
+_POWER_ON[PRE_SCALE] = 0x1E
 
 
 class EmulatedPca9685:
@@ -70,7 +62,7 @@ class EmulatedPca9685:
         on_stop: called after each write that may have changed outputs, with the mask of the channels written
             (0 when only the modes changed).
         output_enable: the OE pin held active; inactive, every output is low (OUTNE 00).
-        violations: what the bus master did against the data sheet.
+        violations: accesses of the bus master that the data sheet forbids.
     """
 
     def __init__(self, address: int, now_ns: Callable[[], int]) -> None:
@@ -81,7 +73,7 @@ class EmulatedPca9685:
         self._now_ns = now_ns
         self._registers = bytearray()
         self._addresses: set[int] = set()
-        self._halted = 0  # channels that sleep has stopped, until RESTART or a new write
+        self._halted = 0  # channels stopped by sleep until RESTART or a new write
         self._power_on()
 
     def brown_out(self) -> None:
@@ -114,11 +106,11 @@ class EmulatedPca9685:
 
     @property
     def counter_start_ns(self) -> int:
-        """When the PWM counter last started from zero: at the wake-up."""
+        """Time at which the PWM counter last started from zero."""
         return self._awake_ns
 
     def high(self, channel: int) -> tuple[int, int]:
-        """Return when in a period an output is high: (first count, how many counts, 0 .. 4096)."""
+        """Return the high time of an output in a period: (first count, number of counts 0 .. 4096)."""
         if not self.output_enable:
             return 0, 0
         start, length = self._pulse(channel)
@@ -127,7 +119,7 @@ class EmulatedPca9685:
         return start, length
 
     def duty(self, channel: int) -> float:
-        """Return the mean of an output over a period, 0 .. 1."""
+        """Return the duty cycle of an output, 0 .. 1."""
         return self.high(channel)[1] / COUNTS
 
     def answers(self, address: int) -> bool:
@@ -152,7 +144,7 @@ class EmulatedPca9685:
             for value in data[1:]:
                 written |= self._store(self._pointer, value)
                 self._advance()
-        # A write to a channel takes the place of RESTART; with OCH set, only one of all its four registers.
+        # A write to a channel acts like RESTART; with OCH set, only a write of all its four registers does.
         if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
             self._halted &= ~written
             self._restart = False
@@ -197,7 +189,7 @@ class EmulatedPca9685:
         return (1 << last + 1) - (1 << first)
 
     def _store(self, register: int, value: int) -> int:
-        """Write one register; return the mask of the channels touched."""
+        """Write one register; return the mask of the affected channels."""
         if LED0_ON_L <= register < _LED_END:
             self._registers[register] = value & _WRITABLE[register]
             return 1 << ((register - LED0_ON_L) >> 2)

@@ -32,12 +32,12 @@ class LineFaults:
     """The faults of a wire, from the next byte on.
 
     Attributes:
-        silent: nothing crosses.
-        garbage: every byte is replaced by a random one.
-        cut_probability: of a message to lose a random run of its bytes.
-        flip_probability: of each bit to arrive inverted.
-        delay_ns: added to the time of each byte.
-        thinned: one message of this many crosses.
+        silent: whether no byte arrives.
+        garbage: whether every byte is replaced by a random byte.
+        cut_probability: probability that a message loses a random run of its bytes.
+        flip_probability: probability that a bit arrives inverted.
+        delay_ns: additional delay of each byte.
+        thinned: number of messages of which only one arrives.
     """
 
     silent: bool = False
@@ -53,7 +53,7 @@ SOUND = LineFaults()
 
 @dataclass(slots=True)
 class _Message:
-    """Bytes on their way: byte i has crossed at start + (i + 1) * 10 / baud."""
+    """Bytes in transmission: byte i has arrived at start + (i + 1) * 10 / baud."""
 
     start_ns: int
     data: bytes
@@ -61,11 +61,11 @@ class _Message:
     taken: int = 0
 
     def crossed_ns(self, count: int) -> int:
-        """Return when the first `count` bytes have crossed, rounded up."""
+        """Return when the first `count` bytes have arrived, rounded up."""
         return self.start_ns - (-count * _BITS * _SECOND_NS // self.baud_rate)
 
     def crossed(self, now_ns: int) -> int:
-        """Return how many bytes have crossed by `now_ns`."""
+        """Return the number of bytes that have arrived by `now_ns`."""
         if now_ns <= self.start_ns:
             return 0
         return min(len(self.data), (now_ns - self.start_ns) * self.baud_rate // (_BITS * _SECOND_NS))
@@ -76,11 +76,11 @@ class Wire:
 
     Attributes:
         faults: its faults; may be replaced at any time.
-        lost_bytes: bytes that found the buffers full.
+        lost_bytes: number of bytes lost because the buffers were full.
     """
 
     def __init__(self, rng: np.random.Generator, capacity: int = 6144) -> None:
-        """Take the generator of the faults and the bytes that fit in the buffers of both ends together."""
+        """Take the generator of the faults and the capacity (bytes) of the buffers of both ends together."""
         self.faults = SOUND
         self.lost_bytes = 0
         self._rng = rng
@@ -92,17 +92,17 @@ class Wire:
         self._messages_sent = 0
 
     def push(self, data: bytes, now_ns: int, sender_baud: int, receiver_baud: int) -> None:
-        """Send bytes, from `now_ns` on or when the wire is free; with unequal speeds they arrive as noise."""
+        """Send bytes as soon as the wire is free; with unequal speeds they arrive as noise."""
         faults = self.faults
         start_ns = max(now_ns, self._free_ns)
         self._free_ns = start_ns + len(data) * _BITS * _SECOND_NS // sender_baud
         if faults is not SOUND:
             data = self._disturb(data, faults)
             start_ns += faults.delay_ns
-        # Bytes keep their order when a delay is removed.
+        # Bytes keep their order after a delay is removed.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
-            # A slower receiver sees fewer characters; none of them is what was sent.
+            # A slower receiver reads fewer characters, and none of them is correct.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
         self.lost_bytes += max(0, len(data) - room)
@@ -114,11 +114,11 @@ class Wire:
             self._last_ns = message.crossed_ns(len(data))
 
     def noise(self, count: int, now_ns: int, baud_rate: int) -> None:
-        """Insert `count` random bytes that neither end sent."""
+        """Insert `count` random bytes."""
         self.push(self._rng.bytes(count), now_ns, baud_rate, baud_rate)
 
     def pull(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return crossed messages by `now_ns`, oldest first: (time of its last byte, bytes)."""
+        """Return the bytes that have arrived by `now_ns`, oldest first: (time of the last byte, bytes)."""
         chunks: list[tuple[int, bytes]] = []
         while self._messages:
             message = self._messages[0]
@@ -133,7 +133,7 @@ class Wire:
         return chunks
 
     def next_arrival_ns(self) -> int:
-        """Return when the message under way will have crossed whole; NEVER when there is none."""
+        """Return when the message in transmission will have arrived; NEVER if there is none."""
         if not self._messages:
             return NEVER
         message = self._messages[0]
@@ -156,7 +156,7 @@ class Wire:
 
 
 class EmulatedSerialLine:
-    """The line with both its ends.
+    """A line in memory with both its ends.
 
     Attributes:
         to_host, to_device: the two wires, each with its faults.
@@ -165,7 +165,7 @@ class EmulatedSerialLine:
     """
 
     def __init__(self, now_ns: Callable[[], int], baud_rate: int, rng: np.random.Generator) -> None:
-        """Take the time of the host's end, the speed of both ends, and the generator of the faults."""
+        """Take the clock of the host's end, the speed of both ends, and the generator of the faults."""
         to_host_rng, to_device_rng = rng.spawn(2)
         self.to_host = Wire(to_host_rng)
         self.to_device = Wire(to_device_rng)
@@ -183,12 +183,12 @@ class HostEnd:
         self._now_ns = now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return the bytes crossed since the last call. Raises NotResponding when the port is gone."""
+        """Return the bytes that have arrived since the last call. Raises NotResponding if unplugged."""
         self._check()
         return self._line.to_host.pull(self._now_ns())
 
     def send(self, data: bytes) -> None:
-        """Send bytes now. Raises NotResponding when the port is gone."""
+        """Send bytes now. Raises NotResponding if the port is unplugged."""
         self._check()
         self._line.to_device.push(data, self._now_ns(), self.baud_rate, self._line.device.baud_rate)
 
@@ -217,11 +217,11 @@ class DeviceEnd:
         self._line.to_host.push(data, now_ns, self.baud_rate, self._line.host.baud_rate)
 
     def read(self, now_ns: int) -> bytes:
-        """Return the host's bytes that have crossed by `now_ns`."""
+        """Return the host's bytes that have arrived by `now_ns`."""
         return b"".join(data for _, data in self._line.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:
-        """Return when the host's bytes will next have crossed."""
+        """Return when bytes of the host next arrive."""
         return self._line.to_device.next_arrival_ns()
 
 
@@ -243,12 +243,13 @@ class PtyLine:
     """
 
     def __init__(self, baud_rate: int, rng: np.random.Generator, link: Path | None = None) -> None:
-        """Open the terminal; `link` is made a symbolic link to it. Raises OSError when one cannot be made."""
+        """Open the terminal, and make `link` a symbolic link to it. Raises OSError if either fails."""
         self.baud_rate = baud_rate
         to_host_rng, to_device_rng = rng.spawn(2)
         self.to_host = Wire(to_host_rng)
         self.to_device = Wire(to_device_rng)
-        # The far side stays open here: without any opener a terminal reports an error. A raw one has no echo.
+        # The far side stays open, because a terminal that nobody has open reports errors. Raw mode has no
+        # echo.
         self._near, self._far = os.openpty()
         tty.setraw(self._far)
         self._set_speed(baud_rate)
@@ -270,15 +271,15 @@ class PtyLine:
         self.to_host.push(data, now_ns, self.baud_rate, self._host_speed())
 
     def read(self, now_ns: int) -> bytes:
-        """Return the host's bytes that have crossed by `now_ns`."""
+        """Return the host's bytes that have arrived by `now_ns`."""
         return b"".join(data for _, data in self.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:
-        """Return when the host's bytes will next have crossed."""
+        """Return when bytes of the host next arrive."""
         return self.to_device.next_arrival_ns()
 
     def exchange(self, now_ns: int) -> None:
-        """Accept the host's bytes; deliver the device's that have crossed by `now_ns`."""
+        """Accept the host's bytes, and deliver the device's bytes that have arrived by `now_ns`."""
         try:
             data = os.read(self._near, 4096)
         except BlockingIOError:
@@ -299,7 +300,7 @@ class PtyLine:
         return self._near
 
     def wait(self, now_ns: int, until_ns: int) -> None:
-        """Wait until the host writes, a message has crossed to it, or `until_ns`."""
+        """Wait until the host writes, a message for it has arrived, or `until_ns`."""
         due_ns = min(until_ns, self.to_host.next_arrival_ns())
         select.select([self._near], [], [], max(0, due_ns - now_ns) * 1e-9)
 
@@ -314,7 +315,7 @@ class PtyLine:
         self._near = self._far = -1
 
     def _host_speed(self) -> int:
-        # A speed without a name (128000) cannot be read back this way: assume that it is right.
+        # A speed without a termios name (128000) cannot be read back; it is assumed to be right.
         return _SPEEDS.get(termios.tcgetattr(self._far)[5], self.baud_rate)
 
     def _set_speed(self, baud_rate: int) -> None:

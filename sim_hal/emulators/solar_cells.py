@@ -1,8 +1,9 @@
-"""The solar strings of a body in orbit: their currents, and the ADS1115 converters that measure them.
+"""The solar cells of a body in orbit: their currents, and the ADS1115 converters that measure them.
 
-The currents follow from sunlight, the Earth's reflected light, shadow, and the errors of the cells. The
-Earth's light is summed over the visible ground, which is matt, has one albedo everywhere, and is sunlit by
-the cosine law: 0.3 is the Earth's mean (Stephens et al. 2015, Rev. Geophys. 53: 0.29).
+A solar string is a group of cells in series on one face of the body; the configuration and the faults call
+the cells `strings`. The currents follow from sunlight, the Earth's reflected light, shadow, and the errors of
+the cells. The Earth's light is summed over the visible ground, which is matt, has one albedo everywhere, and
+is sunlit by the cosine law: 0.3 is the Earth's mean (Stephens et al. 2015, Rev. Geophys. 53: 0.29).
 
 The emulated ADS1115 has the registers Config and Conversion and converts at its own pace (TI SBAS444, Table
 8-3): single-ended inputs and single shots, as the driver uses them. Other settings are stored but convert
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -25,23 +27,24 @@ from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from sim_hal.worlds.orbit import sun_position
-from sim_hal.worlds.world import OrbitingWorld
+from sim_hal.worlds.world import OrbitingWorld, utc_date
 
 DEVICE = "solar strings"
 _RINGS, _SPOKES = 16, 32
+"""Sampling points of the visible ground."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolarCellsModel:
-    """What the strings do.
+    """The properties of n solar strings.
 
     Attributes:
-        normals: (n, 3) unit vectors, outward, in body axes.
-        peaks: (n,) A, at one astronomical unit, straight upon them.
-        gain_errors: (n,) relative departures from the peaks.
-        grazing: rad; light that falls in within so much of the surface is reflected: the cosine gives way.
+        normals: (n, 3) outward unit vectors, body axes.
+        peaks: (n,) A, nominal current at normal incidence and one astronomical unit.
+        gain_errors: (n,) relative errors of the peaks.
+        grazing: rad, angle from the surface below which light is increasingly reflected.
         noise: A, standard deviation.
-        albedo: of the Earth.
+        albedo: albedo of the Earth.
     """
 
     normals: FloatArray
@@ -74,26 +77,26 @@ class SolarCellsModel:
         light = share * self._accepted(normals @ to_sun / distance)
         light = light + self._earthlight(normals, position, sun)
         noise = self.noise * generator.standard_normal(len(self.peaks))
-        # A string's diode lets no current back.
+        # The diode of a string blocks reverse current.
         return np.asarray(np.maximum(self.peaks * (1.0 + self.gain_errors) * light + noise, 0.0))
 
     def _accepted(self, cosines: FloatArray) -> FloatArray:
-        """Return what of light at `cosines` (...) of incidence becomes current, 0 .. 1."""
+        """Return the relative current (...), 0 .. 1, of light at `cosines` (...) of incidence."""
         grazing = math.sin(self.grazing)
         dimmed = cosines * np.clip(cosines / grazing, 0.0, 1.0) if grazing > 0.0 else cosines
         return np.asarray(np.maximum(dimmed, 0.0))
 
     def _earthlight(self, normals: FloatArray, position: FloatArray, sun: FloatArray) -> FloatArray:
-        """Return the Earth's light on strings of `normals` (n, 3), ICRS, over the Sun's."""
+        """Return the Earth's light (n,) on strings with `normals` (n, 3), ICRS, relative to sunlight."""
         rays, ground, solid = _ground_in_view(position)
         lit = np.maximum(ground @ (sun / np.linalg.norm(sun)), 0.0)
         return np.asarray(self._accepted(normals @ rays.T) @ (self.albedo / np.pi * solid * lit))
 
 
 def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return unit vectors (m, 3) from `position` (3,) m to the ground, its verticals (m, 3), and sr for each.
+    """Return directions (m, 3) from `position` (3,) m to the ground, its verticals (m, 3), and sr of each.
 
-    Rings of equal solid angle as the satellite sees them, so that the near ground has its weight.
+    The directions sample the visible disc in rings of equal solid angle.
     """
     distance = float(np.linalg.norm(position))
     down = -position / distance
@@ -118,10 +121,10 @@ _RATES = (8, 16, 32, 64, 128, 250, 475, 860)
 
 
 class EmulatedAds1115:
-    """One converter; `measure(channel)` returns the voltage at an input now.
+    """One converter; `measure(channel)` returns the present voltage at an input.
 
     Attributes:
-        address: on the bus.
+        address: its address on the bus.
     """
 
     def __init__(self, address: int, now_ns: Callable[[], int], measure: Callable[[int], float]) -> None:
@@ -143,7 +146,7 @@ class EmulatedAds1115:
         return address in {_GENERAL_CALL, self.address}
 
     def write(self, address: int, data: bytes) -> None:
-        """Take the register pointer, and a word for Config; thresholds are not modelled.
+        """Accept a register pointer, and a word for Config; thresholds are not modelled.
 
         The reset by general call is the power-on state (9.5.1.2).
         """
@@ -161,7 +164,7 @@ class EmulatedAds1115:
                 self._ready_ns = self._now_ns() + 1_000_000_000 // _RATES[word >> 5 & 0b111]
 
     def read(self, count: int) -> bytes:
-        """Return bytes of the register that the pointer names, over again beyond its two."""
+        """Return the two bytes of the selected register, repeatedly."""
         self._complete()
         word = self._conversion if self._pointer == CONVERSION else self._config
         if self._pointer == CONFIG and not self._converting:
@@ -179,17 +182,18 @@ class EmulatedAds1115:
         self._conversion = min(0x7FFF, max(-0x8000, counts)) & 0xFFFF
 
 
-_UNIX_EPOCH = 2_440_587.5
 _FRESH_NS = 20_000_000
+"""Time during which one measurement of the currents is used."""
 
 
 class EmulatedSolarCells:
-    """The strings and the converters that measure them.
+    """The n solar strings and the converters that measure them.
 
     Attributes:
         parts: the converters.
-        dead: strings (n,) that give no current. frozen: whether all stay as they are now.
-        gain: of all amplifiers over the sound one.
+        dead: (n,) whether each string gives no current.
+        frozen: whether all currents are constant.
+        gain: gain of all amplifiers relative to a sound one.
     """
 
     def __init__(
@@ -208,27 +212,23 @@ class EmulatedSolarCells:
         self._currents: FloatArray = np.zeros(len(wirings))
         self._measured_ns = -_FRESH_NS
         self.parts = tuple(
-            EmulatedAds1115(address, now_ns, self._input(address))
+            EmulatedAds1115(address, now_ns, partial(self._voltage, address))
             for address in sorted({wiring.address for wiring in wirings})
         )
 
-    def _input(self, address: int) -> Callable[[int], float]:
-        def volts(channel: int) -> float:
-            index, volt_per_ampere = self._strings.get((address, channel), (None, 0.0))
-            return 0.0 if index is None else volt_per_ampere * float(self._now()[index])
-
-        return volts
-
-    def _now(self) -> FloatArray:
-        """Return the currents (n,) A as the amplifiers give them; within 20 ms they are measured once."""
+    def _voltage(self, address: int, channel: int) -> float:
+        """Return the voltage at the input of a converter."""
+        index, volt_per_ampere = self._strings.get((address, channel), (None, 0.0))
+        if index is None:
+            return 0.0
         now_ns = self._now_ns()
         if not self.frozen and now_ns - self._measured_ns >= _FRESH_NS:
             self._measured_ns = now_ns
             self._currents = self._light(now_ns)
-        return np.where(self.dead, 0.0, self.gain * self._currents)
+        return volt_per_ampere * float(np.where(self.dead, 0.0, self.gain * self._currents)[index])
 
     def _light(self, now_ns: int) -> FloatArray:
         body = quaternion.attitude_matrix(self._world.motion(now_ns).quaternion)
         around = self._world.surroundings()
-        date = _UNIX_EPOCH + self._world.utc_ns() * 1e-9 / 86_400.0
-        return self._model.currents(np.array(around.position), sun_position(date), body, self._generator)
+        sun = sun_position(utc_date(self._world))
+        return self._model.currents(np.array(around.position), sun, body, self._generator)

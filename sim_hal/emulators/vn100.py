@@ -1,51 +1,34 @@
-"""An emulated VN-100 on the device end of a serial line.
+"""An emulated VN-100 on the device end of a serial line: registers, commands, outputs and power.
 
 The unit executes commands and sends its asynchronous outputs (one ASCII sentence and three binary packets)
-on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to 26, 32 to 51, 74, 82 to 84)
-are stored and echoed without effect, except the heading mode of 35; of register 85 the windows of
+on the 800 Hz grid of its own clock. Register values are kept as the text that the unit prints; contents and
+defaults are those of VectorNav UM001 v2.43 ch. 5. Registers that tune its estimation (21 to 26, 32 to 51, 74,
+82 to 84) are stored and echoed without effect, except the heading mode of 35; of register 85 the windows of
 magnetometer, accelerometer and gyro have an effect. SYNC lines and the second serial port are not emulated.
 The 500 ms of a flash write are VectorNav's; the second of start-up is assumed.
 
 The commands of the attitude filter are those of VectorNav UM001 ch. 8; set initial heading and set filter
-bias are as VectorNav's SDK 0.99 sends them and as its units with satellite navigation answer them. Assumed:
-in the absolute heading mode the magnetometer sets the heading, so tare and set initial heading change
-nothing; gravity sets pitch and roll in every mode, so only the yaw of a given attitude has an effect. The
-filter has no gyro bias error.
+bias follow VectorNav's SDK 0.99 and the answers of its units with satellite navigation. Assumed: in the
+absolute heading mode the magnetometer sets the heading, so tare and set initial heading change nothing;
+gravity sets pitch and roll in every mode, so only the yaw of a given attitude has an effect. The filter has
+no gyro bias error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from hal.drivers.vn100.protocol import Checksum, Sentence, build, parse
+from hal.drivers.vn100.protocol import Checksum, OutputLayout, Sentence, build, layout_of, parse
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import IDENTITY, NED_TO_TESTBED, from_rotation_vector, multiply, normalise
 from sim_hal.clock import NEVER, SerialEnd
-from sim_hal.emulators.vn100_registers import (
-    ASYNC_RATES_HZ,
-    BINARY_OUTPUTS,
-    FILTER_STARTUP_BIAS,
-    GYRO_STARTUP_BIAS,
-    INVALID_CHECKSUM,
-    INVALID_COMMAND,
-    INVALID_PARAMETER,
-    INVALID_REGISTER,
-    LOW_BAUD,
-    RECEIVE_OVERFLOW,
-    TOO_FEW,
-    UNAUTHORIZED,
-    BinaryOutput,
-    RegisterFile,
-    UnitError,
-    binary_output,
-    expect_count,
-)
 from sim_hal.emulators.vn100_sensors import (
-    FIELD_VALUES,
+    BINARY_FIELDS,
     IMU_RATE_HZ,
     OUTPUT_BY_REGISTER,
     OUTPUT_BY_TYPE,
@@ -55,9 +38,265 @@ from sim_hal.emulators.vn100_sensors import (
     NoiseProfile,
     Sensors,
     Vn100Sample,
-    sentence_length,
 )
 from sim_hal.worlds.world import BodyMotion
+
+Rule = Callable[[str], str]
+"""Returns the text as the unit stores it; raises ValueError for an invalid text."""
+
+BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
+ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
+ASYNC_TYPES = (0, 1, 2, 8, 9, 10, 11, 12, 13, 14, 16, 17, 19, 30)
+BINARY_OUTPUTS = (75, 76, 77)
+GYRO_STARTUP_BIAS, FILTER_STARTUP_BIAS = 43, 74
+
+# The fields that a VN-100 has, by group bit; all others need satellite navigation or later units.
+SUPPORTED_FIELDS: Mapping[int, int] = {0: 0x3F3D, 1: 0x0191, 2: 0x0FFF, 4: 0x01FF}
+
+
+class UnitError(Exception):
+    """The unit answers `$VNERR` with this code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"{code:02X}")
+        self.code = code
+
+
+INVALID_CHECKSUM, INVALID_COMMAND, TOO_FEW, TOO_MANY = 0x03, 0x04, 0x05, 0x06
+INVALID_PARAMETER, INVALID_REGISTER, UNAUTHORIZED, LOW_BAUD = 0x07, 0x08, 0x09, 0x0C
+RECEIVE_OVERFLOW = 0x02
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """One register: a rule for each field, and the defaults.
+
+    With `port_option` a write may have a further field, the serial port.
+    """
+
+    rules: tuple[Rule, ...]
+    default: tuple[str, ...]
+    writable: bool = True
+    port_option: bool = False
+
+    def checked(self, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the fields as the unit stores them. Raises UnitError."""
+        if not self.writable:
+            raise UnitError(UNAUTHORIZED)
+        expect_count(fields, len(self.rules), len(self.rules) + self.port_option)
+        try:
+            kept = tuple(rule(text) for rule, text in zip(self.rules, fields, strict=False))
+            extra = tuple(_choice(1, 2)(text) for text in fields[len(self.rules) :])
+        except ValueError as error:
+            raise UnitError(INVALID_PARAMETER) from error
+        return kept + extra
+
+
+def expect_count(fields: tuple[str, ...], least: int, most: int) -> None:
+    """Raise UnitError when the number of fields is out of range."""
+    if len(fields) < least:
+        raise UnitError(TOO_FEW)
+    if len(fields) > most:
+        raise UnitError(TOO_MANY)
+
+
+def _integer(allowed: Container[int]) -> Rule:
+    def rule(text: str) -> str:
+        if int(text) not in allowed:
+            raise ValueError(text)
+        return str(int(text))
+
+    return rule
+
+
+def _choice(*values: int) -> Rule:
+    return _integer(values)
+
+
+def _unsigned(most: int) -> Rule:
+    return _integer(range(most + 1))
+
+
+def _between(low: float, high: float) -> Rule:
+    def rule(text: str) -> str:
+        if not (low <= float(text) <= high and math.isfinite(float(text))):
+            raise ValueError(text)
+        return text
+
+    return rule
+
+
+_number = _between(-math.inf, math.inf)
+
+
+def _tag(text: str) -> str:
+    if len(text) > 20:
+        raise ValueError(text)
+    return text
+
+
+def _fixed(text: str) -> Register:
+    return Register((_tag,), (text,), writable=False)
+
+
+def _numbers(*default: str) -> Register:
+    return Register((_number,) * len(default), default)
+
+
+_ON_OFF = _choice(0, 1)
+_WINDOW = _unsigned(25)
+_IDENTITY = ("1", "0", "0", "0", "1", "0", "0", "0", "1")
+_CALIBRATION = (*_IDENTITY, "0", "0", "0")
+
+REGISTERS: Mapping[int, Register] = {
+    0: Register((_tag,), ("",)),
+    1: _fixed("VN-100T-CR"),
+    2: _fixed("5"),
+    3: _fixed("0100012345"),
+    4: _fixed("2.1.0.0"),
+    5: Register((_choice(*BAUD_RATES),), ("115200",), port_option=True),
+    6: Register((_choice(*ASYNC_TYPES),), ("14",), port_option=True),
+    7: Register((_choice(*ASYNC_RATES_HZ),), ("40",), port_option=True),
+    21: _numbers("1", "0", "1.8", "0", "0", "-9.79375"),
+    23: _numbers(*_CALIBRATION),
+    25: _numbers(*_CALIBRATION),
+    26: _numbers(*_IDENTITY),
+    30: Register(
+        (*(_unsigned(4), _unsigned(2)) * 2, _choice(1, 3), _choice(0, 1, 3), _unsigned(2)),
+        ("0", "0", "0", "0", "1", "0", "1"),
+    ),
+    32: Register(
+        (_unsigned(6), _ON_OFF, _ON_OFF, _unsigned(65535), _unsigned(6), _ON_OFF, _unsigned(65535))
+        + (_unsigned(4294967295),) * 2,
+        ("3", "0", "0", "0", "6", "1", "0", "100000000", "0"),
+    ),
+    33: Register((_unsigned(4294967295),) * 3, ("0", "0", "0")),
+    35: Register((_ON_OFF, _unsigned(2), _ON_OFF, _ON_OFF), ("1", "1", "1", "1")),
+    36: Register((_between(0.0, 10.0),) * 9, ("4",) * 3 + ("5",) * 3 + ("5.5",) * 3),
+    38: Register((_between(0.0, 10.0),) * 9, ("5",) * 3 + ("3",) * 3 + ("4",) * 3),
+    GYRO_STARTUP_BIAS: _numbers(*("+00.000000",) * 3),
+    44: Register((_unsigned(2), _choice(1, 3), _choice(1, 2, 3, 4, 5)), ("1", "3", "5")),
+    47: Register((_number,) * 12, _CALIBRATION, writable=False),
+    50: _numbers("0", "0", "0"),
+    51: Register((_ON_OFF, _number, _number), ("1", "0.1", "0.01")),
+    FILTER_STARTUP_BIAS: _numbers(*("+00.000000",) * 7),
+    82: Register((_ON_OFF, _unsigned(2), _ON_OFF, _ON_OFF, _ON_OFF), ("0", "0", "0", "0", "0")),
+    83: _numbers("0", "0", "0", "0", "1000", "0.000", "+00.00000000", "+000.00000000", "+00000.000"),
+    84: _numbers(*_CALIBRATION),
+    85: Register((_WINDOW,) * 5 + (_unsigned(3),) * 5, ("0", "4", "4", "4", "0", "0", "3", "3", "3", "0")),
+}
+
+_OFF = ("0", "0", "00")
+
+FIELD_BITS = 16
+"""Width of each field of the registers in which bits are flipped."""
+_BASE_10 = 2  # fields of a binary output; the others are hexadecimal
+
+
+@dataclass(frozen=True, slots=True)
+class BinaryOutput:
+    """An output set of registers 75 to 77: serial ports, period in 800 Hz ticks, and packet."""
+
+    ports: int
+    divisor: int
+    layout: OutputLayout
+
+    def pack(self, now: MessageData) -> bytes:
+        """Return the packet of the data of one time."""
+        return self.layout.pack(now.values(" ".join(BINARY_FIELDS[key] for key in self.layout.fields)))
+
+
+def binary_output(fields: tuple[str, ...]) -> BinaryOutput | None:
+    """Return the output set of the fields of a register 75 to 77; None without groups. Raises UnitError."""
+    expect_count(fields, 3, 3 + 8)
+    try:
+        ports, divisor, groups = int(fields[0]), int(fields[1]), int(fields[2], 16)
+        words = [int(text, 16) for text in fields[3:]]
+    except ValueError as error:
+        raise UnitError(INVALID_PARAMETER) from error
+    if not (0 <= ports <= 3 and 0 <= divisor <= 65535 and 0 <= groups <= 0xFF):
+        raise UnitError(INVALID_PARAMETER)
+    bits = [bit for bit in range(8) if groups >> bit & 1]
+    expect_count(fields[3:], len(bits), len(bits))
+    if not bits and ports == 0:
+        return None
+    pairs = dict(zip(bits, words, strict=True))
+    known = all(word and not word & ~SUPPORTED_FIELDS.get(bit, 0) for bit, word in pairs.items())
+    if divisor == 0 or not bits or not known:
+        raise UnitError(INVALID_PARAMETER)
+    return BinaryOutput(ports, divisor, layout_of(pairs))
+
+
+class RegisterFile:
+    """The registers in use, and those in flash.
+
+    Attributes:
+        values: the fields of each register in use.
+    """
+
+    def __init__(self) -> None:
+        self._defaults = {number: register.default for number, register in REGISTERS.items()}
+        self._defaults |= dict.fromkeys(BINARY_OUTPUTS, _OFF)
+        self._flash = dict(self._defaults)
+        self.values = dict(self._defaults)
+
+    def read(self, number: int) -> tuple[str, ...]:
+        """Return a register's fields. Raises UnitError."""
+        if number not in self.values:
+            raise UnitError(INVALID_REGISTER)
+        return self.values[number]
+
+    def integer(self, number: int, index: int = 0) -> int:
+        """Return one field as an integer."""
+        return int(self.values[number][index])
+
+    def write(self, number: int, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Store a register's new fields; return the unit's echo. Raises UnitError."""
+        if number in BINARY_OUTPUTS:
+            binary_output(fields)
+            words = (f"{int(text, 16):04X}" for text in fields[3:])
+            kept = (str(int(fields[0])), str(int(fields[1])), f"{int(fields[2], 16):02X}", *words)
+            self.values[number] = kept
+            return kept
+        if number not in REGISTERS:
+            raise UnitError(INVALID_REGISTER)
+        register = REGISTERS[number]
+        kept = register.checked(fields)
+        # Only the first port, that of the line, is emulated.
+        if kept[len(register.rules) :] != ("2",):
+            self.values[number] = kept[: len(register.rules)]
+        return kept
+
+    def flip(self, number: int, bit: int) -> None:
+        """Flip a bit, counted from the lowest bit of the first field; bits beyond the last field are ignored.
+
+        The register keeps the new content. Raises UnitError if no write could have stored that content.
+        """
+        place, shift = divmod(bit, FIELD_BITS)
+        fields = list(self.values[number])
+        if place >= len(fields):
+            return
+        hexadecimal = number in BINARY_OUTPUTS and place >= _BASE_10
+        value = int(fields[place], 16 if hexadecimal else 10) ^ 1 << shift
+        fields[place] = f"{value:0{len(fields[place])}X}" if hexadecimal else str(value)
+        self.values[number] = tuple(fields)
+        if number in BINARY_OUTPUTS:
+            binary_output(self.values[number])
+        else:
+            REGISTERS[number].checked(self.values[number])
+
+    def save(self) -> None:
+        """Write all to flash."""
+        self._flash = dict(self.values)
+
+    def restore(self) -> None:
+        """Write the factory settings to flash."""
+        self._flash = dict(self._defaults)
+
+    def load(self) -> None:
+        """Load all from flash, as at power-on."""
+        self.values = dict(self._flash)
+
 
 ATTITUDE_COMMANDS = frozenset({"KMD", "KAD", "TAR", "SIH", "SGB", "SFB"})
 _DISTURBANCES = {"KMD": 1 << 11, "KAD": 1 << 12}
@@ -65,7 +304,7 @@ _VPE_CONTROL, _HEADING_MODE, _ABSOLUTE = 35, 1, 0
 
 
 class AttitudeCommands:
-    """The attitude filter of one unit as far as commands reach it.
+    """The part of the unit's attitude filter that commands change.
 
     Attributes:
         status: the VPE status word; KMD and KAD set its disturbance bits.
@@ -83,11 +322,11 @@ class AttitudeCommands:
         self._turn = None
         self.status = 0
 
-    def turned(self, measured: Vn100Sample) -> Vn100Sample:
+    def turned(self, sample: Vn100Sample) -> Vn100Sample:
         """Return a sample with the heading that commands have set."""
         if self._turn is None:
-            return measured
-        return replace(measured, quaternion=multiply(measured.quaternion, self._turn))
+            return sample
+        return replace(sample, quaternion=multiply(sample.quaternion, self._turn))
 
     def execute(self, command: str, fields: tuple[str, ...], sample: Callable[[], Vn100Sample]) -> None:
         """Execute one of ATTITUDE_COMMANDS; `sample` measures now. Raises UnitError."""
@@ -95,7 +334,7 @@ class AttitudeCommands:
             bit = _DISTURBANCES[command]
             self.status = self.status | bit if flag(fields) else self.status & ~bit
         elif command == "SIH":
-            self._set_heading(_yaw_of(_numbers_of(fields)), sample)
+            self._set_heading(_yaw_of(fields), sample)
         else:
             expect_count(fields, 0, 0)
             if command == "TAR":
@@ -125,8 +364,8 @@ def flag(fields: tuple[str, ...]) -> bool:
     return fields[0] == "1"
 
 
-def _numbers_of(fields: tuple[str, ...]) -> list[float]:
-    """Return a heading, yaw, pitch and roll, all in degrees, or a quaternion. Raises UnitError."""
+def _yaw_of(fields: tuple[str, ...]) -> float:
+    """Return the yaw (rad) of a heading or of three angles (deg), or of a quaternion. Raises UnitError."""
     expect_count(fields, 1, 4)
     if len(fields) == 2:
         raise UnitError(TOO_FEW)
@@ -136,11 +375,6 @@ def _numbers_of(fields: tuple[str, ...]) -> list[float]:
         raise UnitError(INVALID_PARAMETER) from error
     if not all(map(math.isfinite, values)):
         raise UnitError(INVALID_PARAMETER)
-    return values
-
-
-def _yaw_of(values: list[float]) -> float:
-    """Return the yaw in rad of `_numbers_of`; a quaternion needs no unit length. Raises UnitError."""
     if len(values) < 4:
         return math.radians(values[0])
     if not any(values):
@@ -154,7 +388,7 @@ _OUR_PORT = 1
 
 @dataclass(slots=True)
 class Stream:
-    """One asynchronous output, sent every `divisor` ticks; `length` in bytes, `sent_ns` in device time."""
+    """One output of `length` bytes, sent every `divisor` ticks, last at `sent_ns` of device time."""
 
     divisor: int
     length: int
@@ -163,7 +397,7 @@ class Stream:
 
 
 class OutputStreams:
-    """The streams of one unit.
+    """The asynchronous outputs of one unit.
 
     Attributes:
         muted: registers whose output is silent until they are written again.
@@ -180,19 +414,18 @@ class OutputStreams:
         self.muted.clear()
 
     def build(self, device_ns: int) -> None:
-        """Rebuild the streams from the registers. Raises UnitError, unchanged, when the line is too slow."""
+        """Rebuild the streams from the registers. Raises UnitError if the line is too slow for them."""
         registers = self._registers
         streams: dict[int, Stream] = {}
-        report = OUTPUT_BY_TYPE.get(registers.integer(6))
-        if report is not None and not self.muted & {6, 7}:
+        output = OUTPUT_BY_TYPE.get(registers.integer(6))
+        if output is not None and not self.muted & {6, 7}:
             divisor = IMU_RATE_HZ // registers.integer(7)
-            crc_bytes = 2 * (self.checksum() == "crc16")
-            length = sentence_length(report) + len(self._suffix(0)) + crc_bytes
-            streams[6] = Stream(divisor, length, lambda now: self._sentence(report, now), device_ns)
+            length = output.length() + len(self._suffix(0)) + 2 * (self.checksum() == "crc16")
+            streams[6] = Stream(divisor, length, partial(self._sentence, output), device_ns)
         for number in sorted(set(BINARY_OUTPUTS) - self.muted):
-            output = binary_output(registers.read(number))
-            if output is not None and output.ports & _OUR_PORT:
-                streams[number] = Stream(output.divisor, output.layout.length, packer(output), device_ns)
+            packet = binary_output(registers.read(number))
+            if packet is not None and packet.ports & _OUR_PORT:
+                streams[number] = Stream(packet.divisor, packet.layout.length, packet.pack, device_ns)
         # A stream that continues unchanged keeps the time of its last message.
         for number in streams.keys() & self._streams.keys():
             streams[number].sent_ns = self._streams[number].sent_ns
@@ -217,160 +450,9 @@ class OutputStreams:
         count = ",T0000000000" if self._registers.integer(30, 0) else ""
         return count + (f",S{status:04X}" if self._registers.integer(30, 1) else "")
 
-    def _sentence(self, report: AsciiOutput, now: MessageData) -> bytes:
-        fields = [*report.text(now), *self._suffix(now.status).split(",")[1:]]
-        return build(report.header, *fields, checksum=self.checksum())
-
-
-def packer(output: BinaryOutput) -> Callable[[MessageData], bytes]:
-    """Return the function that packs a binary output."""
-    sources = [FIELD_VALUES[key] for key in output.layout.fields]
-    return lambda now: output.layout.pack([value for source in sources for value in source(now)])
-
-
-_RECEIVE_BUFFER = 256
-
-
-@dataclass(frozen=True, slots=True)
-class UnitActions:
-    """The unit's actions that commands call, each with the time in ns.
-
-    Attributes:
-        sample: measures at this time.
-        build_streams: rebuilds the outputs from the registers; raises UnitError.
-        write_flash: saves the registers and calls the function when done.
-        restart: resets the unit.
-    """
-
-    sample: Callable[[int], MessageData]
-    build_streams: Callable[[int], None]
-    write_flash: Callable[[int, Callable[[int], None]], None]
-    restart: Callable[[int], None]
-
-
-class CommandInterface:
-    """Executes the commands of one unit.
-
-    Attributes:
-        paused: whether asynchronous outputs are paused (ASY).
-    """
-
-    def __init__(
-        self,
-        line: SerialEnd,
-        registers: RegisterFile,
-        streams: OutputStreams,
-        actions: UnitActions,
-        attitude: AttitudeCommands,
-    ) -> None:
-        self._line = line
-        self._registers = registers
-        self._streams = streams
-        self._actions = actions
-        self._attitude = attitude
-        self._received = bytearray()
-        self.paused = False
-
-    def reset(self) -> None:
-        """Discard received bytes and the state that commands have set."""
-        self._received.clear()
-        self.paused = False
-        self._attitude.reset()
-
-    def receive(self, data: bytes, now_ns: int) -> None:
-        """Execute and answer the commands that `data` completes."""
-        self._received += data
-        while (end := self._received.find(b"\n")) >= 0:
-            line = bytes(self._received[: end + 1])
-            del self._received[: end + 1]
-            start = line.rfind(b"$")
-            if start >= 0:
-                self._answer_line(line[start:], now_ns)
-        if len(self._received) > _RECEIVE_BUFFER:
-            self._received.clear()
-            self._report_error(RECEIVE_OVERFLOW, self._streams.checksum(), now_ns)
-
-    def _answer_line(self, line: bytes, now_ns: int) -> None:
-        sentence = parse(line, allow_none=True)
-        if sentence is None:
-            wide = len(line.rstrip(b"\r\n").rpartition(b"*")[2]) == 4
-            self._report_error(INVALID_CHECKSUM, "crc16" if wide else "xor8", now_ns)
-            return
-        checksum = self._streams.checksum() if sentence.checksum == "none" else sentence.checksum
-        try:
-            self._execute(sentence, checksum, now_ns)
-        except UnitError as error:
-            self._report_error(error.code, checksum, now_ns)
-
-    def _report_error(self, code: int, checksum: Checksum, now_ns: int) -> None:
-        mode = self._registers.integer(30, 6)
-        if mode:
-            self._line.write(build("ERR", f"{code:02X}", checksum=checksum), now_ns)
-        if mode == 2:
-            self._registers.write(6, ("0",))
-            self._actions.build_streams(now_ns)
-
-    def _execute(self, sentence: Sentence, checksum: Checksum, now_ns: int) -> None:
-        """Execute a command and answer it. Raises UnitError."""
-
-        def answer(*fields: str, at_ns: int = now_ns) -> None:
-            self._line.write(build(sentence.command, *fields, checksum=checksum), at_ns)
-
-        fields = sentence.fields
-        match sentence.command:
-            case "RRG":
-                expect_count(fields, 1, 2)
-                answer(fields[0], *self._read(_number_of(fields[0]), now_ns))
-            case "WRG":
-                expect_count(fields, 2, 16)
-                self._write(_number_of(fields[0]), fields, answer, now_ns)
-            case "ASY":
-                self.paused = not flag(fields)
-                answer(*fields)
-            case command if command in ATTITUDE_COMMANDS:
-                self._attitude.execute(command, fields, lambda: self._actions.sample(now_ns).measured)
-                answer(*fields)
-            case "BOM":
-                expect_count(fields, 1, 1)
-                self._poll_binary(BINARY_OUTPUTS[0] - 1 + _number_of(fields[0]), now_ns)
-            case "WNV":
-                self._actions.write_flash(now_ns, lambda end_ns: answer(at_ns=end_ns))
-            case "RFS" | "RST":
-                answer()
-                if sentence.command == "RFS":
-                    self._registers.restore()
-                self._actions.restart(now_ns)
-            case _:
-                raise UnitError(INVALID_COMMAND)
-
-    def _read(self, number: int, now_ns: int) -> tuple[str, ...]:
-        report = OUTPUT_BY_REGISTER.get(number)
-        if report is not None:
-            return tuple(report.text(self._actions.sample(now_ns)))
-        return self._registers.read(number)
-
-    def _write(self, number: int, fields: tuple[str, ...], answer: Callable[..., None], now_ns: int) -> None:
-        if number in OUTPUT_BY_REGISTER:
-            raise UnitError(UNAUTHORIZED)
-        before = self._registers.read(number)
-        echo = self._registers.write(number, fields[1:])
-        self._streams.muted.discard(number)
-        try:
-            self._actions.build_streams(now_ns)
-        except UnitError:
-            self._registers.set_back(number, before)
-            raise
-        # The answer is sent at the old speed.
-        answer(fields[0], *echo)
-        self._line.baud_rate = self._registers.integer(5)
-
-    def _poll_binary(self, number: int, now_ns: int) -> None:
-        if number not in BINARY_OUTPUTS:
-            raise UnitError(INVALID_PARAMETER)
-        output = binary_output(self._registers.read(number))
-        if output is None:
-            raise UnitError(INVALID_PARAMETER)
-        self._line.write(packer(output)(self._actions.sample(now_ns)), now_ns)
+    def _sentence(self, output: AsciiOutput, now: MessageData) -> bytes:
+        fields = [*now.text(output.quantities), *self._suffix(now.status).split(",")[1:]]
+        return build(output.header, *fields, checksum=self.checksum())
 
 
 def _number_of(text: str) -> int:
@@ -380,8 +462,9 @@ def _number_of(text: str) -> int:
         raise UnitError(INVALID_REGISTER) from error
 
 
-TICK_NS = 1_000_000_000 // IMU_RATE_HZ
+_RECEIVE_BUFFER = 256
 _BILLION = 1_000_000_000
+TICK_NS = _BILLION // IMU_RATE_HZ
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,11 +476,13 @@ class Vn100EmulatorSettings:
         mounting: (4,) sensor axes into body axes.
         reference: (4,) NED into the world's reference frame.
         gyro_bias: (3,) rad/s, sensor axes.
-        clock_ppm: how much faster than true its clock runs.
-        uptime_ns: its own time when the simulation begins; the remainder of 25 ms is its phase.
-        boot_ns: from reset to the first message. flash_ns: to write the flash.
-        temperature: degrees C. pressure: kPa.
-        free_fall: there is no gravity for its own attitude to stand on.
+        clock_ppm: rate error of its clock; positive if the clock is fast.
+        uptime_ns: its own time at the start; the remainder of 25 ms is the phase of its outputs.
+        boot_ns: time from reset to the first message.
+        flash_ns: time to write the flash.
+        temperature: degrees C.
+        pressure: kPa.
+        free_fall: whether there is no gravity, so that its own attitude is meaningless.
     """
 
     noise: NoiseProfile = PROFILES["thesis"]
@@ -417,7 +502,8 @@ class Vn100Emulator:
     """The unit; a `sim_hal.clock.EmulatedDevice`.
 
     Attributes:
-        alter: changes each measurement before it is sent, for faults.
+        registers: the registers.
+        alter: function that alters each sample before it is sent, for faults.
     """
 
     def __init__(
@@ -428,7 +514,7 @@ class Vn100Emulator:
         settings: Vn100EmulatorSettings,
         now_ns: int = 0,
     ) -> None:
-        """Start at `now_ns`, the unit on for `settings.uptime_ns`; `sense` returns the motion at a time."""
+        """Connect a running unit at `now_ns`; `sense` returns the motion at a time."""
         self.registers = RegisterFile()
         self.alter: Callable[[Vn100Sample], Vn100Sample] | None = None
         self._sense = sense
@@ -441,9 +527,9 @@ class Vn100Emulator:
         self._clock_rate = _BILLION + round(settings.clock_ppm * 1000)
         self._then: tuple[int, Callable[[int], None]] | None = None
         self._streams = OutputStreams(self.registers)
-        actions = UnitActions(self._instant_now, self._build_streams, self._write_flash, self._restart)
         self._attitude = AttitudeCommands(self.registers, bias)
-        self._commands = CommandInterface(line, self.registers, self._streams, actions, self._attitude)
+        self._received = bytearray()
+        self._paused = False
         self._origin_ns = now_ns
         self._uptime_ns = settings.uptime_ns
         self._tick = -1
@@ -462,14 +548,14 @@ class Vn100Emulator:
                 self._act(event_ns)
             else:
                 data = self._line.read(event_ns)
-                if self._then is None:  # A unit that starts, or writes its flash, receives nothing.
-                    self._commands.receive(data, event_ns)
+                if self._then is None:  # during a start or a flash write the unit receives nothing
+                    self._receive(data, event_ns)
             self._schedule(event_ns)
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Save this speed in the flash, with the fastest output rate that fits. Raises UnitError."""
         self.registers.write(5, (str(baud_rate),))
-        length = sentence_length(OUTPUT_BY_TYPE[14])
+        length = OUTPUT_BY_TYPE[14].length()
         fitting = [rate for rate in ASYNC_RATES_HZ if rate <= 40 and 10 * length * rate <= baud_rate]
         self.registers.write(7, (str(fitting[-1]),))
         self._build_streams(self._origin_ns)
@@ -495,8 +581,8 @@ class Vn100Emulator:
     def upset(self, register: int, bit: int, now_ns: int) -> None:
         """Flip a bit of a register that configures the outputs, as radiation does.
 
-        Assumed: an output whose register is invalid, or asks for more than the line carries, is silent until
-        that register is written.
+        Assumed: an output is silent until its register is written if that register is invalid or the line is
+        too slow for it.
         """
         try:
             self.registers.flip(register, bit)
@@ -519,7 +605,7 @@ class Vn100Emulator:
             self._due_ns = self._then[0]
             return
         tick = self._streams.next_tick(max(self._tick, self._device_ns(now_ns) // TICK_NS))
-        if self._commands.paused or tick is None:
+        if self._paused or tick is None:
             self._due_ns = NEVER
         else:
             self._tick_due = tick
@@ -533,28 +619,117 @@ class Vn100Emulator:
             return
         self._tick = self._tick_due
         device_ns = self._tick * TICK_NS
-        measured = self._measure(now_ns)
+        sample = self._sample(now_ns)
         for stream in self._streams.due(self._tick):
-            self._line.write(stream.message(self._instant(device_ns, measured, stream.sent_ns)), now_ns)
+            self._line.write(stream.message(self._data(device_ns, sample, stream.sent_ns)), now_ns)
             stream.sent_ns = device_ns
+
+    # Commands.
+
+    def _receive(self, data: bytes, now_ns: int) -> None:
+        """Execute and answer the commands that `data` completes."""
+        self._received += data
+        while (end := self._received.find(b"\n")) >= 0:
+            line = bytes(self._received[: end + 1])
+            del self._received[: end + 1]
+            start = line.rfind(b"$")
+            if start >= 0:
+                self._answer_line(line[start:], now_ns)
+        if len(self._received) > _RECEIVE_BUFFER:
+            self._received.clear()
+            self._send_error(RECEIVE_OVERFLOW, self._streams.checksum(), now_ns)
+
+    def _answer_line(self, line: bytes, now_ns: int) -> None:
+        sentence = parse(line, allow_none=True)
+        if sentence is None:
+            wide = len(line.rstrip(b"\r\n").rpartition(b"*")[2]) == 4
+            self._send_error(INVALID_CHECKSUM, "crc16" if wide else "xor8", now_ns)
+            return
+        checksum = self._streams.checksum() if sentence.checksum == "none" else sentence.checksum
+        try:
+            self._execute(sentence, checksum, now_ns)
+        except UnitError as error:
+            self._send_error(error.code, checksum, now_ns)
+
+    def _send_error(self, code: int, checksum: Checksum, now_ns: int) -> None:
+        mode = self.registers.integer(30, 6)
+        if mode:
+            self._line.write(build("ERR", f"{code:02X}", checksum=checksum), now_ns)
+        if mode == 2:
+            self.registers.write(6, ("0",))
+            self._build_streams(now_ns)
+
+    def _execute(self, sentence: Sentence, checksum: Checksum, now_ns: int) -> None:
+        """Execute a command and answer it. Raises UnitError."""
+
+        def answer(*fields: str, at_ns: int = now_ns) -> None:
+            self._line.write(build(sentence.command, *fields, checksum=checksum), at_ns)
+
+        fields = sentence.fields
+        match sentence.command:
+            case "RRG":
+                expect_count(fields, 1, 2)
+                number = _number_of(fields[0])
+                if number in OUTPUT_BY_REGISTER:
+                    answer(fields[0], *self._data_now(now_ns).text(OUTPUT_BY_REGISTER[number].quantities))
+                else:
+                    answer(fields[0], *self.registers.read(number))
+            case "WRG":
+                expect_count(fields, 2, 16)
+                self._write(_number_of(fields[0]), fields, answer, now_ns)
+            case "ASY":
+                self._paused = not flag(fields)
+                answer(*fields)
+            case command if command in ATTITUDE_COMMANDS:
+                self._attitude.execute(command, fields, lambda: self._data_now(now_ns).sample)
+                answer(*fields)
+            case "BOM":
+                expect_count(fields, 1, 1)
+                number = BINARY_OUTPUTS[0] - 1 + _number_of(fields[0])
+                output = binary_output(self.registers.read(number)) if number in BINARY_OUTPUTS else None
+                if output is None:
+                    raise UnitError(INVALID_PARAMETER)
+                self._line.write(output.pack(self._data_now(now_ns)), now_ns)
+            case "WNV":
+                self._write_flash(now_ns, lambda end_ns: answer(at_ns=end_ns))
+            case "RFS" | "RST":
+                answer()
+                if sentence.command == "RFS":
+                    self.registers.restore()
+                self._restart(now_ns)
+            case _:
+                raise UnitError(INVALID_COMMAND)
+
+    def _write(self, number: int, fields: tuple[str, ...], answer: Callable[..., None], now_ns: int) -> None:
+        if number in OUTPUT_BY_REGISTER:
+            raise UnitError(UNAUTHORIZED)
+        before = self.registers.read(number)
+        echo = self.registers.write(number, fields[1:])
+        self._streams.muted.discard(number)
+        try:
+            self._build_streams(now_ns)
+        except UnitError:
+            self.registers.values[number] = before
+            raise
+        # The answer is sent at the old speed.
+        answer(fields[0], *echo)
+        self._line.baud_rate = self.registers.integer(5)
 
     # Output.
 
-    def _measure(self, now_ns: int) -> Vn100Sample:
+    def _sample(self, now_ns: int) -> Vn100Sample:
         windows = tuple(self.registers.integer(85, index) for index in range(3))
-        measured = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
-        return measured if self.alter is None else self.alter(measured)
+        sample = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
+        return sample if self.alter is None else self.alter(sample)
 
-    def _instant(self, device_ns: int, measured: Vn100Sample, since_ns: int) -> MessageData:
-        interval = (device_ns - since_ns) * 1e-9
-        settings = self._settings
-        return MessageData(
-            device_ns, measured, self._attitude.status, interval, settings.temperature, settings.pressure
-        )
+    def _data(self, device_ns: int, sample: Vn100Sample, since_ns: int) -> MessageData:
+        settings, interval = self._settings, (device_ns - since_ns) * 1e-9
+        climate = settings.temperature, settings.pressure
+        return MessageData(device_ns, sample, self._attitude.status, interval, *climate)
 
-    def _instant_now(self, now_ns: int) -> MessageData:
+    def _data_now(self, now_ns: int) -> MessageData:
         device_ns = self._device_ns(now_ns)
-        return self._instant(device_ns, self._measure(now_ns), device_ns - TICK_NS)
+        return self._data(device_ns, self._sample(now_ns), device_ns - TICK_NS)
 
     def _build_streams(self, now_ns: int) -> None:
         self._streams.build(self._device_ns(now_ns))
@@ -573,7 +748,9 @@ class Vn100Emulator:
         self.registers.load()
         self._line.baud_rate = self.registers.integer(5)
         self._sensors.restart()
-        self._commands.reset()
+        self._received.clear()
+        self._paused = False
+        self._attitude.reset()
         self._streams.reset()
         self._origin_ns = now_ns
         self._uptime_ns = uptime_ns

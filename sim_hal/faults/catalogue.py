@@ -18,10 +18,9 @@ import numpy as np
 
 from hal.drivers.pca9685 import CHANNELS, LED0_ON_L, MODE1, MODE2, PRE_SCALE
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from sim_hal.emulators.coil_circuit import CoilCondition
-from sim_hal.emulators.ina219 import CALIBRATION, CONFIG
+from sim_hal.emulators.coil_circuit import CALIBRATION, CONFIG, CoilCondition
 from sim_hal.emulators.serial_line import LineFaults
-from sim_hal.emulators.vn100_registers import BAUD_RATES, FIELD_BITS, UnitError
+from sim_hal.emulators.vn100 import BAUD_RATES, FIELD_BITS, UnitError
 from sim_hal.emulators.vn100_sensors import GAUSS_PER_TESLA, Vn100Sample
 from sim_hal.faults.bench import (
     Begin,
@@ -38,8 +37,8 @@ from sim_hal.faults.bench import (
 )
 
 if TYPE_CHECKING:  # the table of faults needs no devices
+    from sim_hal.emulators.coil_circuit import EmulatedIna219
     from sim_hal.emulators.i2c_bus import I2cPart
-    from sim_hal.emulators.ina219 import EmulatedIna219
     from sim_hal.emulators.pca9685 import EmulatedPca9685
     from sim_hal.emulators.solar_cells import EmulatedAds1115
 

@@ -1,11 +1,8 @@
 """The link to `sim_hal.serving.server`: one line of JSON per message, over a Unix socket.
 
-Uses the standard library only and imports quickly: the guardian, which must start at once and without numpy,
-opens the emulated bus through `open_bus`.
-
-Not `multiprocessing.connection`, which was measured: with the time-out that a bus needs (`poll`, then `recv`)
-a read of six bytes takes 46 us in the median against 43 us here, and its import alone delays the guardian by
-tens of milliseconds. It also blocks on a partial message, unpickles what it reads, and speaks to Python only.
+It uses the standard library only and imports quickly, because the guardian, which must start at once and
+without numpy, opens the emulated bus through `open_bus`. `multiprocessing.connection` would delay the
+guardian by tens of milliseconds; it also blocks on a partial message and unpickles the data it reads.
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ from collections.abc import Sequence
 from typing import Any
 
 _ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
-"""How long an answer may take, and in the first seconds of a connection: its server may still be starting."""
+"""Time-out of an answer (s); time-out while the server may still be starting (s); length of that time (s)."""
 
 
 def pack(message: Any) -> bytes:
@@ -76,11 +73,11 @@ class DeviceLink:
         return bool(self._messages)
 
     def receive(self) -> list[Any]:
-        """Wait for one message. Raises TimeoutError, or ConnectionError when the server is gone."""
+        """Wait for one message. Raises TimeoutError, or ConnectionError if the server has ended."""
         while not self._messages:
             chunk = self._line.recv(65536)
             if not chunk:
-                raise ConnectionResetError(errno.ECONNRESET, "the emulated devices are gone")
+                raise ConnectionResetError(errno.ECONNRESET, "the emulated devices have ended")
             self._messages += self._inbox.take(chunk)
         message: list[Any] = self._messages.popleft()
         return message
@@ -91,7 +88,7 @@ class DeviceLink:
 
 
 class RemoteI2cBus:
-    """An I2cBus whose parts are in the server's process. Safe for several threads."""
+    """An I2cBus whose parts are in the server process. It is safe for several threads."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._link = DeviceLink(path)

@@ -26,21 +26,21 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
 import numpy as np
 
 from flight.schema import reader as configuration
-from flight.schema.document import config_path, names
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import UsageError
-from sim_hal.assembly import CoilHardware, assemble_coils
+from sim_hal.assembly import assemble_coils
 from sim_hal.emulators import i2c_bus
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus, Message
-from sim_hal.serving.options import positive, seed
 from sim_hal.settings import Release, Simulation
 
 SOURCE = Path(__file__).with_name("i2c_preload.c")
@@ -55,7 +55,14 @@ def library() -> Path:
     path = folder / f"i2c-preload-{os.uname().machine}-{hashlib.sha256(text).hexdigest()[:16]}.so"
     if path.is_file():
         return path
-    compiler = _compiler()
+    named = os.environ.get("CC")
+    names = (named,) if named else _COMPILERS
+    compiler = next(filter(None, map(shutil.which, names)), None)
+    if compiler is None:
+        raise UsageError(
+            f"no C compiler ({', '.join(names)}) to build the preload library with: install one"
+            " (Debian: apt-get install gcc libc6-dev) or name it by CC"
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
         beside = path.with_suffix(f".{os.getpid()}")
@@ -70,29 +77,17 @@ def library() -> Path:
     return path
 
 
-def _compiler() -> str:
-    named = os.environ.get("CC")
-    for name in (named,) if named else _COMPILERS:
-        if found := shutil.which(name):
-            return found
-    raise UsageError(
-        f"no C compiler ({named or ', '.join(_COMPILERS)}) to build the preload library with: install one"
-        " (Debian: apt-get install gcc libc6-dev) or name it by CC"
-    )
-
-
-_FUNCTIONS, _SMBUS, _MESSAGES = 1, 2, 3
 _LENGTH = struct.Struct("=I")
 _ANSWER = struct.Struct("=ii")
 _SMBUS_HEAD = struct.Struct("=?BIH")
 _MESSAGE_HEAD = struct.Struct("=HHH")
 _READ = 0x0001
 _UNSUPPORTED = 0x0410
-"""Flags of a message: ten-bit address, length sent by the part."""
+"""Flags of a message that are not supported: ten-bit address, length sent by the part."""
 
 
 class I2cServer:
-    """The far end of every /dev/i2c-N that the programs open."""
+    """Answers the requests of programs that open /dev/i2c-N."""
 
     def __init__(self, bus: EmulatedI2cBus, path: Path) -> None:
         """Listen on a new socket at `path`."""
@@ -105,7 +100,7 @@ class I2cServer:
         self._received: dict[socket.socket, bytearray] = {}
 
     def serve(self, wait: float) -> None:
-        """Answer what is asked within the next `wait` s."""
+        """Answer the requests of the next `wait` s."""
         for key, _ in self._selector.select(wait):
             line = key.fileobj
             assert isinstance(line, socket.socket)
@@ -140,12 +135,12 @@ class I2cServer:
 
     def _answer(self, request: bytes) -> bytes:
         try:
-            given = self._carried_out(request)
+            given = self._execute(request)
         except OSError as error:
             return _ANSWER.pack(error.errno or errno.EIO, 0)
         return _ANSWER.pack(0, len(given)) + given
 
-    def _carried_out(self, request: bytes) -> bytes:
+    def _execute(self, request: bytes) -> bytes:
         match request[0]:
             case 1:
                 return _LENGTH.pack(i2c_bus.FUNCTIONS)
@@ -160,7 +155,7 @@ class I2cServer:
 
 
 def _messages(request: bytes) -> list[Message]:
-    """Return the messages of a request. Raises OSError for what the adapter cannot do."""
+    """Return the messages of a request. Raises OSError for unsupported flags."""
     messages, at = [], 2
     for _ in range(request[1]):
         address, flags, length = _MESSAGE_HEAD.unpack_from(request, at)
@@ -177,92 +172,43 @@ def _messages(request: bytes) -> list[Message]:
 
 _LONGEST_WAIT_S = 0.05
 
-_EXAMPLES = """\
-examples:
-  python -m sim_hal emulate i2c -- i2cdetect -y 1
-      run a program on the emulated bus; ends with it, and with its status
-  python -m sim_hal emulate i2c --bus 7 --config testbed -- python3 my_driver.py
-      another bus number, and the coils of another configuration
-  python -m sim_hal emulate i2c
-      serve until interrupted; prints the environment that lets any program open the bus
-"""
-
-
-def add_to(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the device to `sim_hal emulate`."""
-    parser = devices.add_parser(
-        "i2c",
-        help="the coils' I2C bus, for unchanged programs",
-        description="Serve the PWM chip and the current monitor of a configuration's coils, in real time, to "
-        "programs that open /dev/i2c-N themselves.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    carried = ", ".join(names())
-    add = parser.add_argument
-    add(
-        "--config",
-        type=config_path,
-        default=config_path("step_demo"),
-        metavar="CONFIG",
-        help=f"YAML file, or one of {carried} (default step_demo)",
-    )
-    add("program", nargs="*", metavar="PROGRAM", help="after --: a program to run, with its arguments")
-    add("--bus", type=int, choices=range(256), default=1, metavar="N", help="serve /dev/i2c-N (default 1)")
-    add("--seed", type=seed, default=1, help="of the currents' noise (default 1)")
-    add("--duration", type=positive, metavar="S", help="end after S seconds")
-    add("--json", action="store_true", help="print one JSON object instead of the environment")
-    parser.set_defaults(command=emulate)
-
 
 def emulate(options: argparse.Namespace) -> int:
-    """Serve until the program ends, or without one until SIGINT, SIGTERM or the duration's end."""
-    try:
-        coils = _coils(options.config, options.seed)
-        with tempfile.TemporaryDirectory(prefix="knightcube-i2c-") as folder:
-            path = Path(folder) / "bus.sock"
-            environment = {
-                "LD_PRELOAD": str(library()),
-                "KNIGHTCUBE_I2C": str(path),
-                "KNIGHTCUBE_I2C_BUS": str(options.bus),
-            }
-            server = I2cServer(coils.bus, path)
-            try:
-                if options.program:
-                    return _with_program(server, options.program, environment, options.duration)
-                _announce(options, environment, coils)
-                _serve(server, None, options.duration)
-            finally:
-                server.close()
-    except UsageError as error:
-        sys.stderr.write(f"sim_hal: {error}\n")
-        return 2
+    """Serve until the program ends, or without a program until SIGINT, SIGTERM or the duration's end."""
+    config = configuration.load(options.config)
+    text = options.config.read_text(encoding="utf-8")
+    section = configuration.simulation_section(text, str(options.config), Simulation)
+    if section is None:  # the configuration of a board: its coils have the configured values
+        section = Simulation(release=Release(q2=0.0))
+    coils = assemble_coils(config, section, np.random.default_rng(options.seed), SystemClock().now_ns)
+    with tempfile.TemporaryDirectory(prefix="knightcube-i2c-") as folder:
+        path = Path(folder) / "bus.sock"
+        environment = {
+            "LD_PRELOAD": str(library()),
+            "KNIGHTCUBE_I2C": str(path),
+            "KNIGHTCUBE_I2C_BUS": str(options.bus),
+        }
+        server = I2cServer(coils.bus, path)
+        try:
+            if options.program:
+                return _run_program(server, options.program, environment, options.duration)
+            parts = {"pca9685": coils.pwm.address}
+            if coils.monitor is not None:
+                parts["ina219"] = coils.monitor.address
+            facts = {"device": f"/dev/i2c-{options.bus}", "parts": parts, "environment": environment}
+            assigned = " ".join(f"{name}={shlex.quote(value)}" for name, value in environment.items())
+            sys.stdout.write((json.dumps(facts) if options.json else assigned) + "\n")
+            sys.stdout.flush()
+            _serve(server, None, options.duration)
+        finally:
+            server.close()
     return 0
 
 
-def _coils(config_file: Path, number: int) -> CoilHardware:
-    config = configuration.load(config_file)
-    text = config_file.read_text(encoding="utf-8")
-    section = configuration.simulation_section(text, str(config_file), Simulation)
-    if section is None:  # a board's configuration: its coils have the configured values
-        section = Simulation(release=Release(q2=0.0))
-    return assemble_coils(config, section, np.random.default_rng(number), SystemClock().now_ns)
-
-
-def _announce(options: argparse.Namespace, environment: Mapping[str, str], coils: CoilHardware) -> None:
-    parts = {"pca9685": coils.pwm.address}
-    if coils.monitor is not None:
-        parts["ina219"] = coils.monitor.address
-    facts = {"device": f"/dev/i2c-{options.bus}", "parts": parts, "environment": environment}
-    text = " ".join(f"{name}={shlex.quote(value)}" for name, value in environment.items())
-    sys.stdout.write((json.dumps(facts) if options.json else text) + "\n")
-    sys.stdout.flush()
-
-
-def _with_program(
+def _run_program(
     server: I2cServer, program: list[str], environment: Mapping[str, str], duration: float | None
 ) -> int:
-    """Run a program beside the server; return its exit status as a shell does."""
+    """Run a program with the server; return its exit status as a shell does."""
     try:
         process = subprocess.Popen(program, env={**os.environ, **environment})
     except OSError as error:
@@ -276,20 +222,26 @@ def _with_program(
 
 def _serve(server: I2cServer, process: subprocess.Popen[bytes] | None, duration: float | None) -> None:
     """Answer requests until the process, the duration or a signal ends it."""
-    stopped = False
-
-    def stop(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal stopped
-        stopped = True
-
     clock = SystemClock()
     end_ns = None if duration is None else clock.now_ns() + round(duration * SECOND_NS)
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        while not stopped and (process is None or process.poll() is None):
+    with stop_signals() as stopped:
+        while not stopped.is_set() and (process is None or process.poll() is None):
             if end_ns is not None and clock.now_ns() >= end_ns:
                 return
             server.serve(_LONGEST_WAIT_S)
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """Give an event that SIGINT and SIGTERM set; restore the previous handlers afterwards."""
+    stopped = threading.Event()
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        stopped.set()
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -1,8 +1,8 @@
-"""Simulated hardware in real time, in a process of its own, which survives the flight process.
+"""Simulated hardware in real time, in a process of its own that survives the flight process.
 
 The VN-100 is served on a pseudo-terminal. The I2C bus and the camera answer on a Unix socket, one request
-after the other on each connection (`sim_hal.serving.remote` is the other end); a frame's pixels pass through
-a file beside the socket. Frames are rendered by a helper process, so that the devices keep time.
+after the other on each connection (`sim_hal.rig` is the other end); the pixels of a frame pass through a file
+in the folder of the socket. A helper process renders the frames, so that the devices keep time.
 """
 
 from __future__ import annotations
@@ -24,15 +24,21 @@ from flight.link.telemetry.log import FlightLog
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
-from hal.interfaces.devices import Frame
 from hal.interfaces.errors import DeviceError
 from knightcube.astro.arrays import FloatArray, Image
-from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
+from sim_hal.assembly import (
+    GPS_LINE,
+    Hardware,
+    StarRenderer,
+    assemble,
+    fault_generator,
+    line_generator,
+    render_wide,
+)
 from sim_hal.emulators.camera import EmulatedCamera
 from sim_hal.emulators.serial_line import PtyLine
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import parse, put
-from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, SkySection
 from sim_hal.worlds.world import TruthRecorder
@@ -50,7 +56,7 @@ _renderer: list[StarRenderer] = []
 
 
 def _prepare_renderer(camera: Camera | None, sky: SkySection, seed: int) -> None:
-    """Load the sky once in the rendering process, which ends whenever the server does."""
+    """Load the sky once in the rendering process, which ends with the server."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if camera is not None:
@@ -61,8 +67,8 @@ def _render(sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Seq
     return _renderer[0].render(sequence, times, attitudes, tracks)
 
 
-class _Connection:
-    """One client: a flight process's bus or camera."""
+class _DeviceClient:
+    """The connection of a flight process's bus or camera."""
 
     def __init__(self, line: socket.socket) -> None:
         self.line = line
@@ -70,17 +76,15 @@ class _Connection:
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
-        """Return the complete requests received; None when the client has disconnected."""
+        """Return the complete requests received; None after the client has disconnected."""
         try:
             chunk = self.line.recv(65536)
         except ConnectionError:
             return None
-        if not chunk:
-            return None
-        return self._inbox.take(chunk)
+        return self._inbox.take(chunk) if chunk else None
 
     def answer(self, message: Any) -> None:
-        """Send a message without waiting for a client that is gone or does not read."""
+        """Send a message; a client that has ended or does not read is ignored."""
         try:
             self.line.sendall(pack(message))
         except OSError:
@@ -88,7 +92,7 @@ class _Connection:
 
 
 class DeviceServer:
-    """The devices of one configuration, until stopped."""
+    """Serves the devices of one configuration until stopped."""
 
     def __init__(self, config: Config, section: Simulation, folder: Path) -> None:
         self._clock = SystemClock()
@@ -116,7 +120,7 @@ class DeviceServer:
         self._frames_sent = 0
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()
-        self._connections: dict[int, _Connection] = {}
+        self._connections: dict[int, _DeviceClient] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self.socket_path = Path(self._place.name) / SOCKET_NAME
         self._listener.bind(str(self.socket_path))
@@ -173,7 +177,7 @@ class DeviceServer:
         self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
     ) -> Future[Image]:
         assert self._pool is not None
-        # The previous exposure has its frame or is abandoned; rendering it first would delay this one.
+        # The previous exposure is finished or abandoned; rendering it first would delay this one.
         if self._rendering is not None:
             self._rendering.cancel()
         self._rendering = self._pool.submit(_render, sequence, times, attitudes, tracks)
@@ -182,18 +186,16 @@ class DeviceServer:
     def _expose_wide(
         self, model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]
     ) -> Future[Image]:
-        from sim_hal.orbit_assembly import render_wide  # noqa: PLC0415 - see `orbit_devices`
-
         assert self._pool is not None
         return self._pool.submit(render_wide, model, scene, seed)
 
     def _accept(self) -> None:
         line, _ = self._listener.accept()
         self._served_anybody = True
-        self._connections[line.fileno()] = _Connection(line)
+        self._connections[line.fileno()] = _DeviceClient(line)
         self._selector.register(line, selectors.EVENT_READ)
 
-    def _serve_client(self, connection: _Connection) -> None:
+    def _serve_client(self, connection: _DeviceClient) -> None:
         requests = connection.requests()
         if requests is None:
             self._selector.unregister(connection.line)
@@ -214,7 +216,7 @@ class DeviceServer:
     def _operations(self) -> dict[str, Callable[..., Any]]:
         bus, cameras = self.hardware.bus, self._cameras()
 
-        def trigger(connection: _Connection, exposure_ns: int, number: int = 0) -> None:
+        def trigger(connection: _DeviceClient, exposure_ns: int, number: int = 0) -> None:
             camera = cameras[number]
             if camera is not None:
                 connection.wants_frames.add(number)
@@ -241,36 +243,26 @@ class DeviceServer:
         put([parse(text) for text in faults], bench, epoch_ns)
 
     def _cameras(self) -> tuple[EmulatedCamera | None, ...]:
-        """Return the star camera, which has number 0, and the wide ones."""
+        """Return the star camera, number 0, and the horizon cameras."""
         return self.hardware.camera, *self.hardware.orbit.wide
 
     def _deliver_frames(self) -> None:
         for number, camera in enumerate(self._cameras()):
             frame = camera.poll() if camera is not None else None
-            if frame is not None:
-                self._announce(number, frame)
-
-    def _announce(self, number: int, frame: Frame) -> None:
-        path = self.socket_path.parent / f"frame-{number}-{self._frames_sent % _FRAME_SLOTS}.raw"
-        self._frames_sent += 1
-        path.write_bytes(frame.pixels.tobytes())
-        for connection in self._connections.values():
-            if number in connection.wants_frames:
-                connection.answer([0, "frame", _describe(frame), path.name])
-
-
-def _describe(frame: Frame) -> list[Any]:
-    return [
-        frame.sequence,
-        frame.exposure_start_ns,
-        frame.exposure_ns,
-        list(frame.pixels.shape),
-        frame.pixels.dtype.str,
-    ]
+            if frame is None:
+                continue
+            path = self.socket_path.parent / f"frame-{number}-{self._frames_sent % _FRAME_SLOTS}.raw"
+            self._frames_sent += 1
+            path.write_bytes(frame.pixels.tobytes())
+            times = frame.sequence, frame.exposure_start_ns, frame.exposure_ns
+            description = [*times, list(frame.pixels.shape), frame.pixels.dtype.str]
+            for connection in self._connections.values():
+                if number in connection.wants_frames:
+                    connection.answer([0, "frame", description, path.name])
 
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
-    """Start the rendering process, and wait until it has its sky, so that a flight starts undisturbed."""
+    """Start the rendering process and wait until it has loaded its sky."""
     if config.camera is None and not config.wide_cameras:
         return None
     pool = ProcessPoolExecutor(

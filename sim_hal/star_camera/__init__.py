@@ -5,12 +5,17 @@
     frame = render(model, stars.directions_at(2030.5), stars.magnitude, times, quaternions, rng)
 
 `times` and `quaternions` are the camera's attitude over the exposure, sampled at the steps of the simulation.
-`model` holds the camera's parameters. `exposure` integrates the light of each source along its path, with a
-global or a rolling shutter (`line_time`). `image` interpolates the attitude and makes the counts. `rso` gives
-the tracks of resident space objects.
+`image` has the camera's parameters, interpolates the attitude and makes the counts. `exposure` integrates the
+light of each source along its path, with a global or a rolling shutter (`line_time`). `objects` adds moving
+objects and the view from an orbit.
 """
 
-from sim_hal.star_camera.image import SourceTrack, expected_electrons, render
-from sim_hal.star_camera.model import StarCameraModel, scatter_hot_pixels
+from sim_hal.star_camera.image import (
+    SourceTrack,
+    StarCameraModel,
+    expected_electrons,
+    render,
+    scatter_hot_pixels,
+)
 
 __all__ = ["SourceTrack", "StarCameraModel", "expected_electrons", "render", "scatter_hot_pixels"]

@@ -1,26 +1,29 @@
-"""Star images: the stars and moving sources that a camera records over an exposure.
+"""The star camera: its parameters, and its frames of stars and moving sources over an exposure.
 
 The attitude during an exposure is interpolated between samples by a rotation at constant rate. Sease 2.12
 integrates one constant rate from the start of the exposure; here the true attitude is given, so that the
-acceleration of a slew or a jitter shows in the streak. The detector adds noise and saturation and makes
+acceleration of a slew or a jitter appears in the streak. The detector adds noise and saturation and gives
 counts (Sease 2.10, 2.11).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera.exposure import (
+    DEVICE,
     Float32Array,
     OwnTimes,
     RollingShutter,
@@ -30,11 +33,135 @@ from sim_hal.star_camera.exposure import (
     expose_rolling,
     integrated_gaussian,
 )
-from sim_hal.star_camera.model import StarCameraModel
 
-DEVICE = "star camera model"
+HotPixel = tuple[int, int, float]
+"""Column, row, and dark current (e-/s) above that of the other pixels."""
+
+# Minimum, maximum and unit of each parameter.
+_LIMITS: dict[str, tuple[float, float, str]] = {
+    "columns": (1, 16_384, "px"),
+    "rows": (1, 16_384, "px"),
+    "field_of_view": (1e-4, 2.8, "rad"),
+    "aperture": (1e-4, 10.0, "m"),
+    "zero_magnitude_flux": (1.0, 1e13, "e-/s/m^2"),
+    "read_noise": (0.0, 1e5, "e-"),
+    "dark_current": (0.0, 1e8, "e-/s"),
+    "gain": (1e-3, 1e5, "e-/count"),
+    "pedestal": (0.0, 65_535.0, "counts"),
+    "bits": (1, 16, "bit"),
+    "full_well": (1.0, 1e9, "e-"),
+    "psf_sigma": (0.2, 20.0, "px"),
+    "line_time": (0.0, 0.01, "s"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StarCameraModel:
+    """A star camera; the defaults are a CubeSat's, 1024 x 1024 over 20 degrees.
+
+    Attributes:
+        columns: pixels across.
+        rows: pixels down.
+        field_of_view: rad, across the columns, edge to edge.
+        aperture: m, diameter.
+        zero_magnitude_flux: e-/s per m^2 of aperture for V = 0 (Sease 2.7 corrected: 19,000 is per mm^2).
+        read_noise: e-, standard deviation.
+        dark_current: e-/s per pixel.
+        gain: e- per count; the thesis calls it quantum efficiency.
+        pedestal: counts added before the conversion, so that negative noise is not clipped.
+        bits: resolution of the converter.
+        full_well: e-, capacity of a pixel.
+        psf_sigma: px, standard deviation of the Gaussian blur.
+        psf: "integrated" over each pixel, or "bilinear": placed on four pixels and blurred with a sampled
+            3 x 3 kernel, as in the thesis (2.5, 2.6, 2.9).
+        noise: "poisson" (with Gaussian read noise), or "uniform": the thesis's own draw (text at 2.11).
+        hot_pixels: pixels with a higher dark current.
+        line_time: s between the exposures of consecutive rows; 0 is a global shutter.
+        background_gradient: counts/px of stray light along x and y; it is zero in the darkest corner.
+    """
+
+    columns: int = 1024
+    rows: int = 1024
+    field_of_view: float = math.radians(20.0)
+    aperture: float = 0.025
+    zero_magnitude_flux: float = 1.9e10
+    read_noise: float = 10.0
+    dark_current: float = 50.0
+    gain: float = 1.0
+    pedestal: float = 100.0
+    bits: int = 12
+    full_well: float = 20_000.0
+    psf_sigma: float = 1.0
+    psf: Literal["integrated", "bilinear"] = "integrated"
+    noise: Literal["poisson", "uniform"] = "poisson"
+    hot_pixels: tuple[HotPixel, ...] = ()
+    line_time: float = 0.0
+    background_gradient: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_limits(DEVICE, self, _LIMITS)
+        for name, choices in (("psf", ("integrated", "bilinear")), ("noise", ("poisson", "uniform"))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{DEVICE}: {name} = {getattr(self, name)!r}: use {' or '.join(choices)}")
+        for slope in self.background_gradient:
+            if not -100.0 <= slope <= 100.0:
+                raise OutOfRange(DEVICE, "background_gradient", slope, -100.0, 100.0, "counts/px")
+        for column, row, current in self.hot_pixels:
+            if not 0 <= column < self.columns:
+                raise OutOfRange(DEVICE, "hot pixel's column", column, 0, self.columns - 1, "px")
+            if not 0 <= row < self.rows:
+                raise OutOfRange(DEVICE, "hot pixel's row", row, 0, self.rows - 1, "px")
+            if not 0.0 <= current <= 1e8:
+                raise OutOfRange(DEVICE, "hot pixel's dark current", current, 0.0, 1e8, "e-/s")
+
+    @property
+    def pinhole(self) -> Pinhole:
+        """The camera's geometry (Sease 2.3, 2.4 corrected)."""
+        return Pinhole.from_field_of_view(self.columns, self.rows, self.field_of_view)
+
+    @property
+    def highest_count(self) -> int:
+        """The count at which the converter saturates."""
+        return (1 << self.bits) - 1
+
+    @property
+    def count_type(self) -> type[np.uint8] | type[np.uint16]:
+        """The smallest unsigned integer that holds a count."""
+        return np.uint8 if self.bits <= 8 else np.uint16
+
+    def exposure_within(self, span: float) -> float:
+        """Return the exposure (s) of each row if all rows together take `span` s.
+
+        A rolling shutter takes rows times line time longer than its exposure. Raises OutOfRange if no time is
+        left for the exposure.
+        """
+        readout = self.rows * self.line_time
+        if not span > readout:
+            raise OutOfRange(DEVICE, "the attitude history's length", span, readout, math.inf, "s")
+        return span - readout
+
+    def electrons(self, magnitudes: npt.ArrayLike, exposure: float) -> FloatArray:
+        """Return the e- of sources of Johnson V `magnitudes` in `exposure` s (Sease 2.8)."""
+        area = 0.25 * math.pi * self.aperture**2
+        brightness = 10.0 ** (-0.4 * np.asarray(magnitudes, dtype=float))
+        return np.asarray(self.zero_magnitude_flux * area * exposure * brightness)
+
+
+def scatter_hot_pixels(
+    model: StarCameraModel, count: int, mean_current: float, rng: np.random.Generator
+) -> StarCameraModel:
+    """Return `model` with `count` random hot pixels of exponential current; `mean_current` is in e-/s."""
+    places = rng.choice(model.columns * model.rows, size=count, replace=False)
+    currents = rng.exponential(mean_current, size=count)
+    hot = tuple(
+        (int(place % model.columns), int(place // model.columns), float(current))
+        for place, current in zip(places, currents, strict=True)
+    )
+    return replace(model, hot_pixels=hot)
+
+
 GREATEST_TURN = 0.5 * np.pi
-"""Between two samples, rad. Beyond pi the shorter rotation would be the wrong one."""
+"""Largest rotation (rad) between two attitude samples; beyond pi the shorter rotation would be wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +195,7 @@ class AttitudeHistory:
 
     @property
     def span(self) -> float:
-        """The time from the first sample to the last, s."""
+        """Time (s) from the first sample to the last."""
         return float(self.times[-1] - self.times[0])
 
     def at(self, times: FloatArray) -> FloatArray:
@@ -82,8 +209,8 @@ class AttitudeHistory:
     def knots(self, tolerance: float, longest_turn: float) -> FloatArray:
         """Return times (j,) from start to end between which the motion is smooth and short.
 
-        Between two knots the attitude stays within `tolerance` rad of a turn at constant rate, and turns by
-        `longest_turn` rad at most. Smooth motion needs no more knots for being sampled finely.
+        Between two knots the attitude is within `tolerance` rad of a rotation at constant rate, and the
+        rotation is `longest_turn` rad at most. The number of knots does not grow with that of the samples.
         """
         last = len(self.times) - 1
         kept = np.arange(last + 1)
@@ -115,18 +242,18 @@ def _turns(quaternions: FloatArray) -> FloatArray:
 
 
 FAINT_SHARE = 0.25
-"""A pixel is faint while its light adds at most this share to the variance of the background."""
+"""Largest light of a faint pixel, as a fraction of the variance of the background."""
 GREATEST_SKEWNESS = 0.05
-"""Below it noise may be drawn as Gaussian: its distribution function is then off by 0.004 (Edgeworth)."""
+"""Largest skewness of noise drawn as Gaussian; the distribution function errs by 0.004 (Edgeworth)."""
 
-SLICES = 1 << 16
-OUTER_SLICES = 64
+SLICES, OUTER_SLICES = 1 << 16, 64
+"""Slices of equal probability of the normal distribution, and the outermost ones of each tail."""
 
 
 def counts(
     model: StarCameraModel, electrons: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Image:
-    """Return the frame (rows, columns) of counts that `electrons` of light in `exposure` s give."""
+    """Return the frame (rows, columns) of counts for `electrons` (rows, columns) of light in `exposure` s."""
     light = electrons
     if model.hot_pixels:
         light = electrons.copy()
@@ -143,7 +270,6 @@ def counts(
 
 
 def _stray_light(model: StarCameraModel) -> Float32Array:
-    """Return e- (rows, columns) that grow evenly across and down, from none in the darkest corner."""
     across, down = model.background_gradient
     light = across * np.arange(model.columns) + down * np.arange(model.rows)[:, None]
     return np.asarray(model.gain * (light - light.min()), dtype=np.float32)
@@ -152,11 +278,10 @@ def _stray_light(model: StarCameraModel) -> Float32Array:
 def _poisson(
     model: StarCameraModel, light: Float32Array, exposure: float, rng: np.random.Generator
 ) -> Float32Array:
-    """Return e- with shot noise of light and dark current, filled to the well at most, and read noise.
+    """Return e- with shot noise of light and dark current, clipped at the full well, and read noise.
 
-    2.10 and 2.11 corrected: Poisson and Gaussian instead of uniform. Where light is faint beside a background
-    whose noise is all but Gaussian, the sum of the three is drawn as one Gaussian of the same mean and
-    variance; everywhere else each is drawn as what it is.
+    Sease 2.10 and 2.11 corrected: Poisson and Gaussian noise instead of uniform noise. In pixels with little
+    light and nearly Gaussian background noise, one Gaussian with the total mean and variance is drawn.
     """
     dark = model.dark_current * exposure
     variance = model.read_noise**2 + dark
@@ -176,10 +301,10 @@ def _poisson(
 
 
 def _normal(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Return standard normal draws, four times as fast as the generator's own.
+    """Return standard normal draws, four times as fast as those of the generator.
 
-    A 16-bit number picks one of 65,536 slices of equal probability and gives its middle; of the outermost
-    slices, where they are wide, it gives a point drawn within. So the tails are as long as they should be.
+    A 16-bit number selects one of 65,536 slices of equal probability, and the draw is the centre of the
+    slice. In the outermost slices, which are wide, the draw is a random point, so that the tails are right.
     """
     count = int(np.prod(shape))
     words = rng.integers(0, 2**64, size=(count + 3) // 4, dtype=np.uint64)
@@ -199,7 +324,7 @@ def _slice_middles() -> Float32Array:
 def _exact(
     model: StarCameraModel, light: Float32Array, dark: float, rng: np.random.Generator
 ) -> npt.NDArray[np.float32]:
-    # Ten wells and a thousand electrons fill the well for certain; the draw overflows far beyond.
+    # A mean of ten wells and a thousand electrons fills the well for certain; larger means overflow.
     mean = np.minimum(light.astype(np.float64) + dark, 10.0 * model.full_well + 1000.0)
     collected = np.minimum(rng.poisson(mean), model.full_well).astype(np.float32)
     collected += np.float32(model.read_noise) * rng.standard_normal(light.shape, dtype=np.float32)
@@ -217,16 +342,16 @@ def _uniform(
 
 
 SMOOTHNESS = 0.01
-"""px at the boresight: departures from smooth motion larger than this are followed sample by sample."""
+"""Largest error (px at the boresight) of smooth motion between knots."""
 LONGEST_TURN = 0.05
-"""rad between knots: an arc then exceeds its chord by 0.01 %."""
+"""Largest rotation (rad) between knots; an arc then exceeds its chord by 0.01 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceTrack:
-    """A point that moves in the sky (an RSO): directions (k, 3) ICRS at `times` (k,) s, and its Johnson V.
+    """A point source that moves in the sky: directions (k, 3) ICRS at `times` (k,) s, and its Johnson V.
 
-    Between samples it moves along the chord, evenly. The samples must cover the exposure.
+    Between samples it moves evenly along the chord. The samples must cover the exposure.
     """
 
     times: FloatArray
@@ -266,13 +391,12 @@ def expected_electrons(
     quaternions: FloatArray,
     extra: Sequence[SourceTrack] = (),
 ) -> FloatArray:
-    """Return the light (rows, columns) in e- of an exposure: no noise, no dark current, no saturation.
+    """Return the light (rows, columns) of an exposure, e-, without noise, dark current and saturation.
 
-    `directions` (n, 3) are ICRS unit vectors, `magnitudes` (n,) Johnson V; `times` (k,) s and `quaternions`
-    (k, 4), ICRS into camera, are the attitude from the start to the end of the exposure; with a rolling
-    shutter from the start of the first row's until `model.rows` line times after that exposure's end. Sease
-    2.1-2.9 and 2.12, corrected. Raises ValueError for arrays of the wrong shape or not finite, OutOfRange
-    for an attitude that cannot be.
+    `directions` (n, 3) are ICRS unit vectors and `magnitudes` (n,) Johnson V. `times` (k,) s and
+    `quaternions` (k, 4), ICRS into camera, are the attitude from the start to the end of the exposure; with a
+    rolling shutter to the end of the last row's exposure. Sease 2.1-2.9 and 2.12, corrected. Raises
+    ValueError for arrays of the wrong shape or not finite, and OutOfRange for an invalid attitude.
     """
     history = AttitudeHistory(times, quaternions)
     return _light(model, directions, magnitudes, history, extra).astype(np.float64)
@@ -287,7 +411,7 @@ def render(
     rng: np.random.Generator,
     extra: Sequence[SourceTrack] = (),
 ) -> Image:
-    """Return the camera's frame (rows, columns): uint8 to 8 bits, uint16 above.
+    """Return the camera's frame (rows, columns): uint8 for up to 8 bits, else uint16.
 
     Arguments as for `expected_electrons`; all noise is drawn from `rng`.
     """
@@ -303,7 +427,12 @@ def _light(
     history: AttitudeHistory,
     extra: Sequence[SourceTrack],
 ) -> Float32Array:
-    directions, magnitude = _checked(directions, magnitudes)
+    directions, magnitude = np.asarray(directions, dtype=float), np.asarray(magnitudes, dtype=float)
+    if directions.ndim != 2 or directions.shape[1] != 3 or magnitude.shape != directions.shape[:1]:
+        raise ValueError(f"stars {directions.shape} and magnitudes {magnitude.shape}: give (n, 3) and (n,)")
+    # A sum is finite only if every term is, which needs no array of flags.
+    if not (np.isfinite(directions.sum()) and np.isfinite(magnitude.sum())):
+        raise ValueError("star directions and magnitudes must be finite")
     camera = model.pinhole
     spread = (integrated_gaussian if model.psf == "integrated" else bilinear_gaussian)(model.psf_sigma)
     exposure = model.exposure_within(history.span)
@@ -318,15 +447,19 @@ def _light(
     else:
         expose(image, camera, spread, _stars_seen_by(history, stars), electrons, knots)
     for track in extra:
-        _check_cover(track, history)
+        if track.times[0] > history.times[0] or track.times[-1] < history.times[-1]:
+            raise ValueError(
+                f"source track from {track.times[0]} to {track.times[-1]} s: it must cover the exposure, "
+                f"{history.times[0]} to {history.times[-1]} s"
+            )
         inside = track.times[(track.times > knots[0]) & (track.times < knots[-1])]
         bends = np.union1d(knots, inside)
         electrons = model.electrons([track.magnitude], exposure)
-        own = _at_own_times(history, _directions_of(track))
+        own = _at_own_times(history, partial(_of_track, track))
         if model.line_time > 0.0:
             expose_rolling(image, camera, spread, own, electrons, bends, shutter)
         else:
-            expose(image, camera, spread, _track_seen_by(own), electrons, bends)
+            expose(image, camera, spread, partial(_alone, own), electrons, bends)
     return image
 
 
@@ -340,7 +473,7 @@ def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
 
 
 def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
-    """Return `directions` (..., 3), ICRS, of sources at their own times, as the camera then sees them."""
+    """Return `directions` (..., 3), ICRS, of sources at their own times in the camera frame."""
 
     def vectors(times: FloatArray, sources: IntArray) -> FloatArray:
         matrices = history.matrices_at(times.reshape(-1)).reshape(*times.shape, 3, 3)
@@ -349,19 +482,16 @@ def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
     return vectors
 
 
-def _track_seen_by(own: OwnTimes) -> Vectors:
-    return lambda times: own(times[:, None], np.zeros(1, dtype=np.int64))
+def _of_track(track: SourceTrack, times: FloatArray, _: IntArray) -> FloatArray:
+    return track.directions_at(times.reshape(-1)).reshape(*times.shape, 3)
 
 
-def _directions_of(track: SourceTrack) -> OwnTimes:
-    def directions(times: FloatArray, _: IntArray) -> FloatArray:
-        return track.directions_at(times.reshape(-1)).reshape(*times.shape, 3)
-
-    return directions
+def _alone(own: OwnTimes, times: FloatArray) -> FloatArray:
+    return own(times[:, None], np.zeros(1, dtype=np.int64))
 
 
 def _near_the_field(camera: Pinhole, directions: FloatArray, boresights: FloatArray, margin: int) -> IntArray:
-    """Return the indices of the stars that the field may sweep over, between `boresights` (j, 3) too."""
+    """Return the indices of the stars that the field may cross on its way along `boresights` (j, 3)."""
     middle = boresights.sum(axis=0)
     length = float(np.linalg.norm(middle))
     if length < 0.5 * len(boresights):
@@ -370,22 +500,3 @@ def _near_the_field(camera: Pinhole, directions: FloatArray, boresights: FloatAr
     sweep = np.arccos(np.clip(np.min(boresights @ axis), -1.0, 1.0))
     radius = camera.half_diagonal + sweep + LONGEST_TURN**2 + margin / camera.focal_length
     return np.flatnonzero(directions @ axis >= np.cos(min(radius, np.pi)))
-
-
-def _checked(directions: FloatArray, magnitudes: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-    directions = np.asarray(directions, dtype=float)
-    magnitude = np.asarray(magnitudes, dtype=float)
-    if directions.ndim != 2 or directions.shape[1] != 3 or magnitude.shape != directions.shape[:1]:
-        raise ValueError(f"stars {directions.shape} and magnitudes {magnitude.shape}: give (n, 3) and (n,)")
-    # A sum is finite only when every term is: one pass, no array of flags.
-    if not (np.isfinite(directions.sum()) and np.isfinite(magnitude.sum())):
-        raise ValueError("star directions and magnitudes must be finite")
-    return directions, magnitude
-
-
-def _check_cover(track: SourceTrack, history: AttitudeHistory) -> None:
-    if track.times[0] > history.times[0] or track.times[-1] < history.times[-1]:
-        raise ValueError(
-            f"source track from {track.times[0]} to {track.times[-1]} s: it must cover the exposure, "
-            f"{history.times[0]} to {history.times[-1]} s"
-        )

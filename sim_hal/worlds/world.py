@@ -60,7 +60,7 @@ def about_thread(time_ns: int, angle: float, rate: float, field: float) -> BodyM
 
 WORLDS = {
     "testbed": "sim_hal.worlds.testbed:make",
-    "cage": "sim_hal.worlds.cage:make",
+    "cage": "sim_hal.worlds.testbed:make_caged",
     "free_body": "sim_hal.worlds.free_body:make",
 }
 

@@ -12,9 +12,8 @@ from flight.app.devices import open_devices
 from flight.link.modes import Mode
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Rig
-from sim_hal import lockstep
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.lockstep import LockStep
+from sim_hal.rig import LockStep, opened_lockstep
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 DEVICES = ("imu", "pwm")
@@ -55,7 +54,7 @@ def test_it_is_awaited_in_boot_and_flown_when_it_comes(tmp_path: Path, device: s
 @pytest.mark.parametrize("device", DEVICES)
 def test_on_a_bench_it_is_an_error_at_once(tmp_path: Path, device: str) -> None:
     config = demo_config(1.0, camera=False)
-    with ExitStack() as stack, lockstep.opened(config, demo_world(), tmp_path) as lock:
+    with ExitStack() as stack, opened_lockstep(config, demo_world(), tmp_path) as lock:
         take_away(lock, device)
         rig = Rig(lock.clock, lock.wires, lock.release, False, 1)
         with pytest.raises(NotResponding):

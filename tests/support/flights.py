@@ -17,9 +17,7 @@ from flight.schema.sections import Commands, CommandStep, Config, Modes
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry import Run, read_run
 from hal.interfaces.wires import SECOND_NS, Rig
-from sim_hal import lockstep
-from sim_hal.lockstep import LockStep
-from sim_hal.rig import with_host_faults
+from sim_hal.rig import LockStep, opened_lockstep, with_host_faults
 from sim_hal.settings import Simulation
 from sim_hal.worlds.testbed import Testbed
 
@@ -99,7 +97,7 @@ def fly(
     folder.mkdir(parents=True, exist_ok=True)
     section = section or configuration.replace(demo_world(), seed=seed)
     with ExitStack() as stack:
-        lock = stack.enter_context(lockstep.opened(config, section, folder))
+        lock = stack.enter_context(opened_lockstep(config, section, folder))
         if not any("-high" in entry.fault for entry in section.faults):  # a leg that nothing switches off
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency

@@ -21,16 +21,9 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.sun import DAY, Shadow, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.star_camera.rso import (
-    ResidentSpaceObject,
-    boresights,
-    directions,
-    earth_in_field,
-    hidden_by_earth,
-    in_field,
-    sun_in_field,
-)
+from sim_hal.star_camera.objects import ResidentSpaceObject, directions, hidden_by_earth
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate, sun_position
+from tests.support.exclusion import boresights, earth_in_field, in_field, sun_in_field
 
 DEVICE = "observation opportunities"
 ORBITS = 10

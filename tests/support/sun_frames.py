@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from knightcube.vision.sun import LINEAR, SunSettings, find_sun
-from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
+from tests.support.earth_truth import sun_direction, sun_point
 
 K1 = -0.1
 """Of the bench's lenses: it draws the corners in by 30 px."""

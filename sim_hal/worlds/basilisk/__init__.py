@@ -1,4 +1,4 @@
-"""A world that is not ours: Basilisk (AVS Lab, PyPI `bsk`, extra `worlds`) behind the World Protocol."""
+"""The simulator Basilisk (AVS Lab, PyPI `bsk`, extra `worlds`) as a world."""
 
 STEP_NS = 25_000_000
-"""Of Basilisk's integration."""
+"""Step of Basilisk's integration."""

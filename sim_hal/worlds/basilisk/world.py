@@ -59,7 +59,7 @@ class BasiliskWorld:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
     ) -> None:
-        """Hold the body still until it is released. Raises ConfigError where Basilisk is missing."""
+        """Hold the body still until it is released. Raises ConfigError if Basilisk is not installed."""
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
             raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
         errors, tip_off, _ = generators(seed)
@@ -102,7 +102,7 @@ class BasiliskWorld:
             self._step(since)
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion there; the specific force is zero."""
+        """Advance to `time_ns` and return the motion; the specific force is zero."""
         self.advance_to(time_ns)
         attitude, rate = self._attitude, np.zeros(3)
         if not self._held:

@@ -12,7 +12,7 @@ _LIGHT = """
 import sys
 import flight.app.flight, flight.app.cli.run, flight.link.commands
 import flight.bodies.orbit.body, flight.bodies.testbed.body
-import sim_hal.faults.host, sim_hal.serving.remote
+import sim_hal.faults.host, sim_hal.rig
 sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(".")[0] == "scipy")))
 """
 _WORKING = """

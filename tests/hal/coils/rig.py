@@ -10,9 +10,8 @@ from hal.drivers.coils import CoilSettings, CoilWiring, PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
 from hal.interfaces.devices import TorqueCoils
 from hal.interfaces.wires import Clock, I2cBus
-from sim_hal.emulators.coil_circuit import CoilCircuit
+from sim_hal.emulators.coil_circuit import CoilCircuit, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
-from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from tests.manual_clock import ManualClock
 

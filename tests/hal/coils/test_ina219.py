@@ -9,7 +9,7 @@ import pytest
 from hal.drivers.ina219 import Ina219, config_for, range_for
 from hal.interfaces.devices import PowerMonitor
 from hal.interfaces.errors import OutOfRange
-from sim_hal.emulators.ina219 import EmulatedIna219, conversion_ns
+from sim_hal.emulators.coil_circuit import EmulatedIna219, conversion_ns
 from tests.hal.coils.rig import INA, PCA, Rig
 from tests.manual_clock import ManualClock
 

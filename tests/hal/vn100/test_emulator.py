@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hal.drivers.vn100.protocol import FIELDS, AsciiLine, BinaryPacket, build
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.clock import NEVER
-from sim_hal.emulators.vn100 import Vn100EmulatorSettings
-from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS
+from sim_hal.emulators.vn100 import SUPPORTED_FIELDS, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, REPORTS
 from tests.hal.vn100.emulated_unit import Bench
 

@@ -20,9 +20,10 @@ from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.initial_guess import shortest_turn
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import LINEAR, SunSettings, SunStatus, find_sun, sun_of_cameras
-from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction
-from sim_hal.orbit_assembly import wide_model
+from sim_hal.assembly import wide_model
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import LOW, pointing, random_sun_scene
+from tests.support.earth_truth import sun_direction
 from tests.support.sun_frames import CAMERAS, Outcome, frames_with_sun, frames_without_sun
 
 MODEL, SETTINGS = CAMERAS["logarithmic"]

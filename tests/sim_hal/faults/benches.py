@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim_hal.faults.bench import Bench
-from sim_hal.lockstep import LockStep
+from sim_hal.rig import LockStep
 
 
 def bench_of(lock: LockStep) -> Bench:

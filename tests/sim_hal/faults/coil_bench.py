@@ -21,8 +21,8 @@ from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.devices import ImuReading
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_about_axis_y
-from sim_hal import lockstep
 from sim_hal.clock import SimClock
+from sim_hal.rig import build_lockstep
 from sim_hal.settings import FaultEntry
 from sim_hal.worlds.testbed import Testbed
 from tests.support.flights import demo_config, demo_world
@@ -90,7 +90,7 @@ def observe(
     )
     section = configuration.replace(demo_world(), seed=seed, faults=entries, truth=truth)
     clock = SimClock()
-    lock = lockstep.build(config, section, None, clock)
+    lock = build_lockstep(config, section, None, clock)
     pca = Pca9685(lock.wires.i2c, config.coils.address, clock)
     coils = PwmTorqueCoils(pca, clock, coil_settings(config))
     coils.start()

@@ -1,4 +1,4 @@
-"""Every fault can be begun on the emulated hardware, breaks something, and leaves nothing broken behind."""
+"""Every fault can begin on the emulated hardware, has an effect, and leaves no effect after its removal."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import pytest
 from flight.schema import reader as configuration
 from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
-from sim_hal import lockstep
 from sim_hal.clock import NEVER, SimClock
 from sim_hal.emulators.coil_circuit import CoilCondition
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import parse, put
-from sim_hal.lockstep import LockStep
+from sim_hal.rig import LockStep, build_lockstep
 from tests.sim_hal.faults.benches import bench_of
-from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
 from tests.support.flights import demo_config, demo_world
+from tests.support.orbit_devices import orbit_config, orbit_world
 
 OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
 SECOND_NS = 1_000_000_000
@@ -29,13 +28,13 @@ IN_ORBIT = {"gps", "strings", "wide"}
 @pytest.fixture(scope="module")
 def orbit() -> LockStep:
     """Return the devices of an orbit; every fault leaves them as they were."""
-    return lockstep.build(orbit_config(), orbit_world(), None, SimClock())
+    return build_lockstep(orbit_config(), orbit_world(), None, SimClock())
 
 
 @pytest.fixture
 def lock() -> LockStep:
     config = configuration.replace(demo_config(10.0))
-    return lockstep.build(config, demo_world(), None, SimClock())
+    return build_lockstep(config, demo_world(), None, SimClock())
 
 
 def is_sound(lock: LockStep) -> bool:

@@ -8,10 +8,10 @@ import pytest
 from flight.app.devices import coil_settings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.pca9685 import Pca9685
-from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import parse, put
+from sim_hal.rig import build_lockstep
 from tests.support.flights import demo_config, demo_world
 
 CYCLE_NS = 25_000_000
@@ -21,7 +21,7 @@ WANTED = np.array([0.06, 0.0, -0.03])
 def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
     """Command for six seconds under a fault; return (time, error) by cycle, and the last miss in A."""
     config = demo_config(10.0, camera=False)
-    lock = lockstep.build(config, demo_world(), None, SimClock())
+    lock = build_lockstep(config, demo_world(), None, SimClock())
     coils = PwmTorqueCoils(Pca9685(lock.wires.i2c, 0x40, lock.clock), lock.clock, coil_settings(config))
     coils.start()
     epoch_ns = lock.clock.now_ns()

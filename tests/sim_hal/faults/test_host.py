@@ -1,4 +1,4 @@
-"""What breaks inside the flight process: jobs, wall clock, disk, and the file that it reads."""
+"""Faults inside the flight process: jobs, wall clock, disk, and the configuration file."""
 
 from __future__ import annotations
 

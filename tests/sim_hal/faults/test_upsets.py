@@ -1,4 +1,4 @@
-"""Bits that flip in registers, and a monitor that is behind: what they do, and that the drivers mend it."""
+"""Register upsets and a lagging monitor: their effects, and the repair by the drivers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import pytest
 from flight.schema import reader as configuration
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import LED0_ON_L, MODE1, MODE2, PRE_SCALE
-from sim_hal import lockstep
 from sim_hal.clock import SimClock
-from sim_hal.emulators.ina219 import CALIBRATION, CONFIG
+from sim_hal.emulators.coil_circuit import CALIBRATION, CONFIG
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import parse, put
+from sim_hal.rig import build_lockstep
 from tests.hal.coils.rig import INA, Rig
 from tests.hal.vn100.bench_line import bench_line
 from tests.support.flights import demo_config, demo_world
@@ -162,7 +162,7 @@ def test_an_upset_that_leaves_the_readings_as_they_are_needs_nothing(register: i
 @pytest.mark.parametrize("name", UPSETS)
 def test_what_is_not_said_is_drawn(name: str) -> None:
     """Of many draws some change the registers, and not all the same way."""
-    lock = lockstep.build(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
+    lock = build_lockstep(configuration.replace(demo_config(10.0)), demo_world(), None, SimClock())
     hardware = lock.hardware
     assert hardware.monitor is not None
     seen = set()

@@ -1,4 +1,4 @@
-"""Programs of other people open the emulated bus as /dev/i2c-N, unchanged, in processes of their own."""
+"""Unchanged programs open the emulated bus as /dev/i2c-N in their own processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from sim_hal.serving.cli import main
+from sim_hal.__main__ import main
 
 COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "i2c"]
 PWM, MONITOR, ALL_CALL = 0x40, 0x45, 0x70

@@ -1,4 +1,4 @@
-"""Basilisk, another author's simulator, beside our own free body. Skipped where it is not installed."""
+"""The world of Basilisk compared with `free_body`; skipped if Basilisk is not installed."""
 
 from __future__ import annotations
 

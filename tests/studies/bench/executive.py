@@ -70,7 +70,7 @@ _IMPORTED = (
     "flight.loop.worker",
     "knightcube.vision.streaks.estimate",
     "sim_hal.faults.host",
-    "sim_hal.serving.remote",
+    "sim_hal.rig",
 )
 _ROLES = {
     "knightcube.gnc.guidance.one_axis.job": "planner",

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from knightcube.vision.sun import SunSettings, find_sun
-from sim_hal.earth_camera import EarthCameraModel, render, sun_direction
+from sim_hal.earth_camera import EarthCameraModel, render
 from tests.sim_hal.earth_camera.scenes import random_sun_scene
+from tests.support.earth_truth import sun_direction
 
 SIZES = (256, 384, 512)
 

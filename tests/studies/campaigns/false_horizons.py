@@ -20,11 +20,11 @@ from knightcube.astro.arrays import Image
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
-from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, nadir, render
-from sim_hal.earth_camera.truth import sun_point
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.limbless import MAKERS, photographed
+from tests.support.earth_truth import ideal_counts, limb_truth, radiance_of, sun_point
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
 
 KNOWN = ("nothing", "altitude", "flight")
@@ -141,8 +141,8 @@ def _glinting(
     middle = points[generator.integers(len(points))]
     rows, columns = np.mgrid[0 : model.rows, 0 : model.columns]
     apart = np.hypot(columns - middle[0], rows - middle[1]) / generator.uniform(20.0, 80.0)
-    light = np.maximum(model.radiance_of(frame.astype(float)), 0.0) * (1.0 + 9.0 * np.exp(-0.5 * apart**2))
-    return np.asarray(np.rint(model.ideal_counts(light)).astype(frame.dtype))
+    light = np.maximum(radiance_of(model, frame.astype(float)), 0.0) * (1.0 + 9.0 * np.exp(-0.5 * apart**2))
+    return np.asarray(np.rint(ideal_counts(model, light)).astype(frame.dtype))
 
 
 def _limb(kind: str, generator: np.random.Generator) -> list[Result]:

@@ -35,10 +35,11 @@ from knightcube.vision.camera.lens import MountedCamera
 from knightcube.vision.horizon.limb import MEAN_RADIUS
 from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
-from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.nadir import WRONG_DEG
+from tests.support.earth_truth import limb_truth
 from tests.support.limb_frames import (
     FIELD_SIGMA,
     SUN_SIGMA,

@@ -22,7 +22,7 @@ from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
-from sim_hal.star_camera.rso import source_tracks
+from sim_hal.star_camera.objects import source_tracks
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso import (
     EXPOSURE,

@@ -1,4 +1,4 @@
-"""A slice of the campaigns: in flight each fault rings its alarm, and without one everything is quiet."""
+"""Flights with faults: each fault is reported, and a sound flight reports nothing."""
 
 from __future__ import annotations
 

@@ -17,9 +17,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, attitude_matrix
 from knightcube.gnc.guidance.one_axis.path import PathSample
 from sim_hal.clock import SimClock
-from sim_hal.lockstep import utc_ns
+from sim_hal.rig import utc_ns
 from sim_hal.settings import Simulation
-from sim_hal.worlds.cage import OrbitField
+from sim_hal.worlds.testbed import OrbitField
 
 TEXT = config_path("cage").read_text(encoding="utf-8")
 

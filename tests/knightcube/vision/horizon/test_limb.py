@@ -22,7 +22,7 @@ from knightcube.vision.horizon.limb import (
     mean_sphere,
 )
 from sim_hal.earth_camera import EarthScene
-from sim_hal.earth_camera.truth import limb_directions
+from tests.support.earth_truth import limb_directions
 
 HEIGHT = 15e3
 

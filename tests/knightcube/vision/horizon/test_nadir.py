@@ -36,8 +36,9 @@ from knightcube.vision.horizon.settings import (
     RoughAttitude,
     SensedDirection,
 )
-from sim_hal.earth_camera import Atmosphere, EarthScene, limb_truth, nadir, render
+from sim_hal.earth_camera import Atmosphere, EarthScene, nadir, render
 from tests.sim_hal.earth_camera.scenes import limb_scene, random_scene
+from tests.support.earth_truth import limb_truth
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
 from tests.support.orbit_geometry import suite
 

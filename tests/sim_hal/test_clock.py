@@ -1,4 +1,4 @@
-"""Simulated time jumps, but every event due on the way comes, in order."""
+"""Simulated time jumps, and every event due on the way occurs in order."""
 
 from __future__ import annotations
 

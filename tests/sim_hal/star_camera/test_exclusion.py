@@ -1,4 +1,4 @@
-"""Sun and Earth in the camera's field, and the Earth in between."""
+"""Sun and Earth in the field of a camera, and the Earth between camera and object."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.vision.camera.lens import Pinhole
-from sim_hal.star_camera.rso import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
+from sim_hal.star_camera.objects import hidden_by_earth
+from tests.support.exclusion import boresights, earth_in_field, in_field, sun_in_field
 
 HALF = np.radians(10.0)
 CAMERA = np.array([[0.0, EARTH_RADIUS + 380e3, 0.0]])

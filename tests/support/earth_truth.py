@@ -1,4 +1,4 @@
-"""The true nadir, Sun direction and limb of a scene, to compare the results of detectors with."""
+"""The true nadir, Sun direction and limb of a scene, and ideal counts, to compare results with."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import tangent_basis
 from knightcube.astro.earth.figure import semi_axes
-from sim_hal.earth_camera.model import EarthCameraModel
-from sim_hal.earth_camera.radiance import towards_sun
-from sim_hal.earth_camera.scene import EarthScene
+from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene
+from sim_hal.earth_camera.scene import towards_sun
+
+APPARENT_LIMB_HEIGHT = Atmosphere().apparent_limb_height
+"""Height (m) above the ellipsoid at which a sunlit limb has half its brightness (default atmosphere)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,11 +30,6 @@ class LimbTruth:
     points: FloatArray
     directions: FloatArray
     solar_cosines: FloatArray
-
-
-def nadir(scene: EarthScene) -> FloatArray:
-    """Return the unit vector (3,) in camera axes to the Earth's centre."""
-    return np.asarray(scene.camera_matrix @ (-scene.position / np.linalg.norm(scene.position)))
 
 
 def sun_direction(scene: EarthScene) -> FloatArray:
@@ -73,7 +70,7 @@ def limb_directions(
 def limb_truth(
     scene: EarthScene, model: EarthCameraModel, count: int = 3600, height: float | None = None
 ) -> LimbTruth:
-    """Return the limb on the detector, of `count` points all round the Earth those that are imaged.
+    """Return the points on the detector of `count` points around the limb.
 
     `height` m above the ellipsoid is by default the atmosphere's apparent limb height.
     """
@@ -83,3 +80,21 @@ def limb_truth(
     points = model.lens.project(directions)
     seen = model.lens.contains(points)
     return LimbTruth(points[seen], directions[seen], cosines[seen])
+
+
+def ideal_counts(model: EarthCameraModel, radiance: FloatArray) -> FloatArray:
+    """Return the counts (...) of `radiance` (...), unrounded, of a pixel without noise or blemish."""
+    light = np.asarray(radiance, dtype=float)
+    if model.response == "logarithmic":
+        counts = model.pedestal + model.counts_per_decade * np.log10(1.0 + light / model.darkest)
+    else:
+        counts = model.pedestal + np.minimum(light * model.sensitivity, model.full_well) / model.gain
+    return np.asarray(np.clip(counts, 0.0, model.highest_count))
+
+
+def radiance_of(model: EarthCameraModel, counts: FloatArray) -> FloatArray:
+    """Return the radiance (...) that gives `counts` (...) in a pixel without noise or blemish."""
+    above = np.asarray(counts, dtype=float) - model.pedestal
+    if model.response == "logarithmic":
+        return np.asarray(model.darkest * (10.0 ** (above / model.counts_per_decade) - 1.0))
+    return np.asarray(above * model.gain / model.sensitivity)

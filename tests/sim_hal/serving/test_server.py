@@ -1,11 +1,15 @@
-"""The devices of an orbit in a process of their own, in real time: terminal, socket, frames, faults."""
+"""The server of emulated devices: its start, its renderer, and the devices in orbit in real time."""
 
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 import time
+from concurrent.futures import Future
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +17,32 @@ from flight.app.devices import open_gps, open_strings
 from flight.schema import reader
 from hal.interfaces.devices import Frame, GpsReading
 from hal.interfaces.wires import SECOND_NS, Rig
-from sim_hal.serving import remote
+from sim_hal.rig import started_server
+from sim_hal.serving.server import DeviceServer
+
+
+class IdlePool:
+    """A pool whose process is busy: submitted jobs wait."""
+
+    def submit(self, *_: Any) -> Future[Any]:
+        return Future()
+
+
+def test_a_frame_that_waits_to_be_rendered_is_given_up_for_the_next() -> None:
+    server = DeviceServer.__new__(DeviceServer)
+    server.__dict__.update(_pool=IdlePool(), _rendering=None)
+    times, attitudes = np.zeros(1), np.zeros((1, 4))
+    first = server._expose(1, times, attitudes, ())
+    second = server._expose(2, times, attitudes, ())
+    assert first.cancelled()
+    assert not second.cancelled()
+
+
+def test_a_server_starts_without_the_optics_that_its_renderer_needs() -> None:
+    code = "import sys, sim_hal.__main__; sys.stdout.write(str('sim_hal.star_camera' in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "False"
+
 
 DEVICES = """
 gps: {period: 0.2}
@@ -33,7 +62,7 @@ def test_receiver_strings_and_wide_cameras_answer_in_real_time_with_their_faults
     fixes: list[GpsReading] = []
     frames: dict[int, Frame] = {}
     with ExitStack() as stack:
-        served = stack.enter_context(remote.served(path, 1, tmp_path))
+        served = stack.enter_context(started_server(path, 1, tmp_path))
         rig = Rig(served.clock, served.wires, served.release, True, 1)
         gps, strings = open_gps(config, rig, stack), open_strings(config, rig, stack)
         assert gps is not None

@@ -1,4 +1,4 @@
-"""The devices of an orbit through the drivers that fly, in lock-step."""
+"""The devices in orbit, read by the flight drivers in lock-step."""
 
 from __future__ import annotations
 
@@ -20,21 +20,20 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.sun import SunSettings, find_sun
-from sim_hal import lockstep
+from sim_hal.assembly import wide_model
 from sim_hal.clock import SimClock
 from sim_hal.faults.schedule import parse, put
-from sim_hal.lockstep import LockStep, utc_ns
-from sim_hal.orbit_assembly import wide_model
-from sim_hal.orbit_sky import aberrated, view
+from sim_hal.rig import LockStep, build_lockstep, opened_lockstep, utc_ns
+from sim_hal.star_camera.objects import aberrated, view
 from sim_hal.worlds.free_body import FreeBody
 from tests.sim_hal.faults.benches import bench_of
-from tests.sim_hal.orbit_devices.fitted import UTC, at_first, orbit_config, orbit_world
 from tests.support.flights import TEXT, demo_world
+from tests.support.orbit_devices import UTC, at_first, orbit_config, orbit_world
 
 
 @pytest.fixture
 def lock() -> LockStep:
-    return lockstep.build(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
+    return build_lockstep(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
 
 
 def opened(lock: LockStep, stack: ExitStack) -> Rig:
@@ -84,7 +83,7 @@ def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
 
 
 def looking(boresight: FloatArray, camera: bool = False) -> LockStep:
-    return lockstep.build(orbit_config(camera), orbit_world(boresight), None, SimClock(utc_ns(UTC)))
+    return build_lockstep(orbit_config(camera), orbit_world(boresight), None, SimClock(utc_ns(UTC)))
 
 
 def test_a_wide_camera_sees_the_sun_where_it_is() -> None:
@@ -111,7 +110,7 @@ def test_a_wide_camera_sees_the_dark_sky_above_and_the_bright_earth_below() -> N
 
 
 def test_frames_repeat_with_the_seed_and_cost_little(lock: LockStep) -> None:
-    other = lockstep.build(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
+    other = build_lockstep(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
     first, second = shot(lock, 1), shot(other, 1)
     assert first is not None
     assert second is not None
@@ -137,7 +136,7 @@ def test_faults_reach_the_drivers(lock: LockStep) -> None:
 
 def test_a_world_without_an_orbit_has_no_such_devices() -> None:
     with pytest.raises(ConfigError, match=r"gps: needs a world with an orbit"):
-        lockstep.build(orbit_config(), demo_world(), None, SimClock())
+        build_lockstep(orbit_config(), demo_world(), None, SimClock())
 
 
 DEVICES = """
@@ -159,7 +158,7 @@ def test_a_configuration_describes_the_devices() -> None:
     assert config.solar_strings is not None
     assert (config.gps.period, len(config.solar_strings.strings), len(config.wide_cameras)) == (2.0, 4, 1)
     page = Path("docs/fly/simulation.md").read_text(encoding="utf-8")
-    shown = page.split("orbit_devices/test_in_lockstep.py -->\n```yaml\n")[1].split("```")[0]
+    shown = page.split("sim_hal/test_orbit_devices.py -->\n```yaml\n")[1].split("```")[0]
     documented = reader.parse(TEXT + shown)
     assert documented.gps is not None
     assert documented.gps.device == "/dev/ttyS2"
@@ -234,7 +233,7 @@ def test_aberration_moves_the_stars_towards_the_velocity() -> None:
 
 
 def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
-    with lockstep.opened(orbit_config(), orbit_world(), tmp_path) as lock:
+    with opened_lockstep(orbit_config(), orbit_world(), tmp_path) as lock:
         lock.release(0)
         lock.clock.sleep_until_ns(5 * SECOND_NS + 1)
     packets = scan(b"".join(path.read_bytes() for path in sorted(tmp_path.glob("truth-*")))).packets

@@ -1,4 +1,4 @@
-"""Faults are read as they are written, and a bad one is refused with the nearest right name."""
+"""The grammar of faults, and the messages for invalid faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The world seam: the loop flies in whichever world a configuration names."""
+"""A configuration selects the world of a flight."""
 
 from __future__ import annotations
 

@@ -1,1 +1,0 @@
-"""Tests of orbits, Sun, shadow, exclusion and resident space objects."""

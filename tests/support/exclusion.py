@@ -1,0 +1,54 @@
+"""Exclusion of a camera's frames: the Sun or the Earth in the field (Sease 2.16-2.19, corrected).
+
+The boresight is the camera's +z axis, and the field is a cone around it. With half the field of view (the
+thesis's choice) a corner of the frame may still contain the Sun or the limb; with the pinhole's half diagonal
+it may not. Vectors are in ICRS, positions geocentric in m.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import SUN_RADIUS
+from knightcube.vision.camera.lens import Pinhole
+
+
+def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:
+    """Return the boresights (m, 3), ICRS, at body `attitudes` (m, 4); `mounting` (4,) body into camera."""
+    return np.asarray(quaternion.attitude_matrix(quaternion.multiply(mounting, attitudes))[..., 2, :])
+
+
+def sun_in_field(
+    boresight: FloatArray, position: FloatArray, sun: FloatArray, half_angle: float, buffer: float = 0.0
+) -> BoolArray:
+    """Return at which `boresight` (m, 3) the Sun's disc is within `half_angle` + `buffer` rad (2.16, 2.17).
+
+    `position` (m, 3) is the camera's, `sun` (m, 3) the Sun's; `buffer` is for stray light past the baffle.
+    """
+    to_sun = np.asarray(sun) - position
+    return _within(boresight, to_sun, SUN_RADIUS, half_angle + buffer)
+
+
+def earth_in_field(
+    boresight: FloatArray, position: FloatArray, half_angle: float, buffer: float = 0.0
+) -> BoolArray:
+    """Return at which `boresight` (m, 3) the Earth is within `half_angle` + `buffer` rad (2.18, 2.19)."""
+    return _within(boresight, -np.asarray(position), EARTH_RADIUS, half_angle + buffer)
+
+
+def in_field(
+    camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
+) -> BoolArray:
+    """Return which `directions` (m, 3) ICRS are within `margin` px of the detector at camera `attitudes`."""
+    seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
+    return camera.contains(camera.project(seen), margin)
+
+
+def _within(boresight: FloatArray, to_body: FloatArray, radius: float, half_angle: float) -> BoolArray:
+    distance = np.linalg.norm(to_body, axis=-1)
+    cosine = np.sum(boresight * to_body, axis=-1) / distance
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return np.asarray(angle < np.arcsin(np.minimum(1.0, radius / distance)) + half_angle)
