@@ -188,7 +188,7 @@ def test_a_port_that_is_gone_is_not_responding() -> None:
 
 def test_another_model_is_refused() -> None:
     bench = bench_line()
-    bench.unit.registers.set_back(1, ("VN-200T-CR",))
+    bench.unit.registers.values[1] = ("VN-200T-CR",)
     with pytest.raises(Refused, match="VN-200T-CR"):
         bench.driver.configure()
 

@@ -176,7 +176,7 @@ def test_values_that_never_change_are_no_readings(bench: BenchLine) -> None:
 
 
 def test_a_unit_that_refuses_is_asked_again_a_second_later_and_not_at_every_cycle(bench: BenchLine) -> None:
-    bench.unit.registers.set_back(1, ("VN-200T-CR",))
+    bench.unit.registers.values[1] = ("VN-200T-CR",)
     asked: list[bytes] = []
     send = bench.line.host.send
 
