@@ -1,9 +1,4 @@
-"""Local level and noise, and the frames that are not worth looking at.
-
-Regions of pixels against scipy's labels.
-
-The step between the counts of a frame.
-"""
+"""Properties of a frame: background, regions, hot pixels and saturation."""
 
 from __future__ import annotations
 
@@ -14,11 +9,21 @@ from scipy import ndimage
 from knightcube.astro.arrays import BoolArray
 from knightcube.vision.frame import (
     FrameState,
+    are_hot,
+    at_least,
+    box_sum,
     estimate_background,
+    find_hot_pixels,
     frame_state,
     in_steps,
+    interpolation_weights,
     label_pixels,
+    less_boxes,
+    line_of,
+    moments,
+    saturation_count,
     saturation_level,
+    saturation_of_bright,
 )
 from tests.support.streak_frames import rate_at, star_camera, star_frame
 
@@ -127,3 +132,120 @@ def test_counts_without_a_common_step_and_constant_ones_stay_as_they_are() -> No
         found, step, offset = in_steps(pixels)
         assert found is pixels
         assert (step, offset) == (1, 0)
+
+
+def test_box_sums_are_those_of_a_loop_and_follow_the_light_that_is_taken() -> None:
+    image = np.random.default_rng(4).integers(0, 50, (9, 14)).astype(np.int64)
+    expected = np.zeros_like(image)
+    for row in range(1, 8):
+        for column in range(1, 13):
+            expected[row, column] = image[row - 1 : row + 2, column - 1 : column + 2].sum()
+    assert box_sum(image).tolist() == expected.tolist()
+    pixels, taken = np.array([0, 20, 21, 90, 125]), np.array([3, 5, 7, 11, 13])
+    left = image.copy()
+    left.reshape(-1)[pixels] -= taken
+    assert less_boxes(box_sum(image).reshape(-1), (9, 14), pixels, taken).tolist() == (
+        box_sum(left).reshape(-1).tolist()
+    )
+
+
+def test_weights_interpolate_between_block_centres_and_are_constant_beyond() -> None:
+    weights = interpolation_weights(8, 2)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    # The centres of two blocks of four pixels are at 1.5 and 5.5.
+    np.testing.assert_allclose(weights[:, 1], [0.0, 0.0, 0.125, 0.375, 0.625, 0.875, 1.0, 1.0])
+
+
+def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> None:
+    """A line of 12 px along the first diagonal, each of its 12,001 points spread evenly over 1 px^2."""
+    rng = np.random.default_rng(5)
+    along = np.linspace(-6.0, 6.0, 12_001)
+    spread = rng.normal(0.0, 0.8, (2, len(along)))
+    spread -= spread.mean(axis=1, keepdims=True)
+    x, y = 40.0 + along * np.sqrt(0.5) + spread[0], 30.0 + along * np.sqrt(0.5) + spread[1]
+    light = np.full(len(along), 2.0)
+    owner = np.zeros(len(along), dtype=np.int64)
+    # The second region has light in one pixel, the third none.
+    both = np.append(owner, [1, 2])
+    found = moments(both, np.append(x, [7.0, 9.0]), np.append(y, [8.0, 9.0]), np.append(light, [4.0, 0.0]), 3)
+    assert found.flux.tolist() == pytest.approx([24_002.0, 4.0, 0.0])
+    assert found.centre[0] == pytest.approx([40.0, 30.0], abs=1e-9)
+    assert found.centre[1].tolist() == [7.0, 8.0]
+    assert found.centre[2].tolist() == [0.0, 0.0]
+    assert found.length[0] == pytest.approx(12.0, rel=0.02)
+    assert found.thickness[0] == pytest.approx(0.8, rel=0.02)
+    assert found.direction[0] == pytest.approx(0.25 * np.pi, abs=0.01)
+    assert found.length[1] == found.thickness[1] == 0.0
+
+
+def test_the_line_of_second_moments_has_their_length_and_direction() -> None:
+    axis = np.array([0.6, 0.8])
+    covariance = 5.0**2 / 12.0 * np.outer(axis, axis) + 0.49 * np.eye(2)
+    ends = line_of(np.array([10.0, 20.0]), covariance, 4.9)
+    np.testing.assert_allclose(ends.mean(axis=0), [10.0, 20.0])
+    assert np.abs(ends[1] - ends[0]) == pytest.approx(5.0 * axis)
+    assert line_of(np.array([10.0, 20.0]), covariance, 5.1).tolist() == [[10.0, 20.0]] * 2
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "hot"),
+    [
+        ([0.0] * 8, True),  # one bright pixel alone
+        ([17.9, 17.9, *[0.0] * 6], True),  # 15 % of 100 counts and three sigmas of 1 count are 18 counts
+        ([18.1, 18.1, *[0.0] * 6], False),
+        ([90.0, *[0.0] * 7], True),  # two bright pixels alone
+        ([90.0, 15.9, *[0.0] * 6], True),  # the third pixel is below 15 % of the brightest and one sigma
+        ([90.0, 16.1, *[0.0] * 6], False),
+    ],
+)
+def test_hot_pixels_are_one_or_two_bright_pixels_with_dark_neighbours(
+    neighbours: list[float], hot: bool
+) -> None:
+    light = np.array([100.0, *neighbours])
+    assert are_hot(light[:, None], np.ones(1)).tolist() == [hot]
+    assert are_hot(light[::-1, None], np.ones(1)).tolist() == [hot]
+
+
+def test_the_limit_of_a_faint_hot_pixel_is_a_fraction_of_its_light() -> None:
+    for second, hot in ((2.9, True), (3.1, False)):  # 30 % of 10 counts, at a noise of 1 count
+        assert are_hot(np.array([10.0, second, *[0.0] * 7])[:, None], np.ones(1)).tolist() == [hot]
+
+
+def test_hot_pixels_are_found_where_they_stand_and_nowhere_on_the_border() -> None:
+    signal = np.zeros((12, 15), dtype=np.float32)
+    signal[4, 6] = signal[0, 3] = signal[11, 14] = 100.0
+    signal[8:10, 9:11] = 100.0  # four in a square are not hot
+    row, column = find_hot_pixels(signal, np.ones_like(signal))
+    assert (row.tolist(), column.tolist()) == ([4], [6])
+    assert not len(find_hot_pixels(signal, np.full_like(signal, 13.0**2))[0])  # below eight sigmas
+
+
+def test_the_saturation_is_a_count_that_several_pixels_share() -> None:
+    pixels = np.random.default_rng(6).integers(0, 900, (60, 60)).astype(np.uint16)
+    pixels[pixels == 899] = 898
+    assert saturation_count(pixels) == (898.0 if np.count_nonzero(pixels == 898) >= 6 else 65_535.0)
+    pixels[0, :6] = 1000
+    assert saturation_count(pixels) == 1000.0
+    pixels[0, 0] = 0
+    assert saturation_count(pixels) == 65_535.0
+    assert saturation_count(np.full((4, 4), 7, dtype=np.uint8)) == 255.0
+
+
+def test_a_plateau_of_bright_counts_holds_more_pixels_than_the_counts_below_it() -> None:
+    frame = np.zeros((4, 4), dtype=np.uint16)
+    bright = np.concatenate([np.linspace(100.0, 900.0, 50), np.full(4, 1000.0)])
+    assert saturation_of_bright(bright, frame, None) == 1000.0
+    assert saturation_of_bright(bright, frame, 800.0) == 800.0
+    assert saturation_of_bright(bright[:-1], frame, None) == 65_535.0  # three pixels are too few
+    crowded = np.concatenate([bright, np.full(3, 995.0)])  # within 2 % of the range below the plateau
+    assert saturation_of_bright(crowded, frame, None) == 65_535.0
+    assert saturation_of_bright(np.zeros(0), frame, None) == 65_535.0
+
+
+def test_levels_between_counts_and_beyond_the_type_compare_as_numbers_do() -> None:
+    pixels = np.array([0, 9, 10, 255], dtype=np.uint8)
+    assert at_least(pixels, 9.5).tolist() == [False, False, True, True]
+    assert at_least(pixels, 10.0).tolist() == [False, False, True, True]
+    assert at_least(pixels, 256.0).tolist() == [False] * 4
+    assert at_least(pixels, -1.0).tolist() == [True] * 4
+    assert at_least(pixels.astype(float), 9.5).tolist() == [False, False, True, True]
