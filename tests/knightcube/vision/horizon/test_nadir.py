@@ -368,6 +368,20 @@ def test_two_cameras_outvote_a_third(level: Instant) -> None:
     assert error_deg(found, level.nadir) < 0.5
 
 
+def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_cameras() -> None:
+    """Either rim of the band in the third image may be the limb; the other cameras decide."""
+    tilted = instant(UW, np.array([-0.22, -0.38, 1.0]), np.array([0.8, 0.5, 0.3]), 12)
+    frames = {**tilted.frames, 2: np.minimum(tilted.frames[2], tilted.frames[2][::-1])}
+    knowledge = HorizonKnowledge(position=tilted.position)
+    alone = nadir_of_cameras({2: frames[2]}, UW, knowledge, JOINT_SETTINGS)
+    assert alone.status is HorizonStatus.AMBIGUOUS
+    found = nadir_of_cameras({k: frames[k] for k in (0, 1, 2)}, UW, knowledge, JOINT_SETTINGS)
+    assert found.each[2].nadir is not None
+    assert found.each[2].pixels_read > alone.each[2].pixels_read
+    assert sorted(found.cameras) == [0, 1, 2]
+    assert error_deg(found, tilted.nadir) < 0.1
+
+
 def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
     """The Earth's edge is 68 deg from nadir: a field of 33 deg half a side is full up to about 25 deg off."""
     boresight = VT[0].in_body(np.array([0.0, 0.0, 1.0]))
