@@ -277,17 +277,74 @@ def _misalignment(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> F
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisGuess:
-    """An axis (3,), which regions (n,) agree with it, and the regions as arcs about it."""
+    """The axis on which regions agree, and the n regions as arcs about it.
 
-    axis: FloatArray
+    Attributes:
+        agree: (n,) which regions agree with the axis.
+        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
+        height: (n,) cosine of the angle from the axis.
+        middle: (n,) rad, azimuth of the centre of light.
+        first: (n,) rad, lowest azimuth.
+        last: (n,) rad, highest azimuth.
+        width: (n,) rad, length by the second moment.
+        speed: (n,) px per rad of azimuth.
+        cut_first: (n,) whether the frame's border cuts the first end.
+        cut_last: (n,) whether the frame's border cuts the last end.
+    """
+
     agree: BoolArray
-    arcs: _Arcs
+    frame: FloatArray
+    height: FloatArray
+    middle: FloatArray
+    first: FloatArray
+    last: FloatArray
+    width: FloatArray
+    speed: FloatArray
+    cut_first: BoolArray
+    cut_last: BoolArray
 
 
 def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     """Return the axis on which the regions agree, None without one."""
     found = guess_axis(regions, pinhole)
-    return None if found is None else AxisGuess(*found, _arcs(regions, pinhole, found[0]))
+    if found is None:
+        return None
+    axis, agree = found
+    n, owner, light = len(regions), regions.owner, regions.light
+    middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
+    # Azimuth zero points to the image centre, or anywhere if the axis is there.
+    first = middle - (middle @ axis) * axis
+    if np.linalg.norm(first) < 1e-3:
+        first = np.eye(3)[int(np.argmin(np.abs(axis)))]
+        first = first - (first @ axis) * axis
+    first = first / np.linalg.norm(first)
+    frame = np.stack([first, np.cross(axis, first), axis])
+    points = np.stack([regions.column, regions.row], axis=-1).astype(float)
+    x, y, z = frame @ pinhole.unit_vectors(points).T
+    centre = np.einsum("ij,nj->ni", frame, pinhole.unit_vectors(regions.centre))
+    reference = np.arctan2(centre[:, 1], centre[:, 0])
+    azimuth = np.arctan2(y, x) - reference[owner]
+    azimuth = np.remainder(azimuth + np.pi, 2.0 * np.pi) - np.pi
+    flux = np.bincount(owner, light, n)
+    mean = np.bincount(owner, light * azimuth, n) / flux
+    square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
+    height = np.bincount(owner, light * z, n) / flux
+    speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
+    low, high = _outermost(azimuth, owner, n)
+    # The variance of a uniform arc is a twelfth of its length squared, plus that of the point spread.
+    width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
+    return AxisGuess(
+        agree,
+        frame,
+        height,
+        mean + reference,
+        azimuth[low] + reference,
+        azimuth[high] + reference,
+        width,
+        np.maximum(speed, 1.0),
+        _at_border(regions, pinhole, low),
+        _at_border(regions, pinhole, high),
+    )
 
 
 def motions_by_length(
@@ -298,12 +355,12 @@ def motions_by_length(
     `growth` is the relative change of the rate, see `measured_rate_change`.
     """
     guesses = []
-    for wide, contradicted in _angles(guess.arcs, regions, guess.agree):
+    for wide, contradicted in _angles(guess, regions):
         # The second moment of a path with a changing rate is slightly larger.
         angle = wide / np.sqrt(1.0 + growth**2 / 60.0)
-        stars, light = _stars_of_angle(guess.arcs, regions, guess.agree, pinhole, angle, most, growth)
+        stars, light = _stars_of_angle(guess, regions, pinhole, angle, most, growth)
         if len(light):
-            turn = guess.axis * angle
+            turn = guess.frame[2] * angle
             guesses.append(MotionGuess(CameraMotion(turn, growth * turn), stars, light, contradicted))
     return guesses
 
@@ -330,11 +387,10 @@ def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
     If the rate increases from zero to twice its mean, the centre of light lies a sixth of the length from the
     middle of the streak. The sign is positive if acceleration and rotation have the same sense.
     """
-    arcs = guess.arcs
-    whole = guess.agree & ~regions.cut & (arcs.width * arcs.speed > _LEAST_LENGTH)
+    whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
         return 0.0
-    off = (arcs.middle - 0.5 * (arcs.first + arcs.last))[whole] / arcs.width[whole]
+    off = (guess.middle - 0.5 * (guess.first + guess.last))[whole] / guess.width[whole]
     growth = 12.0 * float(np.median(off))
     return float(np.clip(growth, -2.0, 2.0)) if abs(growth) > _LEAST_GROWTH else 0.0
 
@@ -343,77 +399,12 @@ def motions_by_scan(
     guess: AxisGuess, frame: ReducedFrame, pinhole: Pinhole, most: int, near: float | None
 ) -> Iterator[MotionGuess]:
     """Yield guesses from the light along circles about the axis, see `scan_angles`."""
-    arcs = guess.arcs
     chosen = np.flatnonzero(guess.agree)[:SCANNED_STARS]
-    circles = Circles(arcs.frame, arcs.height[chosen], arcs.middle[chosen])
+    circles = Circles(guess.frame, guess.height[chosen], guess.middle[chosen])
     for candidate in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
         if len(candidate.light):
-            motion = CameraMotion.steady(guess.axis * candidate.angle)
+            motion = CameraMotion.steady(guess.frame[2] * candidate.angle)
             yield MotionGuess(motion, candidate.stars[:most], candidate.light[:most], 0.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Arcs:
-    """Regions as arcs about an axis.
-
-    Attributes:
-        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
-        height: (n,) cosine of the angle from the axis.
-        middle: (n,) rad, azimuth of the centre of light.
-        first: (n,) rad, lowest azimuth.
-        last: (n,) rad, highest azimuth.
-        width: (n,) rad, length by the second moment.
-        speed: (n,) px per rad of azimuth.
-        cut_first: (n,) whether the frame's border cuts the first end.
-        cut_last: (n,) whether the frame's border cuts the last end.
-    """
-
-    frame: FloatArray
-    height: FloatArray
-    middle: FloatArray
-    first: FloatArray
-    last: FloatArray
-    width: FloatArray
-    speed: FloatArray
-    cut_first: BoolArray
-    cut_last: BoolArray
-
-
-def _arcs(regions: BrightRegions, pinhole: Pinhole, axis: FloatArray) -> _Arcs:
-    n, owner, light = len(regions), regions.owner, regions.light
-    middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # Azimuth zero points to the image centre, or anywhere if the axis is there.
-    first = middle - (middle @ axis) * axis
-    if np.linalg.norm(first) < 1e-3:
-        first = np.eye(3)[int(np.argmin(np.abs(axis)))]
-        first = first - (first @ axis) * axis
-    first = first / np.linalg.norm(first)
-    frame = np.stack([first, np.cross(axis, first), axis])
-    points = np.stack([regions.column, regions.row], axis=-1).astype(float)
-    x, y, z = frame @ pinhole.unit_vectors(points).T
-    centre = np.einsum("ij,nj->ni", frame, pinhole.unit_vectors(regions.centre))
-    reference = np.arctan2(centre[:, 1], centre[:, 0])
-    azimuth = np.arctan2(y, x) - reference[owner]
-    azimuth = np.remainder(azimuth + np.pi, 2.0 * np.pi) - np.pi
-    flux = np.bincount(owner, light, n)
-    mean = np.bincount(owner, light * azimuth, n) / flux
-    square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
-    height = np.bincount(owner, light * z, n) / flux
-    speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
-    low, high = _outermost(azimuth, owner, n)
-    # The variance of a uniform arc is a twelfth of its length squared, plus that of the point spread.
-    width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
-    return _Arcs(
-        frame,
-        height,
-        mean + reference,
-        azimuth[low] + reference,
-        azimuth[high] + reference,
-        width,
-        np.maximum(speed, 1.0),
-        _at_border(regions, pinhole, low),
-        _at_border(regions, pinhole, high),
-    )
 
 
 def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
@@ -436,25 +427,25 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
     return np.asarray(~(inside_x & inside_y))
 
 
-def _angles(arcs: _Arcs, regions: BrightRegions, agree: BoolArray) -> list[tuple[float, float]]:
+def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
     """Return the likeliest angles (rad), each with the fraction of light in regions longer than it."""
-    whole = agree & ~regions.cut & (arcs.width > 0.0)
-    candidates, weight = arcs.width[whole], np.sqrt(regions.flux[whole])
-    spread = _LENGTH_ERROR / arcs.speed[whole] + _LENGTH_SHARE * candidates
-    joined = _joined(arcs, regions, agree)
+    whole = guess.agree & ~regions.cut & (guess.width > 0.0)
+    candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
+    spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates
+    joined = _joined(guess, regions)
     candidates = np.append(candidates, joined[:, 0])
     spread, weight = np.append(spread, joined[:, 1]), np.append(weight, joined[:, 2])
-    cut = agree & regions.cut
-    reach = np.abs(arcs.last - arcs.first)
+    cut = guess.agree & regions.cut
+    reach = np.abs(guess.last - guess.first)
     if not len(candidates):
         return [(float(np.max(reach[cut])), 0.0)] if cut.any() else []
     nearness = np.exp(-0.5 * ((candidates[:, None] - candidates) / np.hypot(spread[:, None], spread)) ** 2)
     votes = nearness @ weight
     # A region longer than the angle contradicts it, or consists of two stars.
-    long = agree & (arcs.speed * reach > 20.0)
-    longer = (reach - 10.0 / arcs.speed)[long] > candidates[:, None] + 3.0 * spread[:, None]
+    long = guess.agree & (guess.speed * reach > 20.0)
+    longer = (reach - 10.0 / guess.speed)[long] > candidates[:, None] + 3.0 * spread[:, None]
     doubted = votes - longer @ np.sqrt(regions.flux[long])
-    against = longer @ regions.flux[long] / max(float(regions.flux[agree].sum()), 1e-9)
+    against = longer @ regions.flux[long] / max(float(regions.flux[guess.agree].sum()), 1e-9)
     each = weight / spread**2
     angle = (nearness @ (each * candidates)) / (nearness @ each)
     chosen: list[tuple[float, float]] = []
@@ -469,45 +460,39 @@ def _angles(arcs: _Arcs, regions: BrightRegions, agree: BoolArray) -> list[tuple
     return chosen
 
 
-def _joined(arcs: _Arcs, regions: BrightRegions, agree: BoolArray) -> FloatArray:
+def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
     """Return angle, error and weight (k, 3) of pairs of neighbouring fragments on one circle."""
-    part = np.flatnonzero(agree & ~regions.cut)
-    sine = np.sqrt(np.maximum(1.0 - arcs.height[part] ** 2, 1e-12))
+    part = np.flatnonzero(guess.agree & ~regions.cut)
+    sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
     # Scale from a difference of `height` to px across: d(cos) = -sin d(angle), and speed is px per azimuth.
-    scale = arcs.speed[part] / sine**2
-    near = np.abs(arcs.height[part, None] - arcs.height[part]) * scale < _SAME_CIRCLE
-    gap = arcs.first[part][None, :] - arcs.last[part][:, None]
-    extent = arcs.last[part][None, :] - arcs.first[part][:, None]
+    scale = guess.speed[part] / sine**2
+    near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
+    gap = guess.first[part][None, :] - guess.last[part][:, None]
+    extent = guess.last[part][None, :] - guess.first[part][:, None]
     i, j = np.nonzero(near & (gap > 0.0) & (gap < 0.5 * extent))
-    angle = extent[i, j] - 4.0 / arcs.speed[part[i]]
+    angle = extent[i, j] - 4.0 / guess.speed[part[i]]
     weight = 0.5 * np.sqrt(np.minimum(regions.flux[part[i]], regions.flux[part[j]]))
-    spread = 2.0 / arcs.speed[part[i]] + _LENGTH_SHARE * np.abs(angle)
+    spread = 2.0 / guess.speed[part[i]] + _LENGTH_SHARE * np.abs(angle)
     return np.stack([angle, spread, weight], axis=-1)[angle > 0.0]
 
 
 def _stars_of_angle(
-    arcs: _Arcs,
-    regions: BrightRegions,
-    agree: BoolArray,
-    pinhole: Pinhole,
-    angle: float,
-    most: int,
-    growth: float,
+    guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, angle: float, most: int, growth: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return centres (n, 2) px and light (n,) of the streaks of the brightest regions that fit the angle."""
-    spread = _LENGTH_ERROR / arcs.speed + _LENGTH_SHARE * angle
-    whole = agree & ~regions.cut & (np.abs(arcs.width - angle) < 4.0 * spread)
-    reach = np.abs(arcs.last - arcs.first)
-    one = arcs.cut_first ^ arcs.cut_last
-    cut = agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
+    spread = _LENGTH_ERROR / guess.speed + _LENGTH_SHARE * angle
+    whole = guess.agree & ~regions.cut & (np.abs(guess.width - angle) < 4.0 * spread)
+    reach = np.abs(guess.last - guess.first)
+    one = guess.cut_first ^ guess.cut_last
+    cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
     # The end inside the frame gives the centre of a cut streak; a region extends about 2 px beyond an end.
-    past = 2.0 / arcs.speed
-    middle = np.where(arcs.cut_first, arcs.last - past - 0.5 * angle, arcs.first + past + 0.5 * angle)
-    middle = np.where(whole, arcs.middle - growth / 12.0 * angle, middle)
+    past = 2.0 / guess.speed
+    middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
+    middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)
     part = np.where(whole, 1.0, np.clip(reach / angle, 0.1, 1.0))
     chosen = np.flatnonzero(whole | cut)[:most]
-    sine = np.sqrt(np.maximum(1.0 - arcs.height[chosen] ** 2, 0.0))
-    local = np.stack([sine * np.cos(middle[chosen]), sine * np.sin(middle[chosen]), arcs.height[chosen]])
-    pixel = pinhole.project((arcs.frame.T @ local).T)
+    sine = np.sqrt(np.maximum(1.0 - guess.height[chosen] ** 2, 0.0))
+    local = np.stack([sine * np.cos(middle[chosen]), sine * np.sin(middle[chosen]), guess.height[chosen]])
+    pixel = pinhole.project((guess.frame.T @ local).T)
     seen = np.isfinite(pixel).all(axis=1)
     return pixel[seen], (regions.flux / part)[chosen][seen]
