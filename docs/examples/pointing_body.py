@@ -278,7 +278,7 @@ class PointingControl(BodyControl):
         self.paths = self.planner = direct
         self.targets = Attitudes(config, direct)
         self.tracker = CrossProductTracker(config, surrounding_field(config))
-        self.brake = detumbling_law(config, plant_of(config))
+        self.detumbling = detumbling_law(config, plant_of(config))
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:

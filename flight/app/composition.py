@@ -16,7 +16,7 @@ from flight.link.telemetry.log import Recorder
 from flight.loop import horizon_cameras as horizon_task
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, BodyKind, FlightBody
-from flight.loop.commanding import CommandTask, ParameterTable
+from flight.loop.commanding import CommandTask, OnboardParameters
 from flight.loop.control_cycle import LoopTasks
 from flight.loop.executive import JobRunner, Worker
 from flight.loop.facts import EventLog, Facts, Services, Streams, streams_of
@@ -211,10 +211,11 @@ def _tasks(
     )
     navigation = Navigation(devices.unit, body.estimation, ages, services)
     imaging = _imaging(config, opened, navigation, body, services)
-    wide = None
-    if config.wide_cameras and devices.wide and body.estimation.wide is not None:
+    horizon_cameras = None
+    if config.wide_cameras and devices.horizon_cameras and body.estimation.horizon_cameras is not None:
         times = horizon_camera_settings(config.wide_cameras)
-        wide = HorizonCameraTask(devices.wide, body.estimation.wide, times, services)
+        use = body.estimation.horizon_cameras
+        horizon_cameras = HorizonCameraTask(devices.horizon_cameras, use, times, services)
     limits = np.full(3, config.coils.current_limit)
     coils = CoilDriveSettings(body.control.dipole_per_ampere, limits, body.control.free_axis)
     drive = CoilDrive(devices.coils, devices.power, body.estimation.coil_monitor, coils, services)
@@ -225,8 +226,8 @@ def _tasks(
     busy = [(PLANNER, planner.busy_since_ns, config.executive.planner_timeout)]
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, config.executive.vision_timeout))
-    if wide is not None:
-        busy.append((horizon_task.WORKER, wide.busy_since_ns, config.executive.vision_timeout))
+    if horizon_cameras is not None:
+        busy.append((horizon_task.WORKER, horizon_cameras.busy_since_ns, config.executive.vision_timeout))
     watches = [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
     health = HealthWatch(modes, drive, devices.power, watches, config.health, opened.feed, services)
     housekeeping = Housekeeping(
@@ -234,14 +235,14 @@ def _tasks(
     )
     commanding = None
     if opened.channels or config.commands.timeline:
-        table = ParameterTable(config, (modes.adopt, drive.adopt), health.adopt, keeper, services)
+        table = OnboardParameters(config, (modes.adopt, drive.adopt), health.adopt, keeper, services)
         commanding = CommandTask(modes, drive, table, config.commands.timeline, opened.channels, services)
     return LoopTasks(
         navigation=navigation,
         imaging=imaging,
         positioning=_positioning(config, devices, body, services),
         sun=_sun(config, devices, body, services),
-        wide=wide,
+        horizon_cameras=horizon_cameras,
         modes=modes,
         steering=steering,
         drive=drive,

@@ -111,7 +111,7 @@ class Devices:
     camera: FrameSource | None
     gps: GpsReceiver | None = None
     strings: SolarStrings | None = None
-    wide: tuple[FrameSource, ...] = ()
+    horizon_cameras: tuple[FrameSource, ...] = ()
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:

@@ -328,14 +328,14 @@ class BodyEstimation(Protocol):
         feed: passes the readings of the inertial unit to the filter.
         coil_monitor: detects broken coils.
         learned_problems: why parameters that an earlier boot learned were rejected.
-        wide: makes jobs of the horizon cameras' frames and accepts the results; None without these cameras.
+        horizon_cameras: use of the horizon cameras' frames; None without these cameras.
     """
 
     filter: Filter
     feed: ReadingFeed
     coil_monitor: CoilMonitor
     learned_problems: list[str]
-    wide: HorizonCameraUse | None = None
+    horizon_cameras: HorizonCameraUse | None = None
 
     def field(self, estimate: Estimate) -> FloatArray:
         """Return the magnetic field (3,) T in body axes at an estimate, for the reallocation of currents."""
@@ -380,7 +380,7 @@ class BodyControl(Protocol):
         modes: the modes that this body has.
         dipole_per_ampere: n A of each coil, m^2.
         free_axis: (3,) the only axis about which the body can rotate; None for a free body.
-        brake: the law of detumbling.
+        detumbling: the law of detumbling.
         sun_acquisition: turns the body to the Sun without an attitude, in SAFE; None if the body cannot.
     """
 
@@ -391,7 +391,7 @@ class BodyControl(Protocol):
     planner: Planner
     paths: FlownPaths
     tracker: Tracker
-    brake: WindowedLaw
+    detumbling: WindowedLaw
     sun_acquisition: WindowedLaw | None = None
 
     def follows_objects(self) -> bool:

@@ -55,7 +55,7 @@ PROVEN_NS = 60_000_000_000
 """Flight time (ns) after which a loaded table stays even if the flight ends uncleanly."""
 
 
-class ParameterTable:
+class OnboardParameters:
     """The table of parameters in force."""
 
     def __init__(
@@ -167,7 +167,7 @@ class CommandTask:
         self,
         modes: ModeControl,
         drive: CoilDrive,
-        parameters: ParameterTable,
+        parameters: OnboardParameters,
         timeline: Sequence[CommandStep],
         channels: Sequence[Channel],
         services: Services,

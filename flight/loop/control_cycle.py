@@ -44,7 +44,7 @@ class LoopTasks:
     imaging: Imaging | None
     positioning: Positioning | None
     sun: SunSensing | None
-    wide: HorizonCameraTask | None
+    horizon_cameras: HorizonCameraTask | None
     modes: ModeControl
     steering: Steering
     drive: CoilDrive
@@ -161,8 +161,8 @@ class ControlCycle:
                 continue
             if result.worker == imaging_task.WORKER and tasks.imaging is not None:
                 tasks.imaging.finish(result, now_ns)
-            elif result.worker == horizon_task.WORKER and tasks.wide is not None:
-                tasks.wide.finish(result, now_ns)
+            elif result.worker == horizon_task.WORKER and tasks.horizon_cameras is not None:
+                tasks.horizon_cameras.finish(result, now_ns)
             self._estimate(record)
         record.measured = record.estimate if self._was_measured else None
 

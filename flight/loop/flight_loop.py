@@ -189,7 +189,7 @@ class FlightLoop:
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
             tasks.imaging.begin(epoch_ns)
-        for sensing in (tasks.positioning, tasks.sun, tasks.wide):
+        for sensing in (tasks.positioning, tasks.sun, tasks.horizon_cameras):
             if sensing is not None:
                 sensing.begin(epoch_ns)
         if tasks.commanding is not None:
@@ -243,7 +243,7 @@ class FlightLoop:
     def _keep_house(self, cycle: Cycle) -> None:
         now_ns, output = cycle.start_ns, self._output
         state = output.steered.state if output is not None else SteeringState.OFF
-        for sensing in (self._tasks.positioning, self._tasks.sun, self._tasks.wide):
+        for sensing in (self._tasks.positioning, self._tasks.sun, self._tasks.horizon_cameras):
             if sensing is not None:
                 sensing.run(now_ns)
         self._tasks.housekeeping.run(cycle, state)

@@ -206,7 +206,7 @@ class Steering:
 
     def begin_detumbling(self, now_ns: int) -> None:
         """Begin the measuring and acting windows of detumbling."""
-        self._body.control.brake.begin(now_ns)
+        self._body.control.detumbling.begin(now_ns)
 
     def begin_sun_acquisition(self, now_ns: int) -> None:
         """Begin the windows of Sun acquisition, if the body has it."""
@@ -215,7 +215,7 @@ class Steering:
 
     def detumble(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
         """Detumble in this cycle; `current` is whether the newest reading is within its age limit."""
-        return self._run_law(self._body.control.brake, readings, current, now_ns)
+        return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
         """Turn to the Sun in this cycle, without an attitude; rest if the body has no Sun acquisition."""

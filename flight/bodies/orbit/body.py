@@ -72,7 +72,7 @@ class OrbitView:
 
     def __init__(
         self,
-        brake: FieldDetumblingLaw,
+        detumbling: FieldDetumblingLaw,
         filter_: OrbitFilter,
         environment: EstimatedEnvironment,
         services: Services,
@@ -82,11 +82,11 @@ class OrbitView:
         self._events = services.events
         self._facts = services.facts
         self._knowledge = Knowledge.LOST
-        self._detumbler = brake.detumbler
+        self._detumbler = detumbling.detumbler
         self._recorder = services.recorder
 
     def record_cycle(self, output: ControlOutput) -> None:
-        """Record how well the attitude is known, and the spin packet while the body is braked."""
+        """Record how well the attitude is known, and the spin packet during detumbling."""
         self._record_knowledge(output)
         if output.mode is not Mode.DETUMBLE or output.cycle.slot % SPIN_EVERY:
             return
@@ -171,7 +171,7 @@ class SatelliteEstimation(BodyEstimation):
         self._sun = _sun(config, self.orbit_filter, self.environment)
         self.sun_acquisition = _sun_acquisition(config, services)
         if config.wide_cameras:
-            self.wide = horizon_camera_feed(
+            self.horizon_cameras = horizon_camera_feed(
                 config.wide_cameras, self.orbit_filter, self.environment, self._sun
             )
 
@@ -237,7 +237,7 @@ class SatelliteControl(BodyControl):
         self.targets = PointingTargets(timed, paths, config.looks_for_objects())
         self.tracker = _tracker(config, filter_, environment)
         detumbler = _detumbler(config, filter_, environment)
-        self.brake = self.field_detumbling = FieldDetumblingLaw(detumbler, self.dipole_per_ampere)
+        self.detumbling = self.field_detumbling = FieldDetumblingLaw(detumbler, self.dipole_per_ampere)
         self.sun_acquisition = estimation.sun_acquisition
 
     def follows_objects(self) -> bool:

@@ -1,4 +1,4 @@
-"""Coarse directions: solar cells with the magnetic field, and Sun and nadir of the wide cameras.
+"""Coarse directions: solar cells with the magnetic field, and Sun and nadir of the horizon cameras.
 
 They start the filter without a star, and update it while it is not fine.
 

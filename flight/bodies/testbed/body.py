@@ -212,7 +212,7 @@ class TestbedControl(BodyControl):
         self.planner = self.planning = Planning(plant, settings, guidance, reader, services)
         self.targets = ThreadTargets(steps, reader, guidance, self.planning)
         self.tracker = _tracker(config, plant, reader, cage)
-        self.brake = detumbling_law(config, plant)
+        self.detumbling = detumbling_law(config, plant)
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:

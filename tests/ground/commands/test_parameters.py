@@ -16,7 +16,7 @@ from flight.link.commands import LoadParameters, unpack
 from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer
-from flight.loop.commanding import ParameterTable
+from flight.loop.commanding import OnboardParameters
 from flight.loop.facts import EventLog, Facts, Services, Streams
 from flight.schema.sections import Health, Modes
 from tests.support.flights import demo_config
@@ -39,7 +39,7 @@ class Answering:
         events = EventLog(recorder.event)
         services = Services(None, None, recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no clock, no jobs
         adopt_modes, adopt_health = (self.modes.append,), self.health.append
-        self.task = ParameterTable(demo_config(4.0), adopt_modes, adopt_health, None, services)
+        self.task = OnboardParameters(demo_config(4.0), adopt_modes, adopt_health, None, services)
         self.task.begin(0)
         self._recorder = recorder
         self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
