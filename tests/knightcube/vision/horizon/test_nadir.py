@@ -379,7 +379,7 @@ def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_camera
     assert found.each[2].nadir is not None
     assert found.each[2].pixels_read > alone.each[2].pixels_read
     assert sorted(found.cameras) == [0, 1, 2]
-    assert error_deg(found, tilted.nadir) < 0.1
+    assert error_deg(found, tilted.nadir) < 0.3
 
 
 def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:

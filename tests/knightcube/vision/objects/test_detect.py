@@ -32,6 +32,8 @@ from knightcube.vision.objects.detect import (
     star_ends,
 )
 from knightcube.vision.objects.settings import EndpointSettings, ObjectSettings
+from knightcube.vision.objects.star_light import StarLight
+from knightcube.vision.objects.streak_ends import measure_streaks, segment_frame
 from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
@@ -457,3 +459,17 @@ def test_a_crowded_sky_at_rest_or_nearly_so_has_an_attitude(right: float, up: fl
     assert found.objects is not None
     assert not len(found.objects.points)
     assert EXPOSURE * turn[1] * CAMERA.pinhole.focal_length < 1.6
+
+
+def test_a_star_is_explained_as_well_without_an_object_as_with_one() -> None:
+    pixels = frame_with(_FRAME_CAMERA, _ROTATION, 1.0, 5, [], _FAINTEST)
+    segmented = segment_frame(pixels, _SETTINGS)
+    streaks = measure_streaks(segmented, _SETTINGS)
+    turn = _turn(pixels, _ROTATION, 1.0)
+    for ends in streaks.endpoints[:3]:
+        light = StarLight(segmented, ends, turn, _FRAME_CAMERA.pinhole, 1.0, 1.0, np.inf)
+        found = light.explain(ends)
+        assert found.chi_square <= light.chi_square
+        assert found.misfit <= found.misfit_of_stars * 1.05
+        assert found.misfit_of_stars < 2.5
+        assert light.chi_square < 2.5 * light.pixels
