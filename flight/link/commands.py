@@ -330,7 +330,7 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
         value = fields[field.name]
         if field.states and value not in dict(field.states):
             allowed = ", ".join(f"{number} {label}" for number, label in field.states)
-            raise CommandError(f"{field.name} = {value} is not to be commanded so: one of {allowed}")
+            raise CommandError(f"{field.name} = {value} cannot be commanded: use one of {allowed}")
         if field.valid is not None and not field.valid[0] <= value <= field.valid[1]:  # NaN compares false
             low, high = field.valid
             raise CommandError(f"{field.name} = {value} must lie within {low:g} to {high:g}")
@@ -359,7 +359,7 @@ def unpack(data: bytes) -> Command:
     Raises MalformedError for bytes that are not a command packet and CommandError for invalid values.
     """
     if len(data) < HEADER_BYTES:
-        raise MalformedError(f"{len(data)} bytes are no packet")
+        raise MalformedError(f"{len(data)} bytes are too short for a packet")
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
     if layout is None:
         raise MalformedError(f"no command begins with 0x{int.from_bytes(data[:2], 'big'):04x}")
@@ -387,7 +387,7 @@ def command_of_words(text: str) -> Command:
     """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:
-        raise CommandError(f"{name!r} is no command: {', '.join(LAYOUTS)}")
+        raise CommandError(f"{name!r} is not a command: use {', '.join(LAYOUTS)}")
     packet = LAYOUTS[name].packet
     fields: dict[str, Any] = {}
     for field in packet.fields:
@@ -398,7 +398,7 @@ def command_of_words(text: str) -> Command:
         numbers = [_number(field, word) for word in [*taken, *[""] * (field.count - len(taken))]]
         fields[field.name] = numbers if field.count > 1 else numbers[0]
     if words:
-        raise CommandError(f"{text}: nothing is to stand behind {packet.fields[-1].name}")
+        raise CommandError(f"{text}: unexpected words after {packet.fields[-1].name}")
     command = command_of(packet, fields)
     CommandPacker().pack(command, 0)
     return command
@@ -569,7 +569,7 @@ def _bound_unix(path: Path) -> socket.socket:
     try:
         with contextlib.suppress(FileNotFoundError):
             if not stat.S_ISSOCK(path.lstat().st_mode):
-                raise OSError("something else stands there")
+                raise OSError("another file has this path")
             if _is_served(path):
                 raise OSError("another flight listens there")
             path.unlink()

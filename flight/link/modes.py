@@ -38,7 +38,7 @@ class Mode(IntEnum):
         for mode in cls:
             if mode.label == label:
                 return mode
-        raise ValueError(f"{label!r} is no mode: {', '.join(mode.label for mode in cls)}")
+        raise ValueError(f"{label!r} is not a mode: use {', '.join(mode.label for mode in cls)}")
 
 
 COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO, Mode.SUN, Mode.POINT)

@@ -225,8 +225,8 @@ class Refusal(Enum):
     """Cause of the refusal of a frame."""
 
     CRC = "its CRC is wrong"
-    HEADER = "it is no frame of this spacecraft"
-    SPI = "there is no association of its SPI"
+    HEADER = "it is not a frame of this spacecraft"
+    SPI = "its SPI has no association"
     LOST = "the counter of its SPI is lost"
     MAC = "its MAC is wrong"
     REPEATED = "its counter was used"

@@ -124,7 +124,7 @@ def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse)
     for index, string in enumerate(strings.strings):
         place = f"solar_strings.strings[{index}]"
         if string.address in others:
-            refuse(f"{place}.address", f"is 0x{string.address:02x}, another part's on the same bus")
+            refuse(f"{place}.address", f"is 0x{string.address:02x}, the address of another chip on the bus")
         if (string.address, string.channel) in inputs:
             refuse(f"{place}.channel", f"is {string.channel}: another string is measured there")
         inputs.add((string.address, string.channel))

@@ -168,7 +168,9 @@ class ServedCamera:
             self._device.expose(exposure_ns, trigger_ns)
         frame = self._device.collect()
         if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:
-            raise NotResponding(self.name, "no frame came after the trigger: is it the camera or its cable?")
+            raise NotResponding(
+                self.name, "no frame arrived after the trigger: check the camera and its cable"
+            )
         return frame
 
     def _reopened(self) -> bool:

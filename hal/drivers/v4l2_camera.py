@@ -546,7 +546,7 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
     if error.errno == errno.EBUSY:
         return Refused(name, f"busy while {doing}: another program has the camera")
     if error.errno == errno.ENOTTY:
-        return Refused(name, f"is no V4L2 device (found {doing})")
+        return Refused(name, f"is not a V4L2 device (found {doing})")
     return NotResponding(name, f"failed while {doing}: {os.strerror(error.errno or errno.EIO)}")
 
 

@@ -132,7 +132,7 @@ class Verification:
         if wanted is None:
             return [*reports, report(sent, Stage.COMPLETED, sent.command.text)]
         if self._open is not None:
-            reports.append(report(self._open[0], Stage.FAILED, f"then came: {sent.command.text}"))
+            reports.append(report(self._open[0], Stage.FAILED, f"replaced by: {sent.command.text}"))
         self._open = (sent, wanted, int(row["time_ns"]))
         if int(row["mode"]) == wanted and not isinstance(sent.command, Slew):
             reports += self._close(Stage.COMPLETED, f"mode {wanted.label}")
@@ -434,7 +434,7 @@ def utc_of(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:
-        raise CommandError(f"{text!r} is no UTC such as 2026-11-23T21:00:00") from error
+        raise CommandError(f"{text!r} is not a UTC such as 2026-11-23T21:00:00") from error
     time = time.replace(tzinfo=UTC) if time.tzinfo is None else time
     utc_ns = round(time.timestamp()) * SECOND_NS
     if utc_ns > HIGHEST:

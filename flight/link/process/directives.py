@@ -260,7 +260,7 @@ def unpack(data: bytes) -> Directive | None:
             values[one.name] = bytes(raw.tolist()) if one.count > 1 else raw.item()
     directive: Directive = _KINDS[layout.packet.name](**values)
     if isinstance(directive, Play) and not directive.begin <= directive.end:  # NaN compares false
-        raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is no stretch of time")
+        raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is not an interval of time")
     if values.get("entity", GROUND) not in dict(_ENTITY.states):
         raise CommandError(f"entity {values['entity']} does not receive files")
     return directive

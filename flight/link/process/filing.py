@@ -170,7 +170,7 @@ class Filing:
             return f"{metadata.name}: names are KIND/NAME, KIND one of {', '.join(KINDS)}"
         taken = sum(path.stat().st_size for path in self._store.received.rglob("*") if path.is_file())
         if taken + metadata.size > MOST_RECEIVED:
-            return f"{taken} of {MOST_RECEIVED} bytes are taken: delete what is not needed"
+            return f"{taken} of {MOST_RECEIVED} bytes are in use: delete files that are not needed"
         return ""
 
     def _write_listing(self, under: str) -> Path:

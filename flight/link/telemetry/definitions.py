@@ -139,7 +139,7 @@ def problem_of(values: Mapping[str, float]) -> str:
     if lacking := [key for key in PARAMETER_KEYS if key not in values]:
         return f"{lacking[0]} is missing: a table is loaded as a whole"
     if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
-        return f"{unknown[0]} is no parameter: {', '.join(PARAMETER_KEYS)}"
+        return f"{unknown[0]} is not a parameter: use {', '.join(PARAMETER_KEYS)}"
     for key, parameter in zip(PARAMETER_KEYS, PARAMETER_FIELDS, strict=True):
         low, high = parameter.valid or (-math.inf, math.inf)
         if not low <= values[key] <= high:  # NaN compares false

@@ -93,8 +93,8 @@ def check(settings: Vn100Settings, baud_rate: int) -> None:
     if settings.rate_hz not in possible:
         raise Refused(
             DEVICE,
-            f"rate_hz = {settings.rate_hz} is no {settings.output} output rate of the unit; "
-            f"it has {', '.join(map(str, possible))}",
+            f"rate_hz = {settings.rate_hz} is not an output rate of {settings.output} packets; "
+            f"possible are {', '.join(map(str, possible))}",
         )
     load = settings.rate_hz * length * 10 / baud_rate
     if load > _LINE_LOAD_LIMIT:
@@ -142,7 +142,7 @@ def set_up(settings: Vn100Settings) -> Dialogue:
     """Set the unit up in its volatile memory; its flash is not written."""
     model = yield Question("RRG", (1,))
     if not model or not model[0].startswith("VN-100"):
-        raise Refused(DEVICE, f"the unit calls itself {','.join(model)!r}: this line needs a VN-100")
+        raise Refused(DEVICE, f"the unit reports the model {','.join(model)!r}: this line needs a VN-100")
     yield from _write(6, 0)
     # The unit's own hard and soft iron estimation would mistake the coils' field for the unit's.
     yield from _write(44, 0, 1, 5)
@@ -170,14 +170,14 @@ def _write(register: int, *values: object) -> Dialogue:
     base16 = 75 <= register <= 77
     if len(echo) != len(asked) or not all(_same(a, b, base16) for a, b in zip(asked, echo, strict=True)):
         wanted, found = ",".join(asked), ",".join(echo)
-        raise Refused(DEVICE, f"register {register} was to be {wanted}, the unit answered {found}")
+        raise Refused(DEVICE, f"register {register} should be {wanted}, but the unit answered {found}")
 
 
 def _switch_off(register: int) -> Dialogue:
     """Switch a binary output off; the remaining fields do not matter then."""
     echo = yield Question("WRG", (register, 0, 20, "01", "0001"))
     if not echo or not _same("0", echo[0], True):
-        raise Refused(DEVICE, f"register {register} was to be off, the unit answered {','.join(echo)}")
+        raise Refused(DEVICE, f"register {register} should be off, but the unit answered {','.join(echo)}")
 
 
 def _same(asked: str, echoed: str, base16: bool) -> bool:
@@ -653,7 +653,8 @@ class Vn100:
             return CorruptData(DEVICE, f"{tried} but {self._unit_error}: the line to the unit is noisy")
         if link.packets == before.packets:
             return CorruptData(
-                DEVICE, f"{tried}; {received} bytes came, none made sense: check the baud rate (register 5)"
+                DEVICE,
+                f"{tried}; {received} bytes arrived, but no valid packet: check the baud rate (register 5)",
             )
         return NotResponding(
             DEVICE, f"{tried}, though its output arrives: check the wire from the host's TX to the unit's RX"

@@ -148,5 +148,5 @@ def test_a_way_back_to_boot_is_refused() -> None:
 
 def test_labels_lead_back_to_their_modes() -> None:
     assert [Mode.named(mode.label) for mode in Mode] == list(Mode)
-    with pytest.raises(ValueError, match="'fly' is no mode: boot, safe"):
+    with pytest.raises(ValueError, match="'fly' is not a mode: use boot, safe"):
         Mode.named("fly")

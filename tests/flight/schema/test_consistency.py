@@ -80,7 +80,11 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
     ("right", "wrong", "complaint"),
     [
         ("channel: 1}", "channel: 0}", r"`solar_strings.strings\[1\].channel` is 0: another string"),
-        ("channel: 0}", "channel: 0, address: 0x40}", r"strings\[0\].address` is 0x40, another part's"),
+        (
+            "channel: 0}",
+            "channel: 0, address: 0x40}",
+            r"strings\[0\].address` is 0x40, the address of another chip",
+        ),
         ("{normal: [1.0,", "{normal: [1.1,", r"strings\[0\].normal` has length 1.1: give a unit vector"),
         (
             "[0.0, 0.0, 0.0, 1.0], columns",

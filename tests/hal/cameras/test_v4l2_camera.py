@@ -237,7 +237,7 @@ def test_a_camera_that_stands_still_is_opened_again(kernel: IoctlCamera, clock: 
     kernel.stopped = True
     video.camera.trigger(EXPOSURE_NS)
     assert video.rig.frame_within(3 * SECOND_NS) is None
-    with pytest.raises(NotResponding, match="no frame came after the trigger"):
+    with pytest.raises(NotResponding, match="no frame arrived after the trigger"):
         video.rig.frame_within(SECOND_NS)
     kernel.stopped = False
     video.rig.wait(SECOND_NS)
@@ -341,7 +341,7 @@ def test_what_is_no_video_device_is_refused(tmp_path: Path, clock: ManualClock) 
     path = tmp_path / "file"
     path.write_bytes(b"")
     kernel = IoctlCamera(tmp_path, clock.now_ns)  # which the binding does not see: it asks the real kernel
-    with pytest.raises(Refused, match="is no V4L2 device"):
+    with pytest.raises(Refused, match="is not a V4L2 device"):
         video_rig(kernel, clock, path=str(path))
     kernel.close()
 

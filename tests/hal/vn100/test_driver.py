@@ -166,7 +166,7 @@ def test_silence_is_not_responding_and_names_what_was_tried() -> None:
 def test_a_wrong_baud_rate_is_corrupt_data() -> None:
     bench = bench_line()
     bench.line.host.set_baud_rate(57600)
-    with pytest.raises(CorruptData, match="none made sense: check the baud rate"):
+    with pytest.raises(CorruptData, match="but no valid packet: check the baud rate"):
         bench.driver.configure()
     assert bench.driver.link().packets == 0
 
@@ -209,7 +209,7 @@ def test_an_echo_of_other_values_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
         return ("1", "3", "5") if number == 44 else keep(number, fields)
 
     monkeypatch.setattr(bench.unit.registers, "write", stubborn)
-    with pytest.raises(Refused, match=r"register 44 was to be 0,1,5, the unit answered 1,3,5"):
+    with pytest.raises(Refused, match=r"register 44 should be 0,1,5, but the unit answered 1,3,5"):
         bench.driver.configure()
 
 

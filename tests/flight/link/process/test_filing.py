@@ -116,7 +116,7 @@ def test_what_came_has_a_limit(link: FiledEnds, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(filing, "MOST_RECEIVED", 5)
     link.session.put(config(link), "configuration/a", link.clock.now_ns())
     link.until_closed()
-    assert "delete what is not needed" in link.session.reason_of(link.ended[0])
+    assert "delete files that are not needed" in link.session.reason_of(link.ended[0])
 
 
 def test_wrong_units_are_refused_in_words_and_unknown_transfers_reported(link: FiledEnds) -> None:

@@ -116,8 +116,8 @@ def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> 
 
     later = in_seconds(link, 3600)
     assert "has passed" in refused(in_seconds(link, -1), "ping 1")
-    assert "is no UTC" in refused("tomorrow", "ping 1")
-    assert "is no command" in refused(later, "schedule x ping")
+    assert "is not a UTC" in refused("tomorrow", "ping 1")
+    assert "is not a command" in refused(later, "schedule x ping")
     assert "must lie within" in refused(later, "slew 3")
     assert "no command is scheduled under 5" in texts(link, send(link, Deletion(5)))[-1]
     for _ in range(MOST_ENTRIES):
