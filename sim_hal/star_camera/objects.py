@@ -66,7 +66,7 @@ def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
     return np.asarray(closest < EARTH_RADIUS)
 
 
-class Trajectory(Protocol):
+class BodyTrajectory(Protocol):
     """The trajectory of a body, such as an `Orbit`."""
 
     def states_at(self, times: FloatArray) -> FloatArray:
@@ -85,7 +85,7 @@ class ResidentSpaceObject:
 
 
 def source_tracks(
-    camera: Trajectory,
+    camera: BodyTrajectory,
     objects: Sequence[ResidentSpaceObject],
     epoch: float,
     start: float,
@@ -124,7 +124,7 @@ def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
     return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
-def _track_times(camera: Trajectory, orbit: Orbit, start: float, end: float) -> FloatArray:
+def _track_times(camera: BodyTrajectory, orbit: Orbit, start: float, end: float) -> FloatArray:
     """Return times between which linear interpolation of the direction is within `TRACK_ERROR`.
 
     The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the
