@@ -456,37 +456,17 @@ _MORE = 2
 _MOST_STRETCHED_CHANGE = 0.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LightEnds:
-    """Distances (n, 2) px of the light beyond the ends of the paths, NaN if unknown; path lengths (n,) px."""
+def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray, FloatArray]:
+    """Return distances (n, 2) px of the light beyond the ends of the paths, and the path lengths (n,) px.
 
-    beyond: FloatArray
-    length: FloatArray
-
-    @property
-    def stretch(self) -> float:
-        """The relative correction of the rotation on which most streaks agree, 0 without agreement."""
-        off = self.beyond.sum(axis=1)
-        known = np.isfinite(off)
-        off, length = off[known], self.length[known]
-        wrong = off[np.abs(off) > _LEAST_OFF]
-        if len(wrong) < _LEAST_STREAKS:
-            return 0.0
-        agree = np.abs(wrong[:, None] - off) < _ALIKE
-        most = agree[np.argmax(agree.sum(axis=1))]
-        if most.sum() < max(_LEAST_STREAKS, _MORE * np.count_nonzero(np.abs(off) <= _LEAST_OFF)):
-            return 0.0
-        return float(np.median(off[most] / length[most]))
-
-
-def find_edges(camera: FitProblem, scene: StreakScene) -> LightEnds:
-    """Return the ends of the light in the frame relative to those of the streaks of `scene`."""
+    Unknown distances are NaN.
+    """
     motion, stars = scene.motion, scene.stars
     length = path_lengths(camera.pinhole, motion, stars)
     beyond = np.full((len(stars), 2), np.nan)
     long = np.flatnonzero(length > 2.0 * _LEAST_REACH)
     if not len(long):
-        return LightEnds(beyond, length)
+        return beyond, length
     stars, own = stars[long], np.maximum(length[long], 1.0)
     reach = np.clip(_REACH * own, _LEAST_REACH, _MOST_REACH)
     outward = np.linspace(-1.0, 1.0, _STEPS) * reach[:, None]
@@ -505,7 +485,7 @@ def find_edges(camera: FitProblem, scene: StreakScene) -> LightEnds:
         known = np.isfinite(mean).all(axis=1) & sure
         found = outward[np.arange(len(last)), last] + 0.5 * (outward[:, 1] - outward[:, 0])
         beyond[long, end] = np.where(known, found, np.nan)
-    return LightEnds(beyond, length)
+    return beyond, length
 
 
 def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
@@ -516,11 +496,21 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     """
     if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
-    edges = find_edges(camera, scene)
-    stretch = edges.stretch
+    beyond, length = find_light_ends(camera, scene)
+    off = beyond.sum(axis=1)
+    known = np.isfinite(off)
+    off, own = off[known], length[known]
+    wrong = off[np.abs(off) > _LEAST_OFF]
+    if len(wrong) < _LEAST_STREAKS:
+        return None
+    agree = np.abs(wrong[:, None] - off) < _ALIKE
+    most = agree[np.argmax(agree.sum(axis=1))]
+    if most.sum() < max(_LEAST_STREAKS, _MORE * np.count_nonzero(np.abs(off) <= _LEAST_OFF)):
+        return None
+    stretch = float(np.median(off[most] / own[most]))
     if stretch == 0.0:
         return None
-    off = edges.beyond / np.maximum(edges.length, 1.0)[:, None]
+    off = beyond / np.maximum(length, 1.0)[:, None]
     # Time of mid-exposure under the uncorrected motion, by either end.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)

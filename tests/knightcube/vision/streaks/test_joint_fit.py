@@ -10,7 +10,7 @@ import pytest
 from knightcube.vision.streaks import joint_fit
 from knightcube.vision.streaks.frame import reduce_frame
 from knightcube.vision.streaks.geometry import CameraMotion, Shutter, StreakScene, positions
-from knightcube.vision.streaks.joint_fit import FitProblem, find_edges, stretched
+from knightcube.vision.streaks.joint_fit import FitProblem, find_light_ends, stretched
 from knightcube.vision.streaks.normal_equations import window_areas
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from tests.knightcube.vision.streaks.scenes import CAMERA, SATURATION, real_sky
@@ -33,9 +33,9 @@ def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, Strea
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 120.0), (60.0, 300.0), (20.0, 300.0)])
 def test_the_light_ends_at_the_ends_of_the_true_motion(theta: float, length: float) -> None:
     camera, scene, _ = _seen(theta, length, 1.0)
-    edges = find_edges(camera, scene)
-    assert np.count_nonzero(np.isfinite(edges.beyond)) >= 8
-    assert float(np.nanmedian(np.abs(edges.beyond))) < 2.0
+    beyond, _ = find_light_ends(camera, scene)
+    assert np.count_nonzero(np.isfinite(beyond)) >= 8
+    assert float(np.nanmedian(np.abs(beyond))) < 2.0
     assert stretched(camera, scene) is None
 
 
