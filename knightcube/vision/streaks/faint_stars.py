@@ -551,7 +551,14 @@ def _responses(
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
     """Return the heights (k,) of stars whose overlapping responses add up to the response at each star."""
     middle = np.rint(row).astype(int)
-    one, other = _neighbours(row, column, grid.length)
+    # Pairs of stars, including each star with itself, whose responses may overlap.
+    order = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[order], row - _FARTHEST, side="right")
+    count = np.searchsorted(row[order], row + _FARTHEST) - first
+    one = np.repeat(np.arange(len(row)), count)
+    other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
+    near = np.flatnonzero(np.abs(column[one] - column[other]) < grid.length)
+    one, other = one[near], other[near]
     span = held.span[middle]
     common = np.stack(
         [np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])], axis=-1
@@ -566,17 +573,6 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
         np.float64
     )
     return _solved(one, other, overlap, seen)
-
-
-def _neighbours(row: FloatArray, column: FloatArray, length: float) -> tuple[IntArray, IntArray]:
-    """Return the pairs of stars, including each star with itself, whose responses may overlap."""
-    order = np.argsort(row, kind="stable")
-    first = np.searchsorted(row[order], row - _FARTHEST, side="right")
-    count = np.searchsorted(row[order], row + _FARTHEST) - first
-    one = np.repeat(np.arange(len(row)), count)
-    other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
-    near = np.flatnonzero(np.abs(column[one] - column[other]) < length)
-    return one[near], other[near]
 
 
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:

@@ -211,7 +211,12 @@ def _strips_and_patches(
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
     # A patch covers the slow part of a streak, or all of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
-    patches = _patches_about(pinhole, scene, spot, part, room)
+    sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
+    stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
+    there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
+    low, high = there.min(axis=1), there.max(axis=1)
+    half = int(np.ceil(room + 0.5 * float(np.max(high - low, initial=0.0))))
+    patches = cut_patches(pinhole, 0.5 * (low + high), half)
     strips = _without_patches(strips, long, patches, spot)
     return long, spot, strips, patches
 
@@ -241,18 +246,6 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     way = speed * (motion.progress(fast[:, 1]) - motion.progress(fast[:, 0]))
     fast[way < _LEAST_FAST * scene.width] = 0.0
     return fast, rest
-
-
-def _patches_about(
-    pinhole: Pinhole, scene: StreakScene, spot: IntArray, part: FloatArray, room: float
-) -> Patches:
-    """Return patches with all pixels within `room` px of stars `spot` (n,) between times `part` (n, 2)."""
-    sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
-    stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
-    there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
-    low, high = there.min(axis=1), there.max(axis=1)
-    half = int(np.ceil(room + 0.5 * float(np.max(high - low, initial=0.0))))
-    return cut_patches(pinhole, 0.5 * (low + high), half)
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:

@@ -475,23 +475,16 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     `shares` are ratios of the durations of the two parts. Light and sky of the star are fitted.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    light = np.diff(_light_before(edges / lengths[:, None], shares[:, None, None]), axis=-1)
+    # Light before each edge; a negative share stands for a motion that begins after the rest.
+    share, root = shares[:, None, None], np.sqrt(np.clip(edges / lengths[:, None], 0.0, 1.0))
+    before = np.maximum(root, -share) + np.minimum(root, np.maximum(share, 0.0)) + np.minimum(share, 0.0)
+    light = np.diff(before / (1.0 + share), axis=-1)
     light = gaussian_filter1d(light, width / _STEP, axis=-1, mode="constant")
     square, cross, plain = light**2 @ one.square, light @ one.cross, light @ one.plain
     weight, first, second = one.moments
     determinant = np.maximum(square * weight - plain**2, 1e-30)
     explained = (weight * cross**2 - 2.0 * plain * cross * first + square * first**2) / determinant
     return np.asarray(second - explained)
-
-
-def _light_before(place: FloatArray, share: FloatArray) -> FloatArray:
-    """Return the fraction of the light before `place`, in path lengths from the rest.
-
-    A negative `share` stands for a motion that begins after the rest.
-    """
-    root, turned = np.sqrt(np.clip(place, 0.0, 1.0)), np.maximum(share, 0.0)
-    whole = np.maximum(root, -share) + np.minimum(root, turned) + np.minimum(share, 0.0)
-    return np.asarray(whole / (1.0 + share))
 
 
 # Maximum number of conjugate-gradient steps for the covariance.
