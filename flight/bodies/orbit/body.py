@@ -162,7 +162,11 @@ class SatelliteEstimation(BodyEstimation):
 
     def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
         """Start from the states that an earlier boot learned."""
-        self.environment = EstimatedEnvironment(_elements(config), services.clock)
+        try:
+            elements = None if config.elements is None else TwoLineElements(*config.elements)
+        except UsageError as error:
+            raise ConfigError("elements", f"are no two-line elements: {error}") from error
+        self.environment = EstimatedEnvironment(elements, services.clock)
         self._services = services
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))
         self.filter = self.orbit_filter
@@ -296,15 +300,12 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     )
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
-    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, _slew(config))
-
-
-def _slew(config: OrbitConfig) -> SlewRequest:
-    """Return the request of slews; without a star camera the keep-out cones refer to the pointing axis."""
-    section, camera = config.pointing, config.camera
+    # Without a star camera the keep-out cones refer to the pointing axis.
+    camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
-    return SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
+    slew = SlewRequest(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
+    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, slew)
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
@@ -388,16 +389,6 @@ def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionL
     settings = SunAcquisitionSettings(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
     law = SunAcquisition(_pauses(config), settings)
     return SunAcquisitionLaw(law, _strings(section), craft.dipole_per_ampere, services.events)
-
-
-def _elements(config: OrbitConfig) -> TwoLineElements | None:
-    """Return the configured two-line elements. Raises ConfigError for malformed lines."""
-    if config.elements is None:
-        return None
-    try:
-        return TwoLineElements(*config.elements)
-    except UsageError as error:
-        raise ConfigError("elements", f"are no two-line elements: {error}") from error
 
 
 def _detumbler(

@@ -690,8 +690,15 @@ class OrbitFilter:
             taken = [id(m) in used for m in late]
         applied(taken)
         for m, was in zip(late, taken, strict=True):
-            if isinstance(m, AttitudeMeasurement):
-                self._judge(m, was)
+            if not isinstance(m, AttitudeMeasurement):
+                continue
+            self._refused_attitudes = 0 if was else self._refused_attitudes + 1
+            if was:
+                self._placed_ns = m.time_ns
+            # A fine estimate restarts after several contradicting attitudes, a coarse estimate after one.
+            patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
+            if self._refused_attitudes >= patience:
+                self.begin(m, doubted=True)
 
     def catch_up(self, most: int | None = None) -> None:
         """Do nothing, because late measurements are applied at once, in a millisecond or two."""
@@ -754,15 +761,6 @@ class OrbitFilter:
         step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
         self._replay.add(step)
         self._replay.follow_gyro()
-
-    def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
-        """Restart after too many contradicting attitudes; a coarse estimate restarts after the first."""
-        self._refused_attitudes = 0 if used else self._refused_attitudes + 1
-        if used:
-            self._placed_ns = attitude.time_ns
-        patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
-        if self._refused_attitudes >= patience:
-            self.begin(attitude, doubted=True)
 
 
 class OrbitFeed:

@@ -299,7 +299,11 @@ class Planning:
         settings, goal_ns, begun = self._settings, self._goal_ns, self._goal_ns is not None
         towards_goal = settings.strategy is Strategy.GOAL
         horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
-        end_q2 = self._due_q2(law, now_ns, horizon) if towards_goal else law.q2
+        end_q2 = law.q2
+        if towards_goal and law.rate != 0.0 and self._due_ns is not None:
+            # A moving target has moved on since it was first due.
+            late = horizon - (self._due_ns - now_ns) * 1e-9
+            end_q2 = q2_of(_moved(law, max(late, 0.0)))
         if end_q2 != self._guidance.target_q2:
             self._guidance.aim(end_q2, law.rate, now_ns)
         return PlanJob(
@@ -317,13 +321,6 @@ class Planning:
             self._guidance.remains(now_ns) if begun else None,
             settings.cost,
         )
-
-    def _due_q2(self, law: ThreadLaw, now_ns: int, horizon: float) -> float:
-        """Return q2 to be reached in `horizon` s: a moving target has moved on since first due."""
-        if law.rate == 0.0 or self._due_ns is None:
-            return law.q2
-        late = horizon - (self._due_ns - now_ns) * 1e-9
-        return q2_of(_moved(law, max(late, 0.0)))
 
     def _is_near_goal(self, now_ns: int) -> bool:
         """Return whether too little time is left until the goal for a new plan."""
