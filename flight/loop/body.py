@@ -90,8 +90,8 @@ class Steered:
     Attributes:
         reference: the body's `Reference` now; None without a path.
         dipole: (3,) A m^2, commanded.
-        currents: (3,) A, sent to the driver: after reallocation, with the coil monitor's probe, and zero when
-            a fault of this cycle switched the coils off.
+        currents: (3,) A, sent to the driver after reallocation and with the coil monitor's probe; zero after
+            a fault of this cycle that switched the coils off.
     """
 
     state: SteeringState
@@ -426,7 +426,7 @@ class BodyKind:
     """A kind of body.
 
     Attributes:
-        plan: the planner worker's function: a job in, a plan out, as `jobs.Worker` says. None without one.
+        plan: function of the planner worker, from a job to a plan; None without a planner.
         make: builds the body of a configuration, with the parameters that an earlier boot learned.
     """
 

@@ -285,9 +285,9 @@ class CoilMonitorSettings:
         window_ns: averaging time of a reading's mean. A longer gap between readings resets the monitor.
         persistence: readings in a row that fit no healthy circuit, until there is a suspicion.
         settle: readings after that until the window lies wholly after the fault.
-        evidence: readings that a verdict needs.
+        evidence: number of readings that a verdict needs.
         probe_current: A, of the wave that distinguishes faults of axes at rest.
-        probe_half_ns: half the wave's period.
+        probe_half_ns: half the period (ns) of the wave.
         response: the body's response to the coils; None if the motion is not used.
         slow: the same over longer bins, which show currents below the noise of the monitor.
         tumble_rate: rate (rad/s) above which a coil that looks reversed rests until the body is slower.

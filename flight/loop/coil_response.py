@@ -17,9 +17,9 @@ makes, and estimates the error that remains by nuisance parameters (`knightcube.
 If the coils' field at the magnetometer is as large as the Earth's, the field measured in their last pause is
 rotated with the body.
 
-The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
-supply current did distinguishes a broken coil from a wrong monitor (`observed_share`). `MotionWitness` checks
-verdicts that rest on the supply current in this way.
+The residual accelerations, with all coils assumed healthy, are kept longer. A change at the time of a change
+of the supply current distinguishes a broken coil from a wrong monitor (`observed_share`). `MotionWitness`
+checks verdicts that rest on the supply current in this way.
 """
 
 from __future__ import annotations
@@ -195,7 +195,7 @@ def fits(
     chops = np.array([one.chopped for one in evidence])
     mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
     slack: FloatArray = np.full(len(evidence), bounds.noise)
-    free = 0.0  # current that axes of unknown state may add
+    free = 0.0  # largest additional current (A) of axes in an unknown state
     for number, variant in enumerate(variants):
         if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
             free += bounds.full_current[number]
@@ -306,11 +306,11 @@ class ResponseSettings:
         dipole_per_ampere: n A of each coil, m^2.
         rate_noise: rad/s, standard deviation of a sample of the rate about each axis.
         free: (3,) whether the body can rotate about each axis; on a thread only about y.
-        bin_samples: samples of the rate in a bin.
-        bins: differences of bins in the fit.
+        bin_samples: number of rate samples in a bin.
+        bins: number of bin differences in the fit.
         model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.
         torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
-        errors: largest errors of the inertia and of the gyro, of a body free about three axes.
+        errors: largest errors of inertia and gyro for a body that is free about three axes.
         sure: standard deviation below which a gain is used.
         persistence: fits in a row that must agree.
         lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
@@ -392,8 +392,8 @@ class CoilResponse:
         self._turned: FloatArray = np.zeros(3)
         self._spun: FloatArray = np.zeros(6)  # rad^2/s, the integrals of the rate products
         self._quiet_field: FloatArray | None = None
-        # Of each free axis (f, 6 + k): accelerations by the coils (3), observed, mean rate and angle of the
-        # bin, accelerations by the k modes.
+        # One row (f, 6 + k) for each bin and its f free axes: three accelerations by the coils, the observed
+        # acceleration, mean rate, angle, and accelerations by the k modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         self._speeds: deque[float] = deque(maxlen=self._settings.bins)
         self.fastest = 0.0

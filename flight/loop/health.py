@@ -48,7 +48,7 @@ class ResourceSample:
 
     Attributes:
         time_ns: monotonic.
-        cpu: s, processor time of the control process since its start.
+        cpu: processor time (s) of the control process since its start.
         resident: bytes, resident set size of the control process.
         proportional: bytes, proportional set size of all flight processes together.
         disk_free: bytes, free on the flight log's file system.
@@ -168,7 +168,7 @@ class Board:
     """Reads resources from the kernel; values that the kernel does not provide are NaN."""
 
     def __init__(self, log_folder: Path, proc: Path = Path("/proc"), thermal: Path | None = None) -> None:
-        """Take the flight log's folder, and the kernel's folders of processes and thermal zones."""
+        """`proc` and `thermal` are the kernel's folders of processes and thermal zones."""
         self._folder = log_folder
         self._proc = proc
         self._thermal = thermal or Path("/sys/class/thermal")

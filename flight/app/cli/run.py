@@ -146,7 +146,7 @@ def run(options: argparse.Namespace) -> int:
     except OSError as error:
         if options.archive is None:
             raise
-        raise FlightError(str(error)) from error  # no mistake of a user's: the service is started again
+        raise FlightError(str(error)) from error  # the service manager restarts the service
     if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun

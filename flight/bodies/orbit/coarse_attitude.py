@@ -1,6 +1,6 @@
 """Coarse directions: solar cells with the magnetic field, and Sun and nadir of the horizon cameras.
 
-They start the filter without a star, and update it while it is not fine.
+They start the filter without a star fix, and update it until the attitude is fine.
 
 An attitude by field and solar cells has a covariance that covers every turn that is possible while any one
 cell fails (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for minutes: a

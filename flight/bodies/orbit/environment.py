@@ -1,8 +1,8 @@
 """The estimated orbit environment: position, magnetic field, Sun and shadow at any time.
 
 The position is propagated from the newest GPS fix or, without a fix, from two-line elements. The environment
-is predicted for some 20 s at once (2 ms) and interpolated. Predictions of a revolution belong into a worker:
-they take 0.3 ms for each 10 s.
+is predicted for some 20 s at once (2 ms) and interpolated. Predictions of a revolution belong into a worker,
+because they take 0.3 ms for each 10 s.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ class DipoleHistory:
         self._times.append(time_ns)
         self._dipoles.append(dipole)
         oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
-        if oldest > 64:  # in batches, not each cycle
+        if oldest > 64:  # discard the oldest entries in batches
             del self._times[:oldest], self._dipoles[:oldest], self._sums[:oldest]
 
     def total(self, time_ns: int) -> FloatArray:

@@ -79,7 +79,7 @@ LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThreadEstimate:
-    """Angle, rate and disturbance about the thread at `time_ns`: rad, rad/s, rad/s^2; covariance (3, 3).
+    """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread, with their covariance (3, 3).
 
     `measured_ns` is the time of the newest measurement used.
     """
