@@ -37,7 +37,7 @@ from flight.schema.devices import Camera, WideCamera, camera_model, likelihood_s
 from flight.schema.document import ConfigError
 from flight.schema.sections import CONTROL_RATE_HZ, Config
 from hal.interfaces.wires import SECOND_NS, Clock
-from knightcube.gnc.tracking.tracker import TrackSettings
+from knightcube.gnc.tracker import TrackSettings
 from knightcube.vision import frame_job, horizon_camera_job
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraKnowledge, Exposures

@@ -24,7 +24,7 @@ from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
-from knightcube.gnc.tracking.tracker import Track
+from knightcube.gnc.tracker import Track
 from knightcube.vision.frame_job import StreakEstimator
 from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCameraResult
 

@@ -34,8 +34,7 @@ from functools import cache
 import numpy as np
 
 from hal.interfaces.devices import PowerReading
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import cross_matrices
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
     coefficient_modes,

@@ -28,7 +28,12 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.gnc.estimation.estimate import ATTITUDE, RATE, Estimate, Knowledge
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, Track, TrackSettings
+from knightcube.gnc.tracker import (
+    FrameSightings,
+    ObjectTracker,
+    Track,
+    TrackSettings,
+)
 from knightcube.vision.camera.images import KeptFrames
 from knightcube.vision.camera.lens import CameraModel, Exposures
 from knightcube.vision.frame_job import FrameFound, FrameJob, StreakEstimator, TrackerSettings

@@ -30,7 +30,7 @@ class Craft(Section, frozen=True, kw_only=True):
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
-    """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control.three_axes`).
+    """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control`).
 
     `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. `torque_noise` (rad/s
     per sqrt(s)) stands for unmodelled torques. The plan covers `horizon` s and is renewed every `replan` s. A
@@ -79,7 +79,7 @@ class ExclusionCones(Section, frozen=True, kw_only=True):
 
 
 class PointingSection(Section, frozen=True, kw_only=True):
-    """Pointing of a satellite (`knightcube.gnc.control.three_axes`).
+    """Pointing of a satellite (`knightcube.gnc.control`).
 
     `axis` of the body points at the target; a given roll is measured from `across`, perpendicular to it.
     Errors of `turn` rad and `rate` rad/s and a dipole of `dipole` A m^2 have equal cost, as does a rotation

@@ -22,8 +22,13 @@ from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugat
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.planners import STRETCH
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    HORIZON_RANGE,
+    LEAST_TIME,
+    NODES,
+    BoresightEnd,
+)
 from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewStatus
-from knightcube.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES, BoresightEnd
 
 BODIES: tuple[Literal["sun", "earth", "moon"], ...] = ("sun", "earth", "moon")
 _OFF_UNIT = 0.1

@@ -34,7 +34,7 @@ from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.catalogue import PROPER_NAMES
 from knightcube.astro.earth.sun import julian_date
 from knightcube.errors import UsageError
-from knightcube.reference.star_identification.methods import DEFAULT_METHOD, METHODS, method_of
+from knightcube.reference.star_identification import DEFAULT_METHOD, METHODS, method_of
 from knightcube.vision.camera.images import grey_stretch, write_picture
 from knightcube.vision.star_tracker import (
     FOV_TOLERANCE,

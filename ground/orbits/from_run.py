@@ -12,7 +12,7 @@ from ground.telemetry import Run
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_velocity
 from knightcube.errors import UsageError
-from knightcube.gnc.tracking.first_orbit import (
+from knightcube.gnc.first_orbit import (
     LEAST_SIGHTINGS,
     ArcError,
     Bearings,

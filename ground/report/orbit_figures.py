@@ -29,9 +29,8 @@ from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.guidance.three_axes.slew_model import shown
+from knightcube.gnc.guidance.three_axes.slew_model import Cone, shown
 from knightcube.gnc.guidance.three_axes.slew_plan import OrderedSlew, SlewOrder, SlewStatus
-from knightcube.gnc.guidance.three_axes.slew_task import Cone
 
 SPIN_MARGIN = 0.2
 """Fraction of the time of detumbling that is shown before and after it."""

@@ -15,7 +15,7 @@ from flight.link.telemetry.packets import PacketArray, to_text
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
-from knightcube.gnc.coil_power import steady_heat, supply_power
+from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
 
 Object = dict[str, Any]
 
@@ -39,7 +39,7 @@ class ThreadMotion:
 
 @dataclass(frozen=True)
 class PowerHistory:
-    """Power of all coils together, as means over the intervals of a run (`knightcube.gnc.coil_power`).
+    """Power of all coils together, as means over the intervals of a run.
 
     Attributes:
         time: beginning (n,) of each interval, s.

@@ -27,9 +27,8 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
-from knightcube.gnc.control.one_axis.lq_tracker import CurrentCommand, attitude_error
-from knightcube.gnc.guidance.one_axis.path import PathSample
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.control.one_axis import CurrentCommand, attitude_error
+from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
 
 
 @dataclass(frozen=True, slots=True)

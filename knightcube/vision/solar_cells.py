@@ -24,8 +24,7 @@ from enum import Enum
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.errors import UsageError
 

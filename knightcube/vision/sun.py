@@ -23,8 +23,7 @@ from enum import Enum
 import numpy as np
 from scipy.ndimage import find_objects, label
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image

@@ -29,8 +29,7 @@ from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import BoolArray, FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 

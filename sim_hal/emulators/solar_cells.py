@@ -22,8 +22,7 @@ import numpy as np
 from hal.drivers.ads1115 import StringWiring
 from hal.interfaces.errors import check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from sim_hal.worlds.orbit import sun_position

@@ -13,7 +13,7 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep
 from ground.telemetry import Run
 from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
-from knightcube.gnc.control.three_axes import pointing_law
+from knightcube.gnc.control import pointing_law
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.mode_flights import modes_of
 from tests.scenario.orbit_flights import navigating, skyward

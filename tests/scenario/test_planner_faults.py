@@ -15,10 +15,9 @@ from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis import job as plan_job
-from knightcube.gnc.guidance.one_axis.job import PlanJob
-from knightcube.gnc.guidance.one_axis.path import PolynomialPath
-from knightcube.gnc.guidance.one_axis.vmc import StepPlan
+from knightcube.gnc.guidance.one_axis import vmc as plan_job
+from knightcube.gnc.guidance.one_axis.plant import PolynomialPath
+from knightcube.gnc.guidance.one_axis.vmc import PlanJob, StepPlan
 from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
 from tests.support.flights import demo_config, event_names, fly, thesis_config
 

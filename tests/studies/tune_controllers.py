@@ -20,9 +20,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from knightcube.gnc.control.one_axis.lq_tracker import AngleController
-from knightcube.gnc.guidance.one_axis.path import PathSample
-from knightcube.gnc.guidance.one_axis.plant import angle_of
+from knightcube.gnc.control.one_axis import AngleController
+from knightcube.gnc.guidance.one_axis.plant import PathSample, angle_of
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 from tests.support.thread_loop import BELIEVED, PERIOD
 

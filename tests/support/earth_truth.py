@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.earth.figure import semi_axes
 from sim_hal.earth_camera import Atmosphere, EarthCameraModel, EarthScene
 from sim_hal.earth_camera.scene import towards_sun

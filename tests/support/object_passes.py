@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
-from knightcube.gnc.tracking.tracker import FrameSightings
+from knightcube.astro.arrays import FloatArray, tangent_basis
+from knightcube.gnc.tracker import FrameSightings
 
 EARTH = 3.986004418e14
 PIXEL = np.radians(20.0) / 1024

@@ -17,9 +17,14 @@ from numpy.polynomial import chebyshev
 from scipy.integrate import solve_ivp
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCraft, SlewEnvironment
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    AttitudeEnd,
+    EnvironmentAt,
+    SlewCraft,
+    SlewEnvironment,
+    SlewTask,
+)
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
-from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, SlewTask
 
 FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum_orbit.json"
 

@@ -8,9 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.one_axis.lq_tracker import AngleController
-from knightcube.gnc.guidance.one_axis.path import PathSample
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.control.one_axis import AngleController
+from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
 from tests.knightcube.gnc.estimation.single_axis import (
     ANGLE,
     RATE,

@@ -44,18 +44,18 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState, TwoLineElements
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import UsageError
+from knightcube.gnc.control import pointing_job
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, FieldDetumblerSettings
-from knightcube.gnc.control.three_axes.pointing_job import SlewRequest
-from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
-from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldDetumblerSettings
+from knightcube.gnc.control.pointing_job import SlewRequest
+from knightcube.gnc.control.pointing_table import PointingWeights
+from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.gnc.estimation.estimate import Estimate, Knowledge
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from knightcube.gnc.estimation.free_filter import FreeFilterSettings
 from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
-from knightcube.gnc.tracking.tracker import Track
+from knightcube.gnc.tracker import Track
 from knightcube.vision.solar_cells import SolarStringModel
 
 SPIN_EVERY = 10

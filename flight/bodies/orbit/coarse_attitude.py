@@ -22,10 +22,9 @@ from flight.schema.devices import WideCamera, camera_model
 from hal.interfaces.devices import Frame, StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.attitude.solvers import VectorObservation, field_observation, weighted_fit
 from knightcube.astro.attitude.wahba import AttitudeError
-from knightcube.astro.directions import tangent_basis
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,

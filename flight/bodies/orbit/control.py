@@ -3,7 +3,7 @@
 Detumbling follows the momentum plan in the measured field, or in the field expected ahead. SAFE turns to the
 Sun by solar cells, gyro and measured field, without orbit, attitude or clock. Pointing follows the pointing
 law along its path; far off its path the body is held still instead
-(`knightcube.gnc.control.three_axes.astray`).
+(`knightcube.gnc.control.astray`).
 
 While pointing, the coils pause at the beginning of each window, so that the magnetometer is read without
 their field; then one dipole, computed at the pause's end, is held. The dipole is increased to make up for the
@@ -27,9 +27,9 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import FieldAhead
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler
-from knightcube.gnc.control.three_axes.pointing_law import damping_dipole
-from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition
+from knightcube.gnc.control.field_detumbler import FieldDetumbler
+from knightcube.gnc.control.pointing_law import damping_dipole
+from knightcube.gnc.control.sun_acquisition import SunAcquisition
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 

@@ -30,8 +30,7 @@ from flight.loop.body import ReadingAgreement
 from flight.loop.state import Learned
 from hal.interfaces.devices import ImuReading
 from hal.interfaces.wires import SECOND_NS
-from knightcube.astro.arrays import FloatArray, IntArray
-from knightcube.astro.directions import cross_product
+from knightcube.astro.arrays import FloatArray, IntArray, cross_product
 from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from knightcube.gnc.estimation import estimate as form
 from knightcube.gnc.estimation import free_filter as states

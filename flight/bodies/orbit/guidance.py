@@ -27,13 +27,18 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.errors import UsageError
-from knightcube.gnc.control.three_axes.pointing_job import STEADY, ObjectDirection, PointingJob, SlewRequest
-from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
+from knightcube.gnc.control.pointing_job import (
+    STEADY,
+    ObjectDirection,
+    PointingJob,
+    SlewRequest,
+)
+from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw
+from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
 from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference, BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.tracking.tracker import Track
+from knightcube.gnc.tracker import Track
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,7 +62,7 @@ from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSett
 from knightcube.gnc.estimation.estimate import Estimate, Parameters
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import RigidBody
-from knightcube.gnc.guidance.one_axis import job as plan_job
+from knightcube.gnc.guidance.one_axis import vmc as plan_job
 from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, PathGuidance
 from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant
 from knightcube.gnc.guidance.one_axis.vmc import NODES

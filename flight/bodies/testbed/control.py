@@ -44,16 +44,26 @@ from knightcube.astro.earth.sun import DAY
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import Detumbler
-from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from knightcube.gnc.control.one_axis.lq_tracker import AngleController, LqTracker
+from knightcube.gnc.control.one_axis import (
+    AngleController,
+    ExcitationController,
+    ExcitationSettings,
+    LqTracker,
+)
 from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
 from knightcube.gnc.estimation.estimate import NOMINAL, PARAMETERS, Estimate, Parameters, SlowPrior
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.guidance.one_axis.guidance import PathGuidance
-from knightcube.gnc.guidance.one_axis.job import PlanJob
-from knightcube.gnc.guidance.one_axis.path import FARTHEST, PathSample
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, PathCost, SingleAxisPlant, angle_of, q2_of
-from knightcube.gnc.guidance.one_axis.vmc import PlanStatus, StepPlan
+from knightcube.gnc.guidance.one_axis.plant import (
+    FARTHEST,
+    Q2_LIMIT,
+    PathCost,
+    PathSample,
+    SingleAxisPlant,
+    angle_of,
+    q2_of,
+)
+from knightcube.gnc.guidance.one_axis.vmc import PlanJob, PlanStatus, StepPlan
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 from knightcube.reference.control import AdaptiveController, AdaptiveSettings, PidController, PidSettings
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.astro.attitude.wahba import (
     AttitudeError,
     AttitudeFix,
@@ -31,7 +31,6 @@ from knightcube.astro.attitude.wahba import (
     sightings,
     upright,
 )
-from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import multiply, normalise, to_rotation_vector
 
 _WORST_CONDITION = 1e12

@@ -40,7 +40,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_matrices, tangent_basis
 from knightcube.astro.attitude import olae
 from knightcube.astro.attitude.wahba import (
     AttitudeError,
@@ -55,7 +55,6 @@ from knightcube.astro.attitude.wahba import (
     sightings,
     upright,
 )
-from knightcube.astro.directions import cross_matrices, tangent_basis
 from knightcube.astro.quaternion import (
     attitude_matrix,
     from_matrix,

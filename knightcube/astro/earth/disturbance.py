@@ -16,8 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import cross_matrices
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.astro.earth.ephemeris import Ephemeris
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.orientation import ROTATION_RATE

@@ -25,8 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.astro.directions import cross_matrix, tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrix, tangent_basis
 from knightcube.astro.earth.disturbance import SIZES, Pressures, box_areas, shapes
 from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from knightcube.astro.quaternion import (

@@ -23,8 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     DISTURBANCE,

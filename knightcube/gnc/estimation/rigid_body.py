@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import cross_matrices
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.estimate import (

@@ -18,9 +18,9 @@ from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, q2
 from knightcube.gnc.guidance.one_axis.vmc import MAX_STRETCH, NODES, StepPlan, plan
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import NODES as SLEW_NODES
 from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
 from knightcube.gnc.guidance.three_axes.slew_plan import LEAD, OrderedSlew, SlewOrder, plan_order
-from knightcube.gnc.guidance.three_axes.slew_task import NODES as SLEW_NODES
 
 STRETCH = 3.0
 """Longest slew without `longest`, as a multiple of `duration`."""

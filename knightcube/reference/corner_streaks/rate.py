@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, cross_matrices
 from knightcube.astro.attitude.olae import OlaeSolution, gain, rotation_between
-from knightcube.astro.directions import cross_matrices
 from knightcube.reference.corner_streaks.detectors import cornerness
 from knightcube.reference.corner_streaks.settings import StreakResult, StreakSettings
 from knightcube.vision.camera.lens import Pinhole

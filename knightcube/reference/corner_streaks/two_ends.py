@@ -14,10 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
-from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,

@@ -16,8 +16,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import FlightError
-from knightcube.reference.star_identification.known_sky import KnownSky
-from knightcube.reference.star_identification.pair_table import angles
+from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import (
     MatchStatus,
     StarField,

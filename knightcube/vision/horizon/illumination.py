@@ -24,8 +24,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray, tangent_basis
 from knightcube.vision.camera.lens import Lens, MountedCamera
 from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals

@@ -22,8 +22,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, select, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.vision.horizon.edges import EdgeRays, Observation
 from knightcube.vision.horizon.illumination import agreement

@@ -32,8 +32,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 
 MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0

@@ -24,8 +24,7 @@ from enum import Enum
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import BoolArray, FloatArray, Image
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, tangent_basis
 from knightcube.astro.quaternion import multiply
 from knightcube.vision.camera.lens import CameraModel, MountedCamera, check_image
 from knightcube.vision.horizon.edges import ImagePart, Levels, Observation, find_edges, observe

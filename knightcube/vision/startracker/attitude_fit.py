@@ -23,9 +23,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import FloatArray, IntArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeFix
-from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import from_matrix
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 

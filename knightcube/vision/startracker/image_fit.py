@@ -23,9 +23,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, cross_matrices
 from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, Solver
-from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_matrix
 from knightcube.vision.camera.lens import CameraModel
 from knightcube.vision.startracker.attitude_fit import (

@@ -22,8 +22,8 @@ from ground.identification.scale import (
     excitation_config,
 )
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from knightcube.gnc.guidance.one_axis.path import PathSample
+from knightcube.gnc.control.one_axis import ExcitationController, ExcitationSettings
+from knightcube.gnc.guidance.one_axis.plant import PathSample
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 from tests.support import flights

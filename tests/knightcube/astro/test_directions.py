@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import tangent_basis
 from knightcube.astro.quaternion import normalise
 
 

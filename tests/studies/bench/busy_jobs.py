@@ -69,12 +69,12 @@ _again = Again()
 
 def plan_testbed(job: Any) -> Any:
     """Plan for the testbed."""
-    return _again("knightcube.gnc.guidance.one_axis.job", job)
+    return _again("knightcube.gnc.guidance.one_axis.vmc", job)
 
 
 def plan_orbit(job: Any) -> Any:
     """Plan for the satellite."""
-    return _again("knightcube.gnc.control.three_axes.pointing_job", job)
+    return _again("knightcube.gnc.control.pointing_job", job)
 
 
 def see(job: Any) -> Any:
@@ -88,8 +88,8 @@ def see_wide(job: Any) -> Any:
 
 
 BUSY: dict[str, Callable[[Any], Any]] = {
-    "knightcube.gnc.guidance.one_axis.job": plan_testbed,
-    "knightcube.gnc.control.three_axes.pointing_job": plan_orbit,
+    "knightcube.gnc.guidance.one_axis.vmc": plan_testbed,
+    "knightcube.gnc.control.pointing_job": plan_orbit,
     "knightcube.vision.frame_job": see,
     "knightcube.vision.horizon_camera_job": see_wide,
 }

@@ -73,8 +73,8 @@ _IMPORTED = (
     "sim_hal.rig",
 )
 _ROLES = {
-    "knightcube.gnc.guidance.one_axis.job": "planner",
-    "knightcube.gnc.control.three_axes.pointing_job": "planner",
+    "knightcube.gnc.guidance.one_axis.vmc": "planner",
+    "knightcube.gnc.control.pointing_job": "planner",
     "knightcube.vision.frame_job": "vision",
     "knightcube.vision.horizon_camera_job": "wide",
     "hal.guardian": "guardian",

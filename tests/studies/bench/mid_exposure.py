@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.astro.attitude.solvers import SOLVERS
-from knightcube.astro.directions import cross_matrices
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import FlightError
 from knightcube.vision.camera.lens import Pinhole

@@ -23,16 +23,16 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.errors import PlanningError
-from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_job import RESERVE, PointingJob, SlewRequest, slew
-from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
-from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
-from knightcube.gnc.guidance.three_axes.slew_task import (
-    LEAST_TIME,
-    AttitudeEnd,
-    SlewTask,
+from knightcube.gnc.control import pointing_job
+from knightcube.gnc.control.pointing_job import (
+    RESERVE,
+    PointingJob,
+    SlewRequest,
+    slew,
 )
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import LEAST_TIME, AttitudeEnd, SlewPath, SlewTask
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
 from tests.studies.campaigns.orbit_pointing_flight import TORQUE
 from tests.support.pointing_settings import AXES, WEIGHTS
 from tests.support.random_slews import _DATE, STAR_CAMERA, clearance, slews

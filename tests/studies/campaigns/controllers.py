@@ -8,9 +8,9 @@ PID and adaptive are tuned by one criterion, `python -m tests.studies.tune_contr
 every step settled in 9 s and overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone,
 and a PID by three poles in one place, stand beside them.
 
-Two powers are given (`knightcube.gnc.coil_power`): V |I|, which the chopped coils take from their supply of
-3.4 V and which compares with the thesis's consumption, and R I^2 of the mean current, the cost that the paths
-minimise.
+Two powers are given (`knightcube.gnc.guidance.one_axis.plant`): V |I|, which the chopped coils take from
+their supply of 3.4 V and which compares with the thesis's consumption, and R I^2 of the mean current, the
+cost that the paths minimise.
 
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
 command and held, by direct collocation (tests.support.collocation_oracle). What reaches its targets later

@@ -21,7 +21,7 @@ from knightcube.astro.earth.ephemeris import FieldAhead, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler, FieldDetumblerSettings
+from knightcube.gnc.control.field_detumbler import FieldDetumbler, FieldDetumblerSettings
 from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from sim_hal.settings import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

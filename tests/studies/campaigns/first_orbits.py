@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.gnc.tracking.first_orbit import ArcError, Bearings, first_orbit
+from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.support.short_arcs import LIGHT, circular, flown_states
 

@@ -21,9 +21,8 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.reference.star_identification.known_sky import KnownSky
-from knightcube.reference.star_identification.methods import METHODS, StarMotion, identify_by_rate
-from knightcube.reference.star_identification.pair_table import angles
+from knightcube.reference.star_identification import METHODS, StarMotion, identify_by_rate
+from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

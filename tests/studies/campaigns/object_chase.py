@@ -17,14 +17,13 @@ from scipy.integrate import solve_ivp
 from flight.bodies.orbit.guidance import ObjectAim, Sensor
 from flight.link.events import EventKind
 from flight.loop.facts import EventLog
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector
-from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.control import pointing_job
+from knightcube.gnc.control.pointing_job import PointingJob
+from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
+from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from sim_hal.settings import TipOff
 from tests.studies.campaigns.free_flight import FreeFlight
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, PointingFlight

@@ -17,15 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.quaternion import (
     attitude_matrix,
     from_matrix,
     from_rotation_vector,
     multiply,
 )
-from knightcube.gnc.tracking.tracker import FrameSightings, LineOfSightState, ObjectTracker, TrackSettings
+from knightcube.gnc.tracker import (
+    FrameSightings,
+    LineOfSightState,
+    ObjectTracker,
+    TrackSettings,
+)
 from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.frame_job import FrameJob, TrackerSettings
 from knightcube.vision.frame_job import run as look

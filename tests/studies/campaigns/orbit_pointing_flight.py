@@ -2,7 +2,7 @@
 
 The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
 pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
-held still (`knightcube.gnc.control.three_axes.pointing_law`). The coils
+held still (`knightcube.gnc.control.pointing_law`). The coils
 pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
 Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
 lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
@@ -26,10 +26,10 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
-from knightcube.gnc.control.three_axes.pointing_law import PathRecovery, PointingLaw, damping_dipole
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.control import pointing_job
+from knightcube.gnc.control.pointing_job import PointingJob, SlewRequest
+from knightcube.gnc.control.pointing_law import PathRecovery, PointingLaw, damping_dipole
+from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.estimation.free_filter import (
     ATTITUDE,
     GYRO,

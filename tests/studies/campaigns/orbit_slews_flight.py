@@ -24,8 +24,8 @@ from knightcube.astro.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from knightcube.gnc.control.three_axes import pointing_job
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.control import pointing_job
+from knightcube.gnc.control.pointing_table import PointingTable, table_along
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget

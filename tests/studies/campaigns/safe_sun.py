@@ -19,7 +19,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import sunlit_share
 from knightcube.astro.quaternion import attitude_matrix
-from knightcube.gnc.control.three_axes.sun_acquisition import SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.control.sun_acquisition import SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff

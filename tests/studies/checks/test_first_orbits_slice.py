@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knightcube.gnc.tracking.first_orbit import ArcError, Bearings, first_orbit
+from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
 from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.first_orbits import FIRST_ORBITS, run
 

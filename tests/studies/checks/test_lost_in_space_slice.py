@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knightcube.reference.star_identification.methods import METHODS
+from knightcube.reference.star_identification import METHODS
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarMatch
 from knightcube.vision.startracker.verification import nothing
 from tests.studies.campaigns import lost_in_space

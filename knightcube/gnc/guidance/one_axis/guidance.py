@@ -13,8 +13,13 @@ from enum import StrEnum
 import numpy as np
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.path import PathSample, PolynomialPath
-from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, q2_of
+from knightcube.gnc.guidance.one_axis.plant import (
+    Q2_LIMIT,
+    PathSample,
+    PolynomialPath,
+    SingleAxisPlant,
+    q2_of,
+)
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan
 
 _CHECKED_POINTS = 600

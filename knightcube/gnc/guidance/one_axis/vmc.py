@@ -1,11 +1,9 @@
 """The planner of paths about one axis: minimum energy by virtual motion camouflage.
 
-Sease 2013, 5.8-5.15 corrected.
-
-NLopt optimises the free path control parameters under |I| <= Imax and |q2| <= a bound at every time. If no
-path over the requested horizon keeps the limits, the horizon is stretched to the shortest feasible one and
-the status of the plan is STRETCHED. With a time cost the horizon is optimised too. Energy is the integral of
-R I^2 in J, without the factor 1/2 of 5.1.
+Sease 2013, 5.8-5.15 corrected. NLopt optimises the free path control parameters under |I| <= Imax and |q2| <=
+a bound at every time. If no path over the requested horizon keeps the limits, the horizon is stretched to the
+shortest feasible one and the status of the plan is STRETCHED. With a time cost the horizon is optimised too.
+Energy is the integral of R I^2 in J, without the factor 1/2 of 5.1.
 
 The three searches for a horizon all minimise energy plus a cost per second between a shortest and a longest
 horizon. If the cost per second is far above the coil's power and the shortest horizon is the requested one,
@@ -27,12 +25,14 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.path import CubicPrey, PolynomialPath, lgl_rule
 from knightcube.gnc.guidance.one_axis.plant import (
     Q2_LIMIT,
     SQUARE_Q2_WITHOUT_AUTHORITY,
+    CubicPrey,
     PathCost,
+    PolynomialPath,
     SingleAxisPlant,
+    lgl_rule,
     q2_rate_of,
 )
 from knightcube.gnc.guidance.one_axis.vmc_program import (
@@ -447,3 +447,43 @@ def _check(
         raise PlanningError(f"reference is {reference}: it must lie beyond the range of q2, |q_r| > 1 (5.10)")
     if not NODES_RANGE[0] <= nodes <= NODES_RANGE[1]:
         raise PlanningError(f"nodes is {nodes}: it must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
+
+
+@dataclass(frozen=True, slots=True)
+class PlanJob:
+    """Job of the planner's worker: a path from one state to another, both as q2 and rad/s, in `horizon` s.
+
+    `number` counts the jobs; the path starts at `origin_ns`. `last` is the path followed until now, its
+    origin relative to `origin_ns`. The other attributes are arguments of `plan`.
+    """
+
+    number: int
+    origin_ns: int
+    plant: SingleAxisPlant
+    start_q2: float
+    start_rate: float
+    end_q2: float
+    end_rate: float
+    horizon: float
+    max_horizon: float
+    nodes: int = NODES
+    time_price: float | None = None
+    last: PolynomialPath | None = None
+    cost: PathCost = PathCost.HEAT
+
+
+def run(job: PlanJob) -> StepPlan:
+    """Return the plan for `job` (module-level, so that a worker can import it); raises PlanningError."""
+    return plan(
+        job.plant,
+        job.start_q2,
+        job.start_rate,
+        job.end_q2,
+        job.end_rate,
+        job.horizon,
+        nodes=job.nodes,
+        max_stretch=max(job.max_horizon / job.horizon, 1.0),
+        time_price=job.time_price,
+        last=job.last,
+        cost=job.cost,
+    )

@@ -25,12 +25,14 @@ import nlopt
 import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
-from knightcube.gnc.guidance.one_axis.path import CubicPrey, LglRule, lgl_rule
 from knightcube.gnc.guidance.one_axis.plant import (
     SQUARE_Q2_WITHOUT_AUTHORITY,
+    CubicPrey,
+    LglRule,
     PathCost,
     SingleAxisPlant,
     current_and_slopes,
+    lgl_rule,
 )
 
 DENSE_POINTS = 769

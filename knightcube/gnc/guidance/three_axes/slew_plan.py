@@ -34,21 +34,24 @@ from knightcube.gnc.guidance.three_axes.attitude_law import (
     references,
 )
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCraft, SlewDynamics, SlewPath
-from knightcube.gnc.guidance.three_axes.slew_program import Iterate, SlewProgram, Trajectory
-from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
-from knightcube.gnc.guidance.three_axes.slew_task import (
+from knightcube.gnc.guidance.three_axes.slew_model import (
     NODES,
     AttitudeEnd,
     BoresightEnd,
     End,
     EndLaw,
+    EnvironmentAt,
+    SlewCraft,
+    SlewDynamics,
+    SlewPath,
     SlewTask,
     along,
     blocking_cone,
     check,
     cones,
 )
+from knightcube.gnc.guidance.three_axes.slew_program import Iterate, SlewProgram, Trajectory
+from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
 
 _STEPS = 4
 """Runge-Kutta steps per interval, an even number."""

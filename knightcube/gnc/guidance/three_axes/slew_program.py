@@ -25,8 +25,14 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray, IntArray
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.three_axes.slew_model import EnvironmentAt, SlewCraft, SlewDynamics
-from knightcube.gnc.guidance.three_axes.slew_task import ConeConstraints, EndConditions, EndLaw
+from knightcube.gnc.guidance.three_axes.slew_model import (
+    ConeConstraints,
+    EndConditions,
+    EndLaw,
+    EnvironmentAt,
+    SlewCraft,
+    SlewDynamics,
+)
 
 STEP = 31
 """Unknowns of one interval."""

@@ -25,11 +25,18 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.gnc.guidance.three_axes.slew_model import (
+    HORIZON_RANGE,
+    LEAST_TIME,
+    BoresightEnd,
+    ConeConstraints,
+    End,
     HermiteCubic,
     SlewCraft,
     SlewDynamics,
     SlewEnvironment,
     SlewPath,
+    SlewTask,
+    blocking_cone,
     cross,
     shown,
 )
@@ -41,15 +48,6 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
     SlewProgram,
     Trajectory,
     Transcription,
-)
-from knightcube.gnc.guidance.three_axes.slew_task import (
-    HORIZON_RANGE,
-    LEAST_TIME,
-    BoresightEnd,
-    ConeConstraints,
-    End,
-    SlewTask,
-    blocking_cone,
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8

@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.control.pointing_table import PointingTable, table_along
 from knightcube.gnc.guidance.three_axes.attitude_law import references
-from tests.knightcube.gnc.control.three_axes.pointing_cases import INERTIA, LAW, ORBIT, STEP, WEIGHTS
+from tests.knightcube.gnc.control.pointing_cases import (
+    INERTIA,
+    LAW,
+    ORBIT,
+    STEP,
+    WEIGHTS,
+)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from knightcube.gnc.control.three_axes.pointing_law import FAR, SLOW
+from knightcube.gnc.control.pointing_law import FAR, SLOW
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 NADIR = PointingTarget(Goal.NADIR, roll=0.0)

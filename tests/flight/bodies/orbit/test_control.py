@@ -11,7 +11,7 @@ from hal.interfaces.devices import StringReading
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.detumble import WindowSchedule
-from knightcube.gnc.control.three_axes.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
+from knightcube.gnc.control.sun_acquisition import MEMORY, SunAcquisition, SunAcquisitionSettings
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUN = np.array([0.36, 0.48, 0.8])

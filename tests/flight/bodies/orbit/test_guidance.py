@@ -18,12 +18,19 @@ from flight.bodies.orbit.guidance import (
 )
 from flight.loop.body import Target
 from hal.interfaces.wires import SECOND_NS
-from knightcube.gnc.control.three_axes.pointing_job import PointingJob, SlewRequest
-from knightcube.gnc.control.three_axes.pointing_law import LEAVING
+from knightcube.gnc.control.pointing_job import PointingJob, SlewRequest
+from knightcube.gnc.control.pointing_law import LEAVING
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, BodyAxes
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, STILL
-from tests.knightcube.gnc.control.three_axes.pointing_cases import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+from tests.knightcube.gnc.control.pointing_cases import (
+    INERTIA,
+    LIMIT,
+    ORBIT,
+    WEIGHTS,
+    X,
+    Z,
+)
 
 RESIDUAL = np.array([1e-3, 0.0, 0.0])
 WISH = SlewRequest(300.0, np.ones(3), np.zeros(3), Z)

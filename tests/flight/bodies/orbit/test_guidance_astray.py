@@ -8,9 +8,9 @@ import numpy as np
 
 from flight.bodies.orbit.guidance import PointingPaths
 from hal.interfaces.wires import SECOND_NS
-from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.control.pointing_table import PointingTable
 from tests.flight.bodies.orbit.guidance_tables import AWAY, NADIR, NEAR, QUICK, STILL
-from tests.knightcube.gnc.control.three_axes.pointing_cases import LIMIT
+from tests.knightcube.gnc.control.pointing_cases import LIMIT
 
 
 def test_the_path_is_flown_until_the_body_is_far_off_and_again_with_a_new_plan(table: PointingTable) -> None:

@@ -14,12 +14,12 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from knightcube.gnc.control.three_axes.pointing_job import LEAD, PointingJob, run
-from knightcube.gnc.control.three_axes.pointing_law import PointingLaw
-from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
+from knightcube.gnc.control.pointing_job import LEAD, PointingJob, run
+from knightcube.gnc.control.pointing_law import PointingLaw
+from knightcube.gnc.control.pointing_table import PointingWeights
 from knightcube.gnc.guidance.three_axes.attitude_law import BodyAxes, following, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.tracking.tracker import ObjectTracker, TrackSettings
+from knightcube.gnc.tracker import ObjectTracker, TrackSettings
 from tests.support.object_passes import PIXEL, sightings
 
 BORESIGHT = np.array([0.0, -1.0, 0.0])

@@ -7,11 +7,16 @@ import pytest
 
 from knightcube.astro.earth.disturbance import AIR, Pressures, box_areas, pressures, shapes
 from knightcube.astro.quaternion import attitude_matrix, normalise
-from knightcube.gnc.control.three_axes.pointing_job import slew
-from knightcube.gnc.guidance.three_axes.slew_task import along
+from knightcube.gnc.control.pointing_job import slew
+from knightcube.gnc.guidance.three_axes.slew_model import along
 from sim_hal.worlds.free_body import CRAFTS, air_torque, box
-from tests.knightcube.gnc.control.three_axes.pointing_cases import ORBIT
-from tests.knightcube.gnc.control.three_axes.pointing_requests import AXES, BEGIN, NADIR, WISH
+from tests.knightcube.gnc.control.pointing_cases import ORBIT
+from tests.knightcube.gnc.control.pointing_requests import (
+    AXES,
+    BEGIN,
+    NADIR,
+    WISH,
+)
 
 ARM = np.array([0.012, -0.009, 0.013])
 """m."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.horizon.illumination import limb_rays, sun_elevation

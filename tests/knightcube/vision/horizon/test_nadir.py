@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import FloatArray, Image
-from knightcube.astro.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray, Image, tangent_basis
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from knightcube.reference.horizon import fit_circle

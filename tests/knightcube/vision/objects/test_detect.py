@@ -15,7 +15,7 @@ import pytest
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.attitude.olae import rotation_between
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_matrix
-from knightcube.gnc.tracking.tracker import FrameSightings, ObjectTracker, TrackSettings
+from knightcube.gnc.tracker import FrameSightings, ObjectTracker, TrackSettings
 from knightcube.vision.frame_job import run
 from knightcube.vision.objects.detect import (
     ObjectReport,

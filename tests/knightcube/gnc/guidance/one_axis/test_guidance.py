@@ -10,8 +10,7 @@ import pytest
 
 from knightcube.errors import UsageError
 from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, GuidanceState, PathGuidance
-from knightcube.gnc.guidance.one_axis.path import PolynomialPath
-from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.one_axis.plant import PolynomialPath, SingleAxisPlant, angle_of
 from knightcube.gnc.guidance.one_axis.vmc import StepPlan, plan
 from tests.support.step_problems import KNIGHTCUBE
 

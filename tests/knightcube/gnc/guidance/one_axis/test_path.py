@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.path import CubicPrey, lgl_rule
+from knightcube.gnc.guidance.one_axis.plant import CubicPrey, lgl_rule
 
 
 @pytest.mark.parametrize(

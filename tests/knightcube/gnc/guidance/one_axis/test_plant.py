@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from knightcube.errors import UsageError
-from knightcube.gnc.guidance.one_axis.path import PolynomialPath
 from knightcube.gnc.guidance.one_axis.plant import (
+    PolynomialPath,
     SingleAxisPlant,
     acceleration_of,
     angle_of,

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.errors import PlanningError
-from knightcube.gnc.guidance.one_axis.path import FARTHEST
-from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, angle_of, q2_of
+from knightcube.gnc.guidance.one_axis.plant import FARTHEST, PathCost, SingleAxisPlant, angle_of, q2_of
 from knightcube.gnc.guidance.one_axis.vmc import FINE_NODES, PlanStatus, StepPlan, plan
 from knightcube.gnc.guidance.one_axis.vmc_program import (
     BoundaryStates,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.three_axes.slew_model import AttitudeEnd, BoresightEnd, Cone
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_task
-from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd, BoresightEnd, Cone
 from tests.support.random_slews import clearance, slews
 from tests.support.recorded_slews import (
     flown,

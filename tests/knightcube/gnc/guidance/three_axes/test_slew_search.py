@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro.quaternion import angle_between, attitude_matrix
+from knightcube.gnc.guidance.three_axes.slew_model import AttitudeEnd
 from knightcube.gnc.guidance.three_axes.slew_search import SlewSolver, guesses
-from knightcube.gnc.guidance.three_axes.slew_task import AttitudeEnd
 from tests.support.random_slews import slews
 
 

@@ -1,0 +1,419 @@
+"""Detumbling of a free satellite by its magnetometer, with gyro and attitude where they are known.
+
+The field of the coils swamps the magnetometer, so the coils pause: off to settle, off to measure, then on.
+From the samples of the pauses a filter estimates the full body rate and the rotation of the field among the
+stars (`knightcube.gnc.estimation.field_rate`). A gyro gives the rate along the field at once. The momentum
+plan uses the field expected ahead: that of the orbit if the attitude is known, else the measured field,
+rotated at its present speed. Unlike B-dot, the law cannot get stuck with the spin along the field: the plan
+holds the momentum along the field until the field has rotated. A single sample starts nothing. The coils stay
+off until `TRUSTED` samples in a row agree with the prediction of the filter and the standard deviation of the
+rate across the field is below `BOUNDED`; until then no pause is needed. They wait again if no sample was
+accepted for `SILENT_PERIODS` periods, because a restarted sensor may deliver fields of which none is usable.
+
+The momentum plan stops the body in the least time with the predicted field. In inertial axes the angular
+momentum obeys h' = m x B, without the body's inertia and attitude. By Pontryagin's principle the dipole of
+least time has the length L of its limit and the direction of -B x y with one constant vector y. A time T
+suffices for all but a rest r of the momentum exactly if, for every y,
+
+    h . y <= L integral of |B x y| over T + r |y|,
+
+so T is the least time at which the worst y satisfies it, and that y is the plan. The worst y has A(y) y along
+h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that
+equation (iteratively reweighted least squares). A field that keeps its direction cannot remove the momentum
+along itself: the plan then adds momentum across it, which the rotation of the field converts. Without a rest,
+the last momentum along a slowly rotating field would take all of the time.
+
+In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
+that: at the bound no dipole is commanded that makes the body faster. A bound at the initial rate costs time,
+because such a spin is then stopped only after the field has rotated by a right angle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray, cross_product
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
+from knightcube.errors import UsageError
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
+
+ITERATIONS = 12
+LIMIT_GAIN = 1.4
+"""Mean strength of three coils over the limit of one, in a rotating body; if all were saturated, 1.5."""
+STEEP = 12.0
+"""Multiple of the mean of |B x y| at which a coil reaches its limit. The least time saturates all coils, but
+noise in B would switch them where B x y is small."""
+FLAT = 0.02
+"""Floor of |B x y| relative to its largest value, which keeps the weights finite."""
+FINENESS = 60
+"""The horizon is found to within one part in this number."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MomentumPlan:
+    """A momentum plan.
+
+    Attributes:
+        costate: (3,) A m^2/T, inertial axes; zero for a body at rest. The dipole -B x costate reaches the
+            coils' limit at a small multiple of its mean over the plan.
+        horizon: s, the time at which the body is at rest.
+    """
+
+    costate: FloatArray
+    horizon: float
+
+
+def momentum_plan(
+    momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
+) -> MomentumPlan:
+    """Return the plan that removes `momentum` (3,) N m s except `rest` N m s in the least time.
+
+    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
+    momentum; `limit` A m^2 is of each coil. If all times do not suffice, the plan removes as much as possible
+    and its horizon is their span. Raises UsageError for a field of fewer than three instants.
+    """
+    if len(field) < 3:
+        raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
+    size = math.sqrt(float(momentum @ momentum))
+    if size <= rest:
+        return MomentumPlan(np.zeros(3), 0.0)
+    spans = np.diff(times, append=2.0 * times[-1] - times[-2])
+    square = np.einsum("ni,ni->n", field, field)
+    effect = square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]
+    ahead = _FieldPreview(field, effect * spans[:, None, None], LIMIT_GAIN * limit, rest)
+    short, long = 2, len(field)
+    costate = ahead.worst(momentum, long, momentum / size)
+    while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
+        middle = (short + long) // 2
+        found = ahead.worst(momentum, middle, costate)
+        if float(momentum @ found) > float(found @ ahead.matrix(found, middle) @ found):
+            short = middle
+        else:
+            costate, long = found, middle
+    mean = float(ahead.across(costate, long) @ spans[:long]) / float(spans[:long].sum())
+    return MomentumPlan(costate * (STEEP * limit / mean), float(times[long - 1] + spans[long - 1]))
+
+
+def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
+    """Return the dipole (3,) A m^2 of a plan in a field (3,) T, body axes, each coil clipped at `limit`.
+
+    Clipping one coil does not affect the others, because each coil removes momentum by itself.
+    """
+    return np.clip(-cross_product(field, costate), -limit, limit)
+
+
+def without_speed_up(
+    dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray
+) -> FloatArray:
+    """Return the dipole (3,) without the part whose torque makes a body faster.
+
+    `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No coil gets more than the largest had.
+    """
+    grows = cross_product(field, inverse @ rate)  # of |rate|^2 / 2 by A m^2
+    gained, square = float(dipole @ grows), float(grows @ grows)
+    if gained <= 0.0 or square == 0.0:
+        return dipole
+    left = dipole - grows * (gained / square)
+    largest, before = float(np.abs(left).max()), float(np.abs(dipole).max())
+    return left if largest <= before else left * (before / largest)
+
+
+def rotating_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the predicted field (n, 3) T at `times` (n,) s from now on, rotating at its present rate.
+
+    `field` (3,) T and its derivative `change` (3,) T/s are inertial; the strength is kept.
+    """
+    strength = math.sqrt(float(field @ field))
+    along = field / strength
+    across = change - along * float(along @ change)
+    speed = math.sqrt(float(across @ across)) / strength
+    if speed == 0.0:
+        return np.broadcast_to(field, (len(times), 3)).copy()
+    angle = speed * times[:, None]
+    return np.asarray(strength * np.cos(angle) * along + np.sin(angle) * across / speed)
+
+
+def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
+    """Return `fields` (n, 3) rotated by the smallest rotation that aligns the first with `field` (3,).
+
+    The measured field is more accurate than a field predicted with a coarse attitude.
+    """
+    first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
+    wanted = field / math.sqrt(float(field @ field))
+    middle = first + wanted
+    square = float(middle @ middle)
+    if square < 1.0:  # more than 120 deg: such a prediction is not corrected
+        return fields
+    # Two reflections: across the middle, which swaps the two, and back across `wanted`.
+    halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
+    back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
+    return np.asarray(fields @ (back @ halves).T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FieldPreview:
+    """The predicted field of a momentum plan.
+
+    Attributes:
+        field: (n, 3) T.
+        effect: (n, 3, 3) on the momentum.
+        reach: A m^2, strength of the dipole.
+        rest: N m s, momentum that may remain.
+    """
+
+    field: FloatArray
+    effect: FloatArray
+    reach: float
+    rest: float
+
+    def across(self, y: FloatArray, count: int) -> FloatArray:
+        """Return |B x y| (count,), bounded away from zero."""
+        found = np.cross(self.field[:count], y)
+        across = np.sqrt(np.einsum("ni,ni->n", found, found))
+        strength = math.sqrt(float(self.field[0] @ self.field[0]))
+        return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
+
+    def matrix(self, y: FloatArray, count: int) -> FloatArray:
+        """Return A(y) (3, 3) for `count` instants and a unit vector y."""
+        weight = self.reach / self.across(y, count)
+        return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
+
+    def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
+        """Return the unit vector (3,) whose momentum takes longest to remove, for `count` instants."""
+        y = guess
+        for _ in range(ITERATIONS):
+            found = np.linalg.solve(self.matrix(y, count), momentum)
+            y = np.asarray(found / math.sqrt(float(found @ found)))
+        return y
+
+
+TRUSTED = 4
+"""Number of consecutive samples that must agree before the coils act."""
+BOUNDED = 0.02
+"""Largest standard deviation (rad/s) of the rate across the field at which the coils begin to act."""
+SILENT_PERIODS = 2
+"""Number of periods without an accepted sample after which the coils wait again."""
+OLDEST_NS = 100_000_000
+"""Largest age (ns) of a sample relative to the last command; its field is propagated with the body's rate."""
+INSTANTS = 150
+DENSER = 1.5
+"""Exponent of the spacing of the instants: of 1,500 s the first step is a second, the last 15."""
+LEFT = 0.7
+"""Fraction of a slow body's momentum that a plan may leave."""
+FEW, SOON = 4.0, 5.0
+"""Momentum below FEW x LEFT, with at most LEFT along the field, is removed within SOON seconds."""
+KNOWN = 2e-3
+"""Standard deviation (rad/s) of the rate's worst axis below which the speed bound is set."""
+_SECOND = 1e-9
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldDetumblerSettings:
+    """Settings of the field detumbler.
+
+    Attributes:
+        limit: A m^2 of each coil.
+        horizon: s of field prediction; a quarter of an orbit.
+        replan: s, between plans.
+        gentle: rad/s; a body slower than this at the start is never made faster than its initial rate.
+        spin_up: multiple of its initial rate that a faster body may reach.
+        slow: rad/s; a body slower than this is detumbled.
+    """
+
+    limit: float
+    horizon: float = 1500.0
+    replan: float = 5.0
+    gentle: float = 0.052
+    spin_up: float = 2.0
+    slow: float = 8.7e-3
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for settings that are not finite and positive."""
+        for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
+
+    @property
+    def instants(self) -> FloatArray:
+        """Times (n,) s after a plan at which the field is needed; denser at the start."""
+        return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
+
+
+class FieldDetumbler:
+    """Runs the pauses: takes magnetometer samples and returns the dipole of each cycle, in order of time."""
+
+    def __init__(
+        self,
+        schedule: WindowSchedule,
+        braking: FieldDetumblerSettings,
+        settings: FieldRateSettings,
+        expected: Callable[[int], FloatArray | None] = lambda _: None,
+    ) -> None:
+        """Use the given settings; `expected` predicts the field (n, 3) T at `braking.instants` after a time.
+
+        The prediction is in the body axes of that time, and None while attitude or orbit are unknown.
+        """
+        self._schedule = schedule
+        self._braking = braking
+        self._expected = expected
+        self._filter = FieldRate(settings)
+        # The residual momentum may lie along any axis.
+        moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
+        self._rest = LEFT * braking.slow * moment
+        self.begin(0)
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the first pause without knowledge of the field."""
+        self._begun_ns = self._time_ns = self._commanded_ns = now_ns
+        self._dipole = _NO_DIPOLE
+        self._plan: MomentumPlan | None = None
+        self._planned_ns = now_ns
+        self._planned_rotation = _NO_DIPOLE
+        self._agreed = 0
+        self._bounded = False
+        self._driven_ns = now_ns  # until now another mode may have driven the coils
+        self._accepted_ns = now_ns
+        self._fastest = math.inf
+        self._filter.restart()
+
+    def listens(self, time_ns: int) -> bool:
+        """Return whether a field of `time_ns` is usable: in a pause, or before the filter is trusted."""
+        schedule = self._schedule
+        if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
+            return True
+        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
+        inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
+        return time_ns >= self._begun_ns and inside
+
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
+
+        `rate` (3,) rad/s is measured by a gyro at the same time. A command may have been given since.
+        """
+        age_ns = self._time_ns - time_ns
+        if not self.listens(time_ns) or age_ns > OLDEST_NS:
+            return
+        if age_ns < 0:
+            self._advance(time_ns)
+        starts = self._filter.restarts
+        accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
+        if accepted:
+            self._accepted_ns = time_ns
+        if accepted and self._filter.started:
+            self._agreed += 1
+            if rate is not None and self._agreed >= TRUSTED:
+                self._filter.measure_rate(rate)
+            if not self._bounded:
+                self._bounded = self._agreed >= TRUSTED and _sigma_across(self._filter) < BOUNDED
+        if self._filter.restarts != starts or (not accepted and not self.trusted):
+            self._distrust()
+
+    def dipole(self, now_ns: int) -> FloatArray:
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is unknown."""
+        schedule = self._schedule
+        if self._filter.started:  # before that, time passes from sample to sample
+            self._advance(max(now_ns, self._time_ns))
+        if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
+            self._distrust()
+        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
+        acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
+        self._commanded_ns = now_ns
+        self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
+        return self._dipole
+
+    def acts(self, dipole: FloatArray) -> None:
+        """Report a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        if self._dipole.any() or dipole.any():
+            self._driven_ns = self._commanded_ns
+        self._dipole = dipole
+
+    @property
+    def trusted(self) -> bool:
+        """Whether enough samples agreed and the uncertainty of the rate is bounded."""
+        return self._bounded
+
+    @property
+    def rate(self) -> FloatArray | None:
+        """Body rate (3,), rad/s; None before it is known."""
+        return self._filter.rate if self.trusted else None
+
+    @property
+    def field(self) -> FloatArray | None:
+        """Field (3,) T in body axes at the last time; None before it is known."""
+        return self._filter.field if self.trusted else None
+
+    @property
+    def rate_sigma(self) -> float:
+        """Standard deviation of the rate's worst axis, rad/s; infinite before it is known."""
+        if not self.trusted:
+            return math.inf
+        return math.sqrt(float(np.linalg.eigvalsh(self._filter.covariance[RATE, RATE])[-1]))
+
+    @property
+    def restarts(self) -> int:
+        """Number of filter restarts after contradicting samples, as by a spin too fast for the sampling."""
+        return self._filter.restarts
+
+    def _distrust(self) -> None:
+        """Switch the coils off until samples agree."""
+        self._agreed, self._bounded = 0, False
+        self._plan = None
+
+    def _advance(self, time_ns: int) -> None:
+        self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)
+        self._time_ns = time_ns
+
+    def _braking_dipole(self, now_ns: int) -> FloatArray:
+        found, braking = self._filter, self._braking
+        dipole = braking_dipole(self._costate(now_ns), found.field, braking.limit)
+        rate = found.rate
+        speed = math.sqrt(float(rate @ rate))
+        if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
+            self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
+        return (
+            without_speed_up(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
+        )
+
+    def _costate(self, now_ns: int) -> FloatArray:
+        """Return the present costate (3,) A m^2/T, in body axes."""
+        found = self._filter
+        field, momentum = found.field, found.momentum
+        square, along = float(field @ field), float(momentum @ field)
+        little = float(momentum @ momentum) <= (FEW * self._rest) ** 2
+        if little and along * along <= square * self._rest**2:
+            return np.asarray(momentum / (square * SOON))
+        if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
+            self._plan, self._planned_ns, self._planned_rotation = (
+                self._planned(now_ns),
+                now_ns,
+                found.rotation,
+            )
+        # The plan is inertially fixed: rotate it into the present body axes.
+        since = attitude_matrix(multiply(found.rotation, conjugate(self._planned_rotation)))
+        return np.asarray(since @ self._plan.costate)
+
+    def _planned(self, now_ns: int) -> MomentumPlan:
+        """Return a momentum plan in the present body axes."""
+        found, times = self._filter, self._braking.instants
+        expected = self._expected(now_ns)
+        if expected is None:
+            ahead = rotating_field(found.field, found.change, times)
+        else:
+            ahead = aligned_to(expected, found.field)
+        share = self._schedule.act_ns / self._schedule.period_ns
+        return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
+
+
+def _sigma_across(found: FieldRate) -> float:
+    """Return the standard deviation of the rate across the field in its worst direction, rad/s."""
+    field = found.field
+    across = np.eye(3) - np.outer(field, field) / float(field @ field)
+    spread = across @ found.covariance[RATE, RATE] @ across
+    return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))

@@ -1,0 +1,382 @@
+"""The planner's job of a satellite: from an orbit, an attitude and a target to a table of the pointing law.
+
+The field and the torques are predicted along the orbit for a revolution and a quarter, which the last stored
+gains need as preview. A third of a revolution is stored. A passing object is gone within minutes: its tables
+are short and fine, and are computed again with each sighting.
+
+Far from the law, the way into it can be a slew of minimum heat, planned by `slew_plan` with the torques that
+the filter estimates. The dipoles of the slew are flown as planned, because a criterion that weighs rotation
+error against dipole would leave the path of minimum heat. The gains are those of linear-quadratic tracking
+along slew and law, with the field of the revolution ahead; an error at the end of the slew has the highest
+cost. The table also holds the change of the dipole per change of the estimated torques.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures, box_areas, pressures, shapes
+from knightcube.astro.earth.ephemeris import Ephemeris, predict
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from knightcube.errors import PlanningError
+from knightcube.gnc.control.pointing_path import (
+    CostToGo,
+    SweepCost,
+    linearised,
+    sweep,
+)
+from knightcube.gnc.control.pointing_table import (
+    PointingPreview,
+    PointingTable,
+    PointingWeights,
+    pointing_table,
+    step_costs,
+)
+from knightcube.gnc.guidance.three_axes.attitude_law import (
+    AttitudeReferences,
+    Attitudes,
+    BodyAxes,
+    approach,
+    following,
+    law_of,
+    references,
+)
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath, SlewTask, along, cones
+from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
+
+RESERVE = 0.8
+"""Fraction of the coils' limit that a slew is planned with; the rest corrects errors."""
+STIFFER = 5.0
+"""Factor on the dipole of unit cost during a slew."""
+LONGEST = 1_500.0
+"""Longest slew, s; a table also needs some of the law after it."""
+FINE = 5
+"""Steps of a slew per step of pointing, because a slewing body rotates farther per step."""
+TAIL = 300.0
+"""Duration (s) of the law after a slew that is included in its gains."""
+END = 2_000.0
+"""Time (s) for which an error costs as much as at the end of a slew. The torques are not known well before
+the slew, and their effects should be gone by its end."""
+_SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
+"""Factor beyond the excess of the rate on the time of a slew that rotates too fast, largest factor, and
+number of trials."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlewRequest:
+    """The parameters of slews into a pointing target.
+
+    Attributes:
+        seconds: requested duration; longer if that does not suffice.
+        heat: (3,) W/(A m^2)^2 of the coils.
+        residual: (3,) A m^2, the residual dipole of the satellite.
+        camera, angles: body axis (3,) that keeps the exclusion cones of `sun`, `earth` and `moon`, rad.
+    """
+
+    seconds: float
+    heat: FloatArray
+    residual: FloatArray
+    camera: FloatArray
+    angles: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlewStart:
+    """The state at the start of a slew.
+
+    Attributes:
+        quaternion, rate: (4,) and (3,) rad/s, at the first of `times`.
+        times: (m,) s, equally spaced, preview included.
+        kept: number of steps of the table.
+        inertia: (3, 3) kg m^2.
+        limit: A m^2 of each coil, mean.
+        sizes: (9,) N m of the torques.
+    """
+
+    quaternion: FloatArray
+    rate: FloatArray
+    times: FloatArray
+    kept: int
+    inertia: FloatArray
+    limit: float
+    sizes: FloatArray
+
+
+def slew(
+    begin: SlewStart,
+    wish: SlewRequest,
+    target: PointingTarget,
+    axes: BodyAxes,
+    ahead: Ephemeris,
+    fastest: float,
+) -> SlewPath | None:
+    """Return the slew into a target's law that stays slower than `fastest` rad/s; None if there is none.
+
+    Exclusion cones are kept unless the body already is inside one or no slew keeps them.
+    """
+    first = float(begin.times[0])
+    craft = SlewCraft(begin.inertia, np.full(3, RESERVE * begin.limit), wish.heat, wish.residual)
+    task = SlewTask(
+        craft.facing(begin.sizes),
+        along(ahead, first),
+        begin.quaternion,
+        begin.rate,
+        end_law(target, axes, ahead, first),
+        wish.seconds,
+        LONGEST,
+        cones=cones(ahead, first, wish.camera, **wish.angles),
+    )
+    found = _slow_enough(task, fastest)
+    if found is None and task.cones:
+        task = replace(task, cones=())
+        found = _slow_enough(task, fastest)
+    if found is None or not begin.sizes.any():
+        return found
+    # Air and sunlight act on areas that depend on the path.
+    pressed = along(ahead, first, box_areas(begin.inertia), found)
+    return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
+
+
+def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
+    """Return the path of a task, over a longer time if it would rotate too fast; None if there is none.
+
+    `near` is the path of a similar task.
+    """
+    for _ in range(_TRIALS):
+        try:
+            path = plan_task(task, near).path
+        except PlanningError:
+            return None
+        speed = float(np.linalg.norm(path.rate, axis=1).max())
+        if speed < fastest:
+            return path
+        longer = path.horizon * min(_SLOWER * speed / fastest, _MOST_SLOWER)
+        if longer > LONGEST:
+            return None
+        task, near = replace(task, horizon=longer), None
+    return None
+
+
+def slew_table(
+    begin: SlewStart,
+    path: SlewPath,
+    residual: FloatArray,
+    target: PointingTarget,
+    axes: BodyAxes,
+    ahead: Ephemeris,
+    expected: PointingPreview,
+    weights: PointingWeights,
+) -> PointingTable:
+    """Return the table of a slew and of the law after it, in steps of a fifth of the given times' step.
+
+    `residual` (3,) A m^2 is the residual dipole that the path was planned with. `expected` is the environment
+    at the times of `begin`; its motions are not used.
+    """
+    step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
+    law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
+    coarse = math.ceil(path.horizon / (FINE * step))
+    after = _since(expected, references(law, ahead, begin.times), coarse, begin.kept)
+    held = pointing_table(after, begin.inertia, begin.limit, weights)
+    count = FINE * coarse
+    times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
+    wanted = references(law, ahead, times)
+    flown = path.references(times[:count] - first)
+    dipole = path.dipoles(times[:count] + 0.5 * step - first) + residual  # the pointing law subtracts it
+    stop = count + round(TAIL / step)
+    tracked = _joined(flown, wanted.until(stop + 1))
+    gain, torque_part = _tracking(tracked, ahead, dipole, begin, weights)
+    dipoles, gains, torque_parts = (
+        np.concatenate([slewed, np.repeat(kept, FINE, axis=0)])
+        for slewed, kept in (
+            (dipole, held.dipole),
+            (gain, held.gain),
+            (torque_part, held.torque_part),
+        )
+    )
+    whole = _joined(flown, _finer(held.path, times, count))
+    return PointingTable(whole, wanted, dipoles, gains, torque_parts, begin.sizes, path)
+
+
+def _finer(path: AttitudeReferences, times: FloatArray, count: int) -> AttitudeReferences:
+    """Return a path at `times` (n,) s from the instant `count` on; earlier instants are not used."""
+    rest = [path.at(float(time)) for time in times[count:]]
+    whole = [*[rest[0]] * count, *rest]
+    return AttitudeReferences(
+        times,
+        np.array([part.quaternion for part in whole]),
+        np.array([part.rate for part in whole]),
+        np.array([part.acceleration for part in whole]),
+    )
+
+
+def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeReferences:
+    """Return `then` with its first instants replaced by `first`."""
+    count = len(first.times)
+    return AttitudeReferences(
+        then.times,
+        np.concatenate([first.quaternion, then.quaternion[count:]]),
+        np.concatenate([first.rate, then.rate[count:]]),
+        np.concatenate([first.acceleration, then.acceleration[count:]]),
+    )
+
+
+def _since(expected: PointingPreview, wanted: AttitudeReferences, count: int, kept: int) -> PointingPreview:
+    """Return the preview from instant `count` on, when the body is in the law."""
+    pressed = Pressures(expected.pressures.air[count:], expected.pressures.light[count:])
+    after = wanted.since(count)
+    begun = after.until(kept + 1 - count)
+    return PointingPreview(
+        after, begun, expected.field[count:], expected.position[count:], pressed, expected.sizes
+    )
+
+
+def _tracking(
+    tracked: AttitudeReferences,
+    ahead: Ephemeris,
+    dipole: FloatArray,
+    begin: SlewStart,
+    weights: PointingWeights,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the gains (n, 3, 6) along the dipoles (n, 3), and the dipoles per torque size (n, 3, sizes)."""
+    count, steps = len(dipole), len(tracked.times) - 1
+    times, step = tracked.times[:steps], float(tracked.times[1] - tracked.times[0])
+    planned = np.concatenate([dipole, np.zeros((steps - count, 3))])
+    linear = linearised(
+        tracked.until(steps), begin.inertia, ahead.field_at(times), ahead.position_at(times), planned
+    )
+    to_body = attitude_matrix(tracked.quaternion[:steps])
+    shape = shapes(pressures(ahead, times).facing(box_areas(begin.inertia), to_body), to_body)
+    affine = linear.by_torque @ shape
+    state, dipole_cost = step_costs(replace(weights, roll=None), step)
+    control = np.full((steps, 3), dipole_cost / STIFFER**2)
+    nothing, states = np.zeros(affine.shape), np.repeat(state[None], steps, axis=0)
+    states[count] *= END / step
+    cost = SweepCost(states, control, nothing, nothing[:, :3])
+    gain, steady, _ = sweep(linear, affine, cost, CostToGo(state, nothing[0]))
+    return gain[:count], steady[:count]
+
+
+@dataclass(frozen=True, slots=True)
+class TableSpan:
+    """Durations of the prediction and of the stored table, and the step of the table, s."""
+
+    preview: float
+    kept: float
+    step: float
+
+
+STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
+"""Spans of lasting goals, and of a passing object."""
+LEAD = 2.0
+"""Time (s) from the state to the start of the table."""
+FAR = math.radians(15.0)
+"""Angle (rad) from the law beyond which the way into it is a slew of minimum heat, if slews are
+configured."""
+WAY = 4.0
+"""Duration of the initial guess of the way into the law, in time scales of the law; the path found does not
+depend on it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectDirection:
+    """The direction (3,) of an object at `since` s after a job's origin, ICRS.
+
+    `velocity` (3,) 1/s is the relative velocity divided by the distance; zero for a fixed direction.
+    """
+
+    direction: FloatArray
+    velocity: FloatArray
+    since: float
+
+    @property
+    def span(self) -> TableSpan:
+        """The span of the object's tables."""
+        return PASSING if self.velocity.any() else STEADY
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointingJob:
+    """A job: the state of the orbit, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
+
+    Attributes:
+        inertia: (3, 3) kg m^2.
+        sizes: (9,) N m of the torques.
+        limit: A m^2 of each coil, mean.
+        slew: parameters of slews; None for a path by the weights alone.
+        sight: the object to point to instead of the target; None for the target.
+    """
+
+    number: int
+    origin_ns: int
+    orbit: OrbitState
+    inertia: FloatArray
+    axes: BodyAxes
+    weights: PointingWeights
+    target: PointingTarget
+    quaternion: FloatArray
+    rate: FloatArray
+    sizes: FloatArray
+    limit: float
+    slew: SlewRequest | None = None
+    sight: ObjectDirection | None = None
+
+    @property
+    def span(self) -> TableSpan:
+        """The span of the table."""
+        return STEADY if self.sight is None else self.sight.span
+
+
+def prepare() -> None:
+    """Import the modules that plan slews; the worker does so before its first job."""
+    from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
+
+
+def run(job: PointingJob) -> PointingTable:
+    """Return the table, its times in s after the origin; takes one second, or two from far off the law.
+
+    Raises FlightError if the field is not known, UsageError if the law has no attitude.
+    """
+    span = job.span
+    ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
+    times = np.arange(LEAD, span.preview, span.step)
+    kept = round(span.kept / span.step)
+    quaternion = multiply(from_rotation_vector(LEAD * job.rate), job.quaternion)
+    law = _law(job, quaternion, ahead)
+    field, wanted = ahead.field_at(times), references(law, ahead, times)
+    way = approach(law, quaternion, job.rate, LEAD, LEAD + _seconds(job, field))
+    found = PointingPreview(
+        wanted,
+        references(way, ahead, times[: kept + 1]),
+        field,
+        ahead.position_at(times),
+        pressures(ahead, times).facing(box_areas(job.inertia), attitude_matrix(wanted.quaternion)),
+        job.sizes,
+    )
+    wish = job.slew
+    if wish is not None and float(angle_between(quaternion, wanted.quaternion[0])) > FAR:
+        begin = SlewStart(quaternion, job.rate, times, kept, job.inertia, job.limit, job.sizes)
+        path = slew(begin, wish, job.target, job.axes, ahead, job.weights.fastest)
+        if path is not None:
+            return slew_table(begin, path, wish.residual, job.target, job.axes, ahead, found, job.weights)
+    return pointing_table(found, job.inertia, job.limit, job.weights)
+
+
+def _law(job: PointingJob, quaternion: FloatArray, ahead: Ephemeris) -> Attitudes:
+    """Return the law of a job that starts at an attitude (4,)."""
+    sight, axis = job.sight, job.axes.pointing
+    if sight is None:
+        return law_of(job.target, job.axes, quaternion, ahead, LEAD)
+    return following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
+
+
+def _seconds(job: PointingJob, field: FloatArray) -> float:
+    """Return the duration, s, of the initial guess: WAY times the time scale given by the weights."""
+    strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
+    square = strength * job.weights.dipole / (inertia * job.weights.turn)
+    return min(max(WAY / math.sqrt(square), 10.0 * job.span.step), job.span.kept)

@@ -1,0 +1,540 @@
+"""The path of pointing: the optimal motion of a body from its attitude into its attitude law, by LQ sweeps.
+
+The errors x are the small rotation and the rate error of the body relative to a motion, in the motion's axes.
+With the field b(t) expected in these axes,
+
+    turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
+
+where G is the stiffness of the gravity gradient and f the torque that the motion needs and that no other
+source provides. Riccati's equation is integrated backwards with its affine part s, cost-to-go
+x^T S x / 2 + s^T x (Psiaki 2001, J. Guid. Control Dyn. 24(2), with the preview added). The dipole is
+m = -(K x + k), held over a step. Each affine part has columns of its own, and k is linear in them. There may
+be controls besides the dipole.
+
+The path minimises one criterion, rotation error relative to the law plus dipole, over the field and the
+torques expected, with the full motion of the body and the limit of its coils. It is found by iterative
+linear-quadratic sweeps (Li & Todorov 2004, ICINCO; Tassa, Erez & Todorov 2012, IROS). Each iteration
+linearises about the last motion and simulates the result. Coils make no torque along the field, so motions
+that begin far off the law would tumble. The first sweeps therefore allow such a torque, at a cost that rises
+until the torque vanishes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray, cross_matrices
+from knightcube.astro.earth.disturbance import AIR, LIGHT, Pressures, shapes
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+
+_EYE3: FloatArray = np.eye(3)
+_EYE6: FloatArray = np.eye(6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearErrorModel:
+    """The linear model of the errors over n steps.
+
+    Attributes:
+        transition: (n, 6, 6).
+        by_control: (n, 6, controls); from `linearised` per A m^2 of each coil.
+        by_torque: (n, 6, 3), per N m.
+        missing: (n, 3) N m, f: the torque of the motion not provided by gravity.
+        field: (n, 3) T in the motion's axes.
+    """
+
+    transition: FloatArray
+    by_control: FloatArray
+    by_torque: FloatArray
+    missing: FloatArray
+    field: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepCost:
+    """The cost of n steps: x^T state x / 2 + state_slope^T x + control u^2 / 2 + control_slope^T u.
+
+    Attributes:
+        state: (n, 6, 6).
+        control: (n, controls).
+        state_slope, control_slope: (n, 6, columns) and (n, controls, columns).
+    """
+
+    state: FloatArray
+    control: FloatArray
+    state_slope: FloatArray
+    control_slope: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CostToGo:
+    """The cost-to-go: its quadratic part `square` (6, 6) S and its linear part `slope` (6, columns) s."""
+
+    square: FloatArray
+    slope: FloatArray
+
+
+def linearised(
+    references: AttitudeReferences,
+    inertia: FloatArray,
+    field: FloatArray,
+    position: FloatArray,
+    dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> LinearErrorModel:
+    """Return the linear model of the errors about references.
+
+    `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. `dipole` (n, 3) A m^2 is held in body axes, so
+    that an error rotates the field that acts on it. Each of `pressed` is a constant vector (3,) of the body,
+    N m, and a direction (n, 3) in ICRS axes with which it makes a torque.
+    """
+    rate, inverse = references.rate, np.linalg.inv(inertia)
+    slopes, shown, up = acceleration_slopes(
+        references.quaternion, rate, inertia, field, position, dipole, pressed
+    )
+    flow = np.zeros((len(rate), 6, 6))
+    flow[:, :3, :3], flow[:, :3, 3:], flow[:, 3:] = -cross_matrices(rate), _EYE3, slopes
+    dt = float(references.times[1] - references.times[0])
+    transition, pushed = _discrete(flow, dt)
+    by_torque = pushed @ inverse
+    momentum = rate @ inertia.T
+    missing = references.acceleration @ inertia.T + np.cross(rate, momentum) - _gradient(inertia, up)[0]
+    return LinearErrorModel(transition, -by_torque @ cross_matrices(shown), by_torque, missing, shown)
+
+
+def acceleration_slopes(
+    quaternion: FloatArray,
+    rate: FloatArray,
+    inertia: FloatArray,
+    field: FloatArray,
+    position: FloatArray,
+    dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return derivatives (n, 3, 6) of the accelerations by rotation and rate, and field and position.
+
+    The motion has attitudes (n, 4) and rates (n, 3) rad/s; the other arguments are those of `linearised`.
+    Field and position (n, 3) are returned in body axes.
+    """
+    turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
+    shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
+    slopes = np.empty((len(rate), 3, 6))
+    by_turn = _gradient(inertia, up)[1]
+    if dipole is not None:
+        by_turn = by_turn + cross_matrices(dipole) @ cross_matrices(shown)
+    for constant, direction in pressed:
+        met = cross_matrices(np.einsum("nij,nj->ni", turned, direction))
+        by_turn = by_turn + cross_matrices(constant[None]) @ met
+    slopes[:, :, :3] = inverse @ by_turn
+    slopes[:, :, 3:] = inverse @ (cross_matrices(rate @ inertia.T) - cross_matrices(rate) @ inertia)
+    return slopes, shown, up
+
+
+def sweep(
+    linear: LinearErrorModel, affine: FloatArray, cost: SweepCost, end: CostToGo
+) -> tuple[FloatArray, FloatArray, CostToGo]:
+    """Return K (n, controls, 6), k (n, controls, columns) and the cost-to-go at the start.
+
+    `affine` (n, 6, columns) is the affine part of the error model; `end` is the cost-to-go after the steps.
+    Takes 0.1 ms per step.
+    """
+    (count, controls), columns = cost.control.shape, affine.shape[2]
+    gain, steady = np.empty((count, controls, 6)), np.empty((count, controls, columns))
+    square, slope = end.square, end.slope
+    for k in range(count - 1, -1, -1):
+        push, drive = linear.by_control[k], linear.transition[k]
+        pushed = square @ push
+        spread = push.T @ pushed
+        spread.reshape(-1)[:: controls + 1] += cost.control[k]
+        ahead = slope + square @ affine[k]
+        sides = np.concatenate([pushed.T @ drive, push.T @ ahead + cost.control_slope[k]], axis=1)
+        found = np.linalg.solve(spread, sides)
+        gain[k], steady[k] = found[:, :6], found[:, 6:]
+        slope = drive.T @ ahead - sides[:, :6].T @ found[:, 6:] + cost.state_slope[k]
+        square = drive.T @ square @ drive - sides[:, :6].T @ found[:, :6] + cost.state[k]
+        square = 0.5 * (square + square.T)
+    return gain, steady, CostToGo(square, slope)
+
+
+def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return gravity's torque (n, 3) and its derivative by the rotation (n, 3, 3).
+
+    `up` (n, 3) m is the position in body axes.
+    """
+    radius = np.linalg.norm(up, axis=1)
+    down = -up / radius[:, None]
+    strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
+    stiff = down @ inertia.T
+    crossed = cross_matrices(down)
+    stiffness = strength[:, None, None] * ((crossed @ inertia - cross_matrices(stiff)) @ crossed)
+    return strength[:, None] * np.cross(down, stiff), stiffness
+
+
+def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+    """Return exp(F dt) (n, 6, 6) and the rate columns (n, 6, 3) of its integral, to the third order."""
+    first = flow * dt
+    second = first @ first
+    transition = _EYE6 + first + 0.5 * second + first @ second / 6.0
+    integral = dt * (_EYE6 + 0.5 * first + second / 6.0)
+    return transition, integral[:, :, 3:]
+
+
+RISES = (4.0, 2.0, 10.0)
+"""Factors between successive costs of a torque along the field, tried in turn until a path settles. They lead
+to different optima."""
+DEAR, PROHIBITIVE = 1e4, 1e6
+"""Costs of a torque along the field as multiples of the same torque across it: the end of the rise, and the
+last one."""
+SETTLED = math.radians(20.0)
+"""Largest angle (rad) from the law in the second half of a settled path."""
+SWEEPS = 8
+"""Largest number of sweeps at one cost of a torque along the field. The best motion is flown, converged or
+not."""
+SAVED = (0.05, 2e-3)
+"""Relative saving below which a sweep is the last one at its cost of a torque along the field, and at the
+last such cost."""
+NEAR = math.radians(10.0)
+"""Largest angle (rad) from the law of a motion that needs no torque along the field to start with."""
+EXCESS = 3e-5
+"""Excess (rad/s) over the largest rate that costs as much as the rotation that costs one."""
+SHARES = (1.0, 0.4, 0.15)
+"""Fractions of a sweep's change, tried in turn."""
+RUN_AWAY = 100.0
+"""Rate (rad/s) beyond which a diverging motion is not propagated further."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathConditions:
+    """The law and the predicted environment at the n + 1 instants of a path.
+
+    Attributes:
+        wanted: the law.
+        field, position: (n + 1, 3) T and m, ICRS.
+        pressures: shapes of the torques.
+        sizes: (9,) N m of the torques.
+        inertia, inverse: (3, 3) kg m^2, and its inverse.
+        limit: A m^2 of each coil.
+    """
+
+    wanted: AttitudeReferences
+    field: FloatArray
+    position: FloatArray
+    pressures: Pressures
+    sizes: FloatArray
+    inertia: FloatArray
+    inverse: FloatArray
+    limit: float
+
+    @cached_property
+    def around(self) -> FloatArray:
+        """Field, position, air and light as rows (n + 1, 4, 3)."""
+        around = np.empty((len(self.field), 4, 3))
+        around[:, 0], around[:, 1] = self.field, self.position
+        around[:, 2], around[:, 3] = self.pressures.air, self.pressures.light
+        return around
+
+    @cached_property
+    def twice(self) -> FloatArray:
+        """Block-diagonal matrix (6, 6) of the inertia twice, for position and rate at once."""
+        found: FloatArray = np.zeros((6, 6))
+        found[:3, :3] = found[3:, 3:] = self.inertia
+        return found
+
+    def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the attitude-dependent torques at the first instants, as `linearised` takes them."""
+        air, light = self.pressures.air[:count], self.pressures.light[:count]
+        return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
+
+    def until(self, count: int) -> PathConditions:
+        """Return the conditions at the first `count` instants."""
+        field, position, pressures = self.field[:count], self.position[:count], self.pressures.until(count)
+        return replace(
+            self, wanted=self.wanted.until(count), field=field, position=position, pressures=pressures
+        )
+
+    @property
+    def step(self) -> float:
+        """The time between instants, s."""
+        return float(self.wanted.times[1] - self.wanted.times[0])
+
+    def acceleration(
+        self, k: int, quaternion: FloatArray, rate: FloatArray, control: FloatArray
+    ) -> FloatArray:
+        """Return the acceleration (3,) at an attitude (4,) after instant k under a control (4,)."""
+        seen = self.around[k] @ attitude_matrix(quaternion).T
+        # Plain floats: several times as fast as arrays of three.
+        (bx, by, bz), (px, py, pz), (ax, ay, az), (lx, ly, lz) = seen.tolist()
+        mx, my, mz, along = control.tolist()
+        wx, wy, wz = rate.tolist()
+        gx, gy, gz, hx, hy, hz = (self.twice @ np.concatenate([seen[1], rate])).tolist()
+        cx, cy, cz, ux, uy, uz, vx, vy, vz = self.sizes.tolist()
+        pull = 3.0 * GRAVITATIONAL_PARAMETER / (px * px + py * py + pz * pz) ** 2.5
+        share = along / math.sqrt(bx * bx + by * by + bz * bz)
+        torque = (
+            cx + share * bx + my * bz - mz * by + pull * (py * gz - pz * gy)
+            + uy * az - uz * ay + vy * lz - vz * ly - wy * hz + wz * hy,
+            cy + share * by + mz * bx - mx * bz + pull * (pz * gx - px * gz)
+            + uz * ax - ux * az + vz * lx - vx * lz - wz * hx + wx * hz,
+            cz + share * bz + mx * by - my * bx + pull * (px * gy - py * gx)
+            + ux * ay - uy * ax + vx * ly - vy * lx - wx * hy + wy * hx,
+        )  # fmt: skip
+        return np.asarray(self.inverse @ np.array(torque))
+
+    def accelerations(self, quaternion: FloatArray, rate: FloatArray, dipole: FloatArray) -> FloatArray:
+        """Return accelerations (n, 3) at attitudes (n, 4) after the first instants under dipoles (n, 3)."""
+        count = len(quaternion)
+        shown = attitude_matrix(quaternion)
+        field = np.einsum("nij,nj->ni", shown, self.field[:count])
+        up = np.einsum("nij,nj->ni", shown, self.position[:count])
+        pull = 3.0 * GRAVITATIONAL_PARAMETER / np.linalg.norm(up, axis=1) ** 5
+        torque = np.cross(dipole, field) + pull[:, None] * np.cross(up, up @ self.inertia.T)
+        torque += shapes(self.pressures.until(count), shown) @ self.sizes
+        return np.asarray((torque - np.cross(rate, rate @ self.inertia.T)) @ self.inverse.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathCriterion:
+    """The cost of a step.
+
+    Attributes:
+        state: (6, 6), of rotation and rate errors relative to the law.
+        dipole: of each axis.
+        end: the cost-to-go of the law after the path. Its first column belongs to the law and the expected
+            torques, the others to each size of the torques.
+        shape: (n + 1, 3, sizes) of the torques in the law's axes.
+        fastest: rad/s; a faster rate has a high cost, `EXCESS`.
+    """
+
+    state: FloatArray
+    dipole: float
+    end: CostToGo
+    shape: FloatArray
+    fastest: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedMotion:
+    """A motion: attitudes (n + 1, 4), rates (n + 1, 3) rad/s, and controls (n, 4) held over the steps.
+
+    A control is a dipole (A m^2, body axes) and a torque along the field (N m).
+    """
+
+    quaternion: FloatArray
+    rate: FloatArray
+    control: FloatArray
+
+    def references(self, times: FloatArray) -> AttitudeReferences:
+        """Return the motion as references at its times (n + 1,) s."""
+        rises = np.diff(self.rate, axis=0) / (times[1] - times[0])
+        return AttitudeReferences(times, self.quaternion, self.rate, np.concatenate([rises, rises[-1:]]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionGains:
+    """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
+
+    The first column of k improves the motion, the others belong to each size of the torques.
+    """
+
+    gain: FloatArray
+    steady: FloatArray
+
+
+def best_path(
+    expected: PathConditions, initial: AttitudeReferences, criterion: PathCriterion
+) -> tuple[PlannedMotion, MotionGains]:
+    """Return the path from the start of `initial` (n + 1,) and its gains; `initial` leads into the law.
+
+    `initial` need not be feasible with coils. Takes 0.3 ms per instant and sweep. Raises PlanningError if the
+    body rotates too far in a step to be propagated.
+    """
+    rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
+    first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
+    near = float(_counted(expected.wanted, first, criterion).max()) < NEAR
+    best, least = first, math.inf
+    for rise in RISES:
+        motion, multiple = first, PROHIBITIVE if near else 1.0
+        while multiple < DEAR:
+            motion, multiple = _improved(expected, motion, criterion, multiple), multiple * rise
+        motion = _improved(expected, motion, criterion, PROHIBITIVE)
+        cost = _cost(expected, motion, criterion, PROHIBITIVE)
+        if cost < least:
+            best, least = motion, cost
+        later = _counted(expected.wanted, motion, criterion)[len(first.control) // 2 :]
+        if near or float(later.max()) < SETTLED:
+            break
+    return best, _swept(expected, best, criterion, PROHIBITIVE)
+
+
+def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
+    """Return the motion that the sweeps start with.
+
+    It is propagated with the given gains, or without control if it diverges under them: the torque along the
+    field has no limit, so that far from `rest` the gains may rotate the body by several revolutions in a
+    step.
+    """
+    nothing = MotionGains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
+    for tried in (gains, nothing):
+        if (first := propagate(expected, rest, tried, 1.0)) is not None:
+            return first
+    fastest = math.degrees(float(np.linalg.norm(rest.rate[0])))
+    raise PlanningError(f"no path: at {fastest:.1f} deg/s the body rotates too far in one step of the plan")
+
+
+def _improved(
+    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
+) -> PlannedMotion:
+    """Return the best motion near a feasible one for torques along the field at `multiple` cost."""
+    cost = _cost(expected, motion, criterion, multiple)
+    enough = SAVED[multiple == PROHIBITIVE]
+    for _ in range(SWEEPS):
+        gains, before = _swept(expected, motion, criterion, multiple), cost
+        for share in SHARES:
+            tried = propagate(expected, motion, gains, share)
+            found = math.inf if tried is None else _cost(expected, tried, criterion, multiple)
+            if tried is not None and found < cost:
+                motion, cost = tried, found
+                break
+        if before - cost < enough * before:
+            break
+    return motion
+
+
+def propagate(
+    expected: PathConditions, motion: PlannedMotion, gains: MotionGains, share: float
+) -> PlannedMotion | None:
+    """Return the motion from the same start with a fraction `share` of the computed change, and feedback.
+
+    None if it diverges: far from `motion` the torques along the field, which have no limit, drive it away.
+    """
+    count, step = len(motion.control), expected.step
+    quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
+    quaternion[0], rate[0] = q, w = motion.quaternion[0], motion.rate[0]
+    changed = motion.control - share * gains.steady[:, :, 0]
+    for k in range(count):
+        turn = to_rotation_vector(multiply(q, conjugate(motion.quaternion[k])))
+        u = changed[k] - gains.gain[k] @ np.concatenate([turn, w - motion.rate[k]])
+        u[:3] = np.clip(u[:3], -expected.limit, expected.limit)
+        middle = w + 0.5 * step * expected.acceleration(k, q, w, u)
+        if not np.abs([w, middle]).max() < RUN_AWAY:  # also true for NaN
+            return None
+        half = multiply(from_rotation_vector(0.5 * step * w), q)
+        w = w + step * expected.acceleration(k, half, middle, u)
+        q = multiply(from_rotation_vector(step * middle), q)
+        quaternion[k + 1], rate[k + 1], flown[k] = q, w, u
+    return PlannedMotion(quaternion, rate, flown) if np.abs(w).max() < RUN_AWAY else None
+
+
+def _swept(
+    expected: PathConditions,
+    motion: PlannedMotion,
+    criterion: PathCriterion,
+    multiple: float,
+    given: bool = False,
+) -> MotionGains:
+    """Return the gains about a motion.
+
+    A `given` motion takes torques that its controls do not make.
+    """
+    count, state, end = len(motion.control), criterion.state, criterion.end
+    first = motion.references(expected.wanted.times).until(count)
+    field = expected.field[:count]
+    pressed, position = expected.pressed(count), expected.position[:count]
+    linear = linearised(first, expected.inertia, field, position, motion.control[:, :3], pressed)
+    strength = np.linalg.norm(linear.field, axis=1)
+    along = linear.by_torque @ (linear.field / strength[:, None])[:, :, None]
+    linear = replace(linear, by_control=np.concatenate([linear.by_control, along], axis=2))
+    control = np.full((count, 4), criterion.dipole)
+    control[:, 3] *= multiple / strength**2
+    deviation, bent = errors(expected.wanted, motion), error_jacobians(expected.wanted, motion)
+    turned = np.swapaxes(bent, 1, 2)
+    columns = end.slope.shape[1]
+    affine, state_slope = np.zeros((2, count, 6, columns))
+    control_slope = np.zeros((count, 4, columns))
+    affine[:, :, 1:] = linear.by_torque @ criterion.shape[:count]
+    if given:
+        missing = criterion.shape[:count] @ expected.sizes - linear.missing
+        affine[:, :, 0] = np.einsum("nij,nj->ni", linear.by_torque, missing)
+    else:
+        state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, deviation[:-1])
+        control_slope[:, :, 0] = control * motion.control
+    states = turned[:-1] @ state @ bent[:-1]
+    steep, curved = _haste(motion.rate, criterion.fastest, expected.step)
+    state_slope[:, 3:, 0] += steep[:-1]
+    states[:, 3:, 3:] += curved[:-1]
+    slope, square = turned[-1] @ end.slope, turned[-1] @ end.square @ bent[-1]
+    slope[:, 0] += turned[-1] @ end.square @ deviation[-1]
+    slope[3:, 0] += steep[-1]
+    square[3:, 3:] += curved[-1]
+    last = CostToGo(square, slope)
+    cost = SweepCost(states, control, state_slope, control_slope)
+    gain, steady, _ = sweep(linear, affine, cost, last)
+    return MotionGains(gain, steady)
+
+
+def _cost(
+    expected: PathConditions, motion: PlannedMotion, criterion: PathCriterion, multiple: float
+) -> float:
+    """Return the cost of a motion, including the cost-to-go after it."""
+    deviation, end = errors(expected.wanted, motion), criterion.end
+    strength = np.linalg.norm(expected.field[:-1], axis=1)
+    squares = np.einsum("ni,ij,nj->", deviation[:-1], criterion.state, deviation[:-1])
+    squares += criterion.dipole * np.sum(motion.control[:, :3] ** 2)
+    squares += criterion.dipole * multiple * np.sum((motion.control[:, 3] / strength) ** 2)
+    excess = np.maximum(np.linalg.norm(motion.rate, axis=1) - criterion.fastest, 0.0)
+    squares += expected.step * np.sum((excess / EXCESS) ** 2)
+    return float(0.5 * squares + deviation[-1] @ (0.5 * end.square @ deviation[-1] + end.slope[:, 0]))
+
+
+def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return slope (n, 3) and curvature (n, 3, 3) of the cost of rates (n, 3) beyond the largest."""
+    speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
+    along = rate / speed[:, None]
+    excess, weight = np.maximum(speed - fastest, 0.0), step / EXCESS**2
+    outer = along[:, :, None] * along[:, None, :]
+    curved = (excess > 0.0)[:, None, None] * outer
+    curved = curved + (excess / speed)[:, None, None] * (np.eye(3) - outer)
+    return weight * excess[:, None] * along, weight * curved
+
+
+def errors(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
+    """Return the rotation and rate errors (n + 1, 6) of a motion relative to the law."""
+    turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
+    return np.concatenate([turn, motion.rate - wanted.rate], axis=1)
+
+
+def _counted(wanted: AttitudeReferences, motion: PlannedMotion, criterion: PathCriterion) -> FloatArray:
+    """Return the rotation error (n + 1,) rad relative to the law, weighted by its cost."""
+    turn, weights = errors(wanted, motion)[:, :3], criterion.state[:3, :3]
+    squares = np.einsum("ni,ij,nj->n", turn, weights, turn)
+    return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(weights)[-1]))
+
+
+def error_jacobians(wanted: AttitudeReferences, motion: PlannedMotion) -> FloatArray:
+    """Return the derivatives (n + 1, 6, 6) of the errors relative to the law by a small motion of the body.
+
+    The rotation block is the inverse of the left Jacobian of the rotation group, for scalar-last quaternions
+    that rotate inertial into body axes.
+    """
+    turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
+    angle = np.linalg.norm(turn, axis=1)
+    safe = np.where(angle < 1e-2, 1.0, angle)
+    second = np.where(angle < 1e-2, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    across = cross_matrices(turn)
+    bent = np.broadcast_to(np.eye(6), (len(turn), 6, 6)).copy()
+    bent[:, :3, :3] += 0.5 * across + second[:, None, None] * (across @ across)
+    return bent

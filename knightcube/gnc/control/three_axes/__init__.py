@@ -1,1 +1,0 @@
-"""Control of a free satellite by three magnetic coils alone."""

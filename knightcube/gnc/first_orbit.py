@@ -1,0 +1,334 @@
+"""A first orbit of an object from directions alone, observed from a known orbit, by all sightings at once.
+
+The unknowns are the direction, the velocity divided by the distance, and the logarithm of the distance, at
+the middle of the arc. Sightings of one pass determine the first five well and the distance badly: free fall
+close to the observer looks the same at every distance apart from the curvature by gravity. The distance is
+therefore scanned (as over the admissible region of Milani et al., Celestial Mechanics 90, 2004). For each
+distance the other five unknowns are fitted by Gauss-Newton, and the best fit is refined in all six. The
+interval of distances whose chi-square is within the 95 % bound of the minimum shows whether the arc suffices.
+Gauss's method gives the same distance with the noise of three sightings.
+
+Forces: a spherical Earth and J2. Directions are those in which a star at rest would appear: light time and
+aberration shift an object by its velocity relative to the Sun.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, tangent_basis
+from knightcube.astro.chi_square import bound
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT
+from knightcube.errors import FlightError
+
+_LONGEST_STEP = 10.0
+_SMOOTHING_ROUNDS = 3
+_STATE_STEPS = np.repeat([1.0, 1e-3], 3)
+"""Steps of the finite differences, m and m/s."""
+
+
+def smoothed(
+    times: FloatArray, states: FloatArray, sigma: FloatArray, middle: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the orbit that fits measured positions best: states (n, 6), and covariance (6, 6) at `middle`.
+
+    `sigma` (n,) m is the standard deviation of each axis of each position. The velocities of `states` are
+    only the initial guess.
+    """
+    state = states[middle]
+    covariance = np.eye(6)
+    weights = np.repeat(1.0 / sigma, 3)
+    for _ in range(_SMOOTHING_ROUNDS):
+        shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STATE_STEPS), -np.diag(_STATE_STEPS)])
+        flown = propagate_about(state + shifts, times, middle)[..., :3]
+        off = (flown[:, 0] - states[:, :3]).ravel() * weights
+        slope = (flown[:, 1:7] - flown[:, 7:]) / (2.0 * _STATE_STEPS[:, None])
+        jacobian = np.swapaxes(slope, 1, 2).reshape(-1, 6) * weights[:, None]
+        scaled = jacobian / np.linalg.norm(jacobian, axis=0)
+        size = np.linalg.norm(jacobian, axis=0)
+        covariance = np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
+        state = state - covariance @ (jacobian.T @ off)
+    return propagate_about(state[None], times, middle)[:, 0], covariance
+
+
+def propagate_about(start: FloatArray, times: FloatArray, middle: int) -> FloatArray:
+    """Return states (n, k, 6) at increasing times (n,) s from the states (k, 6) at `times[middle]`."""
+    ahead, behind = trajectories(start, times[middle:]), trajectories(start, times[middle::-1])
+    return np.concatenate([behind[:0:-1], ahead])
+
+
+def trajectories(start: FloatArray, times: FloatArray) -> FloatArray:
+    """Return states (n, k, 6) at monotonic times (n,) s from the states (k, 6) at the first time."""
+    found = [start]
+    for before, after in itertools.pairwise(times):
+        steps = max(1, math.ceil(abs(after - before) / _LONGEST_STEP))
+        state, step = found[-1], (after - before) / steps
+        for _ in range(steps):
+            a = _derivative(state)
+            b = _derivative(state + 0.5 * step * a)
+            c = _derivative(state + 0.5 * step * b)
+            d = _derivative(state + step * c)
+            state = state + step / 6.0 * (a + 2.0 * (b + c) + d)
+        found.append(state)
+    return np.array(found)
+
+
+def _derivative(state: FloatArray) -> FloatArray:
+    """Return velocity and acceleration (k, 6)."""
+    position = state[:, :3]
+    # Bound the acceleration of hypotheses deep inside the Earth.
+    square = np.maximum(np.sum(position**2, axis=1, keepdims=True), (0.5 * EARTH_RADIUS) ** 2)
+    flat = 1.5 * J2 * EARTH_RADIUS**2 / square
+    tilt = 5.0 * position[:, 2:] ** 2 / square
+    scale = 1.0 + flat * (np.array([1.0, 1.0, 3.0]) - tilt)
+    return np.hstack([state[:, 3:], -GRAVITATIONAL_PARAMETER / square**1.5 * scale * position])
+
+
+LEAST_SIGHTINGS = 6
+RATIO = 1.5
+"""Largest ratio of the ends of the distance interval for which an orbit is returned."""
+GROUND_CLEARANCE = 80e3
+"""Smallest perigee height (m) of a lasting orbit."""
+_NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
+"""Nearest and farthest distance of the scan, m, and the number of its logarithmically spaced distances."""
+_DEGREES_95 = 3.841
+"""95 % bound of chi-square with one degree of freedom."""
+_STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
+"""Steps of the central differences: rad, rad, 1/s, 1/s, 1/s, logarithm."""
+_LONGEST_STEPS = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
+"""Longest Gauss-Newton steps of the same unknowns, so that poor hypotheses do not diverge."""
+_ROUNDS, _FINAL_ROUNDS = 6, 20
+_MISFIT = 1e-6
+"""Probability of the chi-square below which the sightings are rejected as no free fall, or as having larger
+errors than stated."""
+
+
+class ArcError(FlightError):
+    """Raised if sightings determine no orbit; the message gives the reason with numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bearings:
+    """Directions observed from a known orbit.
+
+    Attributes:
+        times: (n,) s, increasing.
+        directions: (n, 3) unit vectors, ICRS.
+        sigma: (n,) rad, along each axis.
+        observer: (n, 6) m and m/s, ICRS about the Earth's centre.
+        earth: (3,) m/s of the Earth relative to the Sun.
+    """
+
+    times: FloatArray
+    directions: FloatArray
+    sigma: FloatArray
+    observer: FloatArray
+    earth: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstOrbit:
+    """An orbit at one time.
+
+    Attributes:
+        time: s.
+        state: (6,) m and m/s, ICRS.
+        covariance: (6, 6), without the observer's own error.
+        distance: m from the observer at that time.
+        interval: m, ends of the 95 % interval of the distance.
+        lasts: whether the orbit is bound to the Earth and clear of it. If not, the interval contains other
+            orbits that are.
+        chi_square: of the sightings, with `degrees` of freedom.
+        degrees: degrees of freedom.
+    """
+
+    time: float
+    state: FloatArray
+    covariance: FloatArray
+    distance: float
+    interval: tuple[float, float]
+    lasts: bool
+    chi_square: float
+    degrees: int
+
+
+def first_orbit(seen: Bearings) -> FirstOrbit:
+    """Return the orbit of an object. Raises ArcError if the sightings determine none."""
+    count = len(seen.times)
+    if count < LEAST_SIGHTINGS:
+        raise ArcError(f"{count} sightings: an orbit needs {LEAST_SIGHTINGS} or more")
+    fit = _ArcFit(seen)
+    logarithms = np.linspace(math.log(_NEAREST), math.log(_FARTHEST), _GRID)
+    inner, _ = _within(logarithms, fit.chi_square(fit.scan(logarithms)))
+    step = logarithms[1] - logarithms[0]
+    logarithms = np.linspace(inner[0] - step, inner[1] + step, _GRID)
+    tried = fit.scan(logarithms)
+    chi_square = fit.chi_square(tried)
+    _, (low, high) = _within(logarithms, chi_square)
+    possible = fit.admissible(tried) & (logarithms >= low) & (logarithms <= high)
+    if high - low > math.log(RATIO):
+        span = float(seen.times[-1] - seen.times[0])
+        raise ArcError(_too_short(span, (low, high), logarithms[possible]))
+    unknowns, covariance = fit.refine(tried[int(np.argmin(chi_square))])
+    least = float(fit.chi_square(unknowns[None])[0])
+    degrees = 2 * count - 6
+    if least > bound(_MISFIT, degrees):
+        raise ArcError(
+            f"no free fall fits the sightings: chi-square {least:.0f} with {degrees} degrees of freedom"
+        )
+    if not possible.any():
+        near, far = 1e-3 * np.exp([low, high])
+        raise ArcError(f"no orbit at {near:.4g} to {far:.4g} km is bound to the Earth and clear of it")
+    state = fit.states(unknowns[None])[0]
+    jacobian = fit.state_jacobian(unknowns)
+    spread = jacobian @ covariance @ jacobian.T
+    return FirstOrbit(
+        fit.time,
+        state,
+        0.5 * (spread + spread.T),
+        math.exp(unknowns[5]),
+        (math.exp(low), math.exp(high)),
+        bool(fit.admissible(unknowns[None])[0]),
+        least,
+        degrees,
+    )
+
+
+def _within(
+    logarithms: FloatArray, chi_square: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the interval in which chi-square is within `_DEGREES_95` of its minimum.
+
+    The first pair are the outermost scanned points inside, the second the interpolated ends.
+    """
+    excess = chi_square - chi_square.min() - _DEGREES_95
+    first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])
+    ends = []
+    for position, outer in ((first, first - 1), (last, last + 1)):
+        end = float(logarithms[position])
+        if 0 <= outer < len(logarithms):
+            share = excess[position] / (excess[position] - excess[outer])
+            end += float(share * (logarithms[outer] - logarithms[position]))
+        ends.append(end)
+    return (float(logarithms[first]), float(logarithms[last])), (ends[0], ends[1])
+
+
+def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
+    """Return the reason why an arc (s) does not suffice.
+
+    `lasting` holds the logarithms of the distances of lasting orbits.
+    """
+    low, high = (1e-3 * math.exp(end) for end in interval)
+    text = f"the arc of {arc:.0f} s is too short: the distance is {low:.3g} to {high:.3g} km (95 %)"
+    if len(lasting):
+        low, high = (1e-3 * math.exp(end) for end in (lasting.min(), lasting.max()))
+        text += f", {low:.3g} to {high:.3g} km for lasting orbits"
+    return text + f"; an orbit needs ends within a factor of {RATIO:g}"
+
+
+class _ArcFit:
+    """The least-squares fit of the sightings; unknowns (k, 6) of k hypotheses at once."""
+
+    def __init__(self, seen: Bearings) -> None:
+        self._seen = seen
+        self._middle = len(seen.times) // 2
+        self.time = float(seen.times[self._middle])
+        self._axis = seen.directions[self._middle]
+        self._basis = tangent_basis(self._axis)
+        self._across = np.array([tangent_basis(direction) for direction in seen.directions])
+
+    def states(self, unknowns: FloatArray) -> FloatArray:
+        """Return the states (k, 6) at the middle of the arc."""
+        position = self._axis + unknowns[:, :2] @ self._basis
+        position = position / np.linalg.norm(position, axis=1, keepdims=True)
+        moved = unknowns[:, 2:4] @ self._basis + unknowns[:, 4:5] * self._axis
+        return np.asarray(
+            self._seen.observer[self._middle]
+            + np.exp(unknowns[:, 5:6]) * np.concatenate([position, moved], axis=1)
+        )
+
+    def residuals(self, unknowns: FloatArray) -> FloatArray:
+        """Return the residuals (k, 2 n) divided by their standard deviations."""
+        seen, middle = self._seen, self._middle
+        start = self.states(unknowns)
+        states = propagate_about(start, seen.times, middle)
+        way = states[..., :3] - seen.observer[:, None, :3]
+        distance = np.linalg.norm(way, axis=2, keepdims=True)
+        way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
+        way /= np.linalg.norm(way, axis=2, keepdims=True)
+        off = np.einsum("nij,nkj->kni", self._across, way)
+        # Bound the cosine, because the offset would be small again for directions behind the camera.
+        facing = np.einsum("nj,nkj->kn", seen.directions, way)
+        off = off / np.maximum(facing, 1e-3)[:, :, None]
+        return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
+
+    def chi_square(self, unknowns: FloatArray) -> FloatArray:
+        """Return chi-square (k,)."""
+        return np.asarray(np.sum(self.residuals(unknowns) ** 2, axis=1))
+
+    def admissible(self, unknowns: FloatArray) -> BoolArray:
+        """Return which hypotheses (k,) are lasting orbits."""
+        states = self.states(unknowns)
+        position, motion = states[:, :3], states[:, 3:]
+        radius = np.linalg.norm(position, axis=1)
+        energy = 0.5 * np.sum(motion**2, axis=1) - GRAVITATIONAL_PARAMETER / radius
+        turn = np.sum(np.cross(position, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
+        size = -0.5 * GRAVITATIONAL_PARAMETER / np.where(energy < 0.0, energy, -1.0)
+        eccentricity = np.sqrt(np.maximum(1.0 - turn / size, 0.0))
+        clear = size * (1.0 - eccentricity) > EARTH_RADIUS + GROUND_CLEARANCE
+        return np.asarray((energy < 0.0) & clear)
+
+    def scan(self, logarithms: FloatArray) -> FloatArray:
+        """Return the best unknowns (k, 6) for each logarithm (k,) of the distance."""
+        unknowns = np.zeros((len(logarithms), 6))
+        unknowns[:, 5] = logarithms
+        times = self._seen.times - self.time
+        # Initial guess: the mean motion of the direction.
+        weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
+        unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
+        for _ in range(_ROUNDS):
+            residual, jacobian = self._linear(unknowns)
+            step = _solved(residual, jacobian[:, :, :5])[0]
+            unknowns[:, :5] -= np.clip(step, -_LONGEST_STEPS, _LONGEST_STEPS)
+        return unknowns
+
+    def refine(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the best unknowns (6,) near a guess, and their covariance (6, 6)."""
+        covariance = np.eye(6)
+        for _ in range(_FINAL_ROUNDS):
+            residual, jacobian = self._linear(unknowns[None])
+            (step,), (covariance,) = _solved(residual, jacobian)
+            # Shorten steps beyond the linear range of the logarithm.
+            unknowns = unknowns - step * min(1.0, 0.3 / max(abs(float(step[5])), 1e-12))
+            if abs(float(step[5])) < 1e-4 * math.sqrt(float(covariance[5, 5])):
+                break
+        return unknowns, covariance
+
+    def state_jacobian(self, unknowns: FloatArray) -> FloatArray:
+        """Return the derivatives (6, 6) of the state by the unknowns (6,)."""
+        shifts = np.diag(_STEPS)
+        ahead, behind = self.states(unknowns + shifts), self.states(unknowns - shifts)
+        return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
+
+    def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals (k, m) and their derivatives (k, m, 6)."""
+        shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
+        many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
+        found = self.residuals(many).reshape(13, len(unknowns), -1)
+        slope = (found[1:7] - found[7:]) / (2.0 * _STEPS[:, None, None])
+        return found[0], np.moveaxis(slope, 0, 2)
+
+
+def _solved(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss-Newton steps (k, p) and covariances (k, p, p)."""
+    normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+    size = np.sqrt(np.maximum(np.einsum("kii->ki", normal), 1e-300))
+    scaled = normal / size[:, :, None] / size[:, None, :]
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) / size[:, :, None] / size[:, None, :]
+    pull = np.einsum("kmp,km->kp", jacobian, residual)
+    return np.einsum("kpq,kq->kp", inverse, pull), inverse

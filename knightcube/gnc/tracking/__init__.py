@@ -1,1 +1,0 @@
-"""Tracking of objects by the directions in which a camera sees them: bearings only."""

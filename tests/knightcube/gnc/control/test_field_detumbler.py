@@ -1,0 +1,327 @@
+"""Detumbling by the magnetometer alone: started by agreement, and out of a spin along the field.
+
+The momentum plan removes what it says in the time it says, near the least time there is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
+from knightcube.errors import UsageError
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.field_detumbler import (
+    BOUNDED,
+    LIMIT_GAIN,
+    SILENT_PERIODS,
+    TRUSTED,
+    FieldDetumbler,
+    FieldDetumblerSettings,
+    aligned_to,
+    braking_dipole,
+    momentum_plan,
+    rotating_field,
+    without_speed_up,
+)
+from knightcube.gnc.estimation.field_rate import FieldRateSettings
+
+SCHEDULE = WindowSchedule(100_000_000, 300_000_000, 600_000_000)
+INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
+LIMIT = 0.1
+FIELD, TURN = np.array([0.0, 0.0, 4e-5]), np.array([0.0, 2.2e-3, 0.0])
+OWN_FIELD = 4e-4
+"""T by A m^2: the coils at the magnetometer, as strong as the Earth's field at full dipole."""
+CYCLE_NS = 100_000_000
+
+
+def detumbler() -> FieldDetumbler:
+    noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
+    return FieldDetumbler(SCHEDULE, FieldDetumblerSettings(limit=LIMIT), noise)
+
+
+def fly(
+    rate: FloatArray,
+    seconds: float,
+    spikes: float = 0.0,
+    gyro: Callable[[FloatArray], FloatArray] | None = None,
+    sooner: float = 1.0,
+    late: float = 0.0,
+) -> FloatArray:
+    """Return the speed (n,) rad/s of each cycle; `gyro` makes its reading of the rate.
+
+    The field turns by `sooner` times what it does in orbit; a sample is `late` s older than the last command.
+    """
+    law, rng = detumbler(), np.random.default_rng(4)
+    speeds = []
+    law.begin(0)
+    attitude, dipole = IDENTITY, np.zeros(3)
+    dt = 1e-9 * CYCLE_NS
+    for cycle in range(round(seconds / dt)):
+        now_ns = cycle * CYCLE_NS
+        field = (
+            attitude_matrix(attitude)
+            @ attitude_matrix(from_rotation_vector(sooner * TURN * cycle * dt)).T
+            @ FIELD
+        )
+        past = attitude_matrix(from_rotation_vector(-late * rate)) @ field
+        sample = past + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
+        if rng.uniform() < spikes:
+            sample = sample + 1e-4 * rng.standard_normal(3)
+        law.dipole(now_ns)
+        law.sample(now_ns - round(1e9 * late), sample, None if gyro is None else gyro(rate))
+        dipole = law.dipole(now_ns)
+        assert np.abs(dipole).max() <= LIMIT * (1.0 + 1e-12)
+        momentum = INERTIA @ rate
+        middle = rate + 0.5 * dt * np.linalg.solve(
+            INERTIA, np.cross(dipole, field) - np.cross(rate, momentum)
+        )
+        torque = np.cross(dipole, field) - np.cross(middle, INERTIA @ middle)
+        rate = rate + dt * np.linalg.solve(INERTIA, torque)
+        attitude = multiply(from_rotation_vector(dt * middle), attitude)
+        speeds.append(float(np.linalg.norm(rate)))
+    return np.array(speeds)
+
+
+def test_a_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
+    """B-dot takes 2,000 s and more. The plan makes the momentum cross the field, so the speed grows first.
+
+    By less than before it is known that the body was slow.
+    """
+    speeds = fly(np.array([0.0, 0.0, 0.03]), 400.0, spikes=0.1)
+    assert speeds.max() < 2.0 * speeds[0]
+    assert speeds[-1] < math.radians(0.5)
+
+
+BIAS = np.array([4e-4, -3e-4, 5e-4])
+"""rad/s, of the gyro."""
+
+
+def test_with_a_gyro_a_slow_spin_along_the_field_is_never_made_faster() -> None:
+    """The field turns by a right angle in 178 s; in the least time the body would be spun up five times."""
+    speeds = fly(np.array([0.001, 0.0, 0.02]), 260.0, sooner=4.0, gyro=lambda rate: rate + BIAS)
+    assert speeds.max() < 1.1 * speeds[0]
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_twice_its_rate() -> None:
+    speeds = fly(np.array([0.0, 0.0, 0.1]), 380.0, gyro=lambda rate: rate + BIAS)
+    assert 1.5 * speeds[0] < speeds.max() < 2.1 * speeds[0]
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
+    speeds = fly(np.array([0.1, 0.05, 0.03]), 200.0, gyro=lambda _: np.zeros(3))
+    assert speeds[-1] < 0.5 * speeds[0]
+
+
+@pytest.mark.parametrize("late", [0.001, 0.04])
+def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
+    """What lies along the field is first spun up across it, as the field turns."""
+    speeds = fly(np.array([0.1, 0.05, 0.03]), 240.0, late=late)
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
+    """The unit is heard, but its fields are of no use: nothing is braked by what is merely predicted."""
+    law = detumbler()
+    law.begin(0)
+
+    def acts(begin_ns: int, end_ns: int, good: float) -> bool:
+        """Return whether the coils acted while the body turned by 0.1 rad/s across the field."""
+        acted = False
+        for now_ns in range(begin_ns, end_ns, 25_000_000):
+            turned = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
+            law.sample(now_ns, good * turned)
+            acted |= bool(law.dipole(now_ns).any())
+        return acted
+
+    quiet_ns = (2 + SILENT_PERIODS) * SCHEDULE.period_ns
+    assert acts(0, 2 * SCHEDULE.period_ns, 1.0)
+    assert acts(2 * SCHEDULE.period_ns, quiet_ns, math.nan), (
+        "two pauses without a sample do not stop the brake"
+    )
+    assert not acts(quiet_ns, quiet_ns + 10 * SCHEDULE.period_ns, math.nan)
+    assert acts(quiet_ns + 10 * SCHEDULE.period_ns, quiet_ns + 15 * SCHEDULE.period_ns, 1.0)
+
+
+def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:
+    """Half a turn from pause to pause, where B-dot brakes no more: the samples of one pause show the rate."""
+    speeds = fly(np.array([2.0, -2.4, 0.3]), 60.0)
+    assert speeds[-1] < 0.95 * speeds[0]
+
+
+def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
+    law = detumbler()
+    law.begin(0)
+    for k in range(TRUSTED):
+        now_ns = SCHEDULE.settle_ns + 20_000_000 * k
+        law.dipole(now_ns)
+        law.sample(now_ns, FIELD if k else FIELD + 1e-4)  # the first is spiked
+        assert not law.dipole(now_ns).any()
+    assert not law.trusted
+    assert law.rate is None
+    assert law.rate_sigma == math.inf
+    assert not law.dipole(SCHEDULE.settle_ns + SCHEDULE.measure_ns).any()
+
+
+@pytest.mark.parametrize("gyro", [True, False])
+def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool) -> None:
+    """Samples every 25 ms, coils off: a gyro tells the rate at once, the field alone within a second."""
+    law, rate, rng = detumbler(), np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
+    law.begin(0)
+    for now_ns in range(0, 2_000_000_000, 25_000_000):
+        field = attitude_matrix(from_rotation_vector(1e-9 * now_ns * rate)) @ FIELD
+        law.sample(now_ns, field + 2e-7 * rng.standard_normal(3), rate + BIAS if gyro else None)
+        if law.dipole(now_ns).any():
+            break
+    assert SCHEDULE.settle_ns < now_ns <= (600_000_000 if gyro else 1_500_000_000)
+    assert law.rate is not None
+    across = np.cross(FIELD, law.rate - rate) / np.linalg.norm(FIELD)
+    assert np.linalg.norm(across) < 3.0 * BOUNDED
+
+
+def test_after_another_mode_drove_the_coils_they_settle_before_the_first_sample() -> None:
+    law = detumbler()
+    law.begin(7_000_000_000)
+    assert not law.listens(7_000_000_000 + SCHEDULE.settle_ns - 1)
+    assert law.listens(7_000_000_000 + SCHEDULE.settle_ns)
+
+
+def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
+    law = detumbler()
+    law.begin(0)
+    for now_ns in range(0, 5_000_000_000, 25_000_000):
+        law.sample(now_ns, FIELD if law.listens(now_ns) else np.array([1.0, 0.0, 0.0]))
+        law.dipole(now_ns)
+    assert law.trusted
+    assert law.restarts == 0
+    assert law.rate is not None
+    assert np.linalg.norm(law.rate) < 0.02
+
+
+def test_constants_that_do_not_brake_are_refused() -> None:
+    with pytest.raises(UsageError, match="limit"):
+        FieldDetumblerSettings(limit=0.0)
+
+
+STEP, DIPOLE_LIMIT, REST = 5.0, 0.1, 1e-5
+TIMES = np.arange(0.0, 400.0 * STEP, STEP)
+FIELD_AHEAD = rotating_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
+"""T: it turns by two turns in 95 min, as in a polar orbit."""
+
+
+def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
+    """Return the share of the momentum that is left by a dipole of the limit's length along the plan."""
+    now = momentum.copy()
+    for there in FIELD_AHEAD[: round(horizon / STEP)]:
+        dipole = -np.cross(there, costate)
+        dipole *= LIMIT_GAIN * DIPOLE_LIMIT / max(float(np.linalg.norm(dipole)), 1e-2 * DIPOLE_LIMIT)
+        now += STEP * np.cross(dipole, there)
+    return float(np.linalg.norm(now) / np.linalg.norm(momentum))
+
+
+def least_time(momentum: FloatArray, field: FloatArray) -> float:
+    """Return a bound from below: for any p, a dipole of that length takes at most its integral from p . h."""
+    directions = np.random.default_rng(1).standard_normal((3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    most = (
+        np.cumsum(np.linalg.norm(np.cross(field[:, None], directions), axis=2), axis=0)
+        * STEP
+        * DIPOLE_LIMIT
+        * LIMIT_GAIN
+    )
+    enough = np.all(most >= directions @ momentum, axis=1)
+    return float(STEP * (np.argmax(enough) + 1))
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, -0.7, 0.6)])
+def test_the_plan_removes_the_momentum_in_nearly_the_least_time(
+    direction: tuple[float, float, float],
+) -> None:
+    momentum = 1e-3 * np.array(direction)
+    plan = momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, REST)
+    assert left(momentum, plan.costate, plan.horizon) < 0.06
+    least = least_time(momentum, FIELD_AHEAD)
+    assert 0.98 * least - STEP <= plan.horizon < 1.02 * least + STEP
+
+
+def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
+    along = momentum_plan(np.array([0.0, 0.0, 1e-3]), FIELD_AHEAD, TIMES, DIPOLE_LIMIT, REST)
+    across = momentum_plan(np.array([1e-3, 0.0, 0.0]), FIELD_AHEAD, TIMES, DIPOLE_LIMIT, REST)
+    assert along.horizon > 1.2 * across.horizon
+    still = np.broadcast_to(FIELD_AHEAD[0], FIELD_AHEAD.shape)
+    stuck = momentum_plan(np.array([0.0, 0.0, 1e-3]), still, TIMES, DIPOLE_LIMIT, REST)
+    assert stuck.horizon == STEP * len(FIELD_AHEAD)
+    assert np.all(np.isfinite(stuck.costate))
+
+
+def test_what_the_rest_allows_is_not_waited_for() -> None:
+    """A tenth of the momentum lies along the field, which takes longer to turn than the others to stop."""
+    momentum = np.array([1e-4, 0.0, 1e-5])
+    exact, allowed = (
+        momentum_plan(momentum, FIELD_AHEAD, TIMES, DIPOLE_LIMIT, rest) for rest in (1e-7, 1.2e-5)
+    )
+    assert allowed.horizon < 0.6 * exact.horizon
+
+
+def test_the_field_ahead_begins_as_it_is_measured() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        ahead = rng.standard_normal((9, 3))
+        field = ahead[0] + 0.5 * rng.standard_normal(3)
+        turned = aligned_to(ahead, field)
+        np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)  # a rotation
+        assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
+        if ahead[0] @ field > 0.0:
+            along = field / np.linalg.norm(field) * np.linalg.norm(ahead[0])
+            np.testing.assert_allclose(turned[0], along, atol=1e-12)
+
+
+def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_limit() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        costate, field = rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
+        dipole = braking_dipole(1e4 * costate, field, DIPOLE_LIMIT)
+        assert float(np.abs(dipole).max()) <= DIPOLE_LIMIT
+        assert float(np.cross(dipole, field) @ costate) <= 0.0
+
+
+def test_the_field_turned_ahead_keeps_its_strength_and_begins_with_its_change() -> None:
+    field, change = np.array([1e-5, -2e-5, 3e-5]), np.array([3e-8, 2e-8, 5e-8])
+    ahead = rotating_field(field, change, np.arange(50.0))
+    np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), np.linalg.norm(field), rtol=1e-12)
+    across = change - field * float(field @ change) / float(field @ field)
+    np.testing.assert_allclose(ahead[1] - ahead[0], across, rtol=0.01, atol=1e-10)
+    np.testing.assert_array_equal(rotating_field(field, np.zeros(3), np.arange(3.0)), np.tile(field, (3, 1)))
+
+
+def test_a_field_of_two_instants_is_refused_and_no_momentum_needs_no_dipole() -> None:
+    with pytest.raises(UsageError, match="three instants"):
+        momentum_plan(np.ones(3), FIELD_AHEAD[:2], TIMES[:2], DIPOLE_LIMIT, REST)
+    rest = momentum_plan(np.zeros(3), FIELD_AHEAD, TIMES, DIPOLE_LIMIT, REST)
+    assert not rest.costate.any()
+    assert rest.horizon == 0.0
+
+
+def test_without_gain_no_torque_makes_the_body_faster_and_what_brakes_it_stays() -> None:
+    rng, inverse = np.random.default_rng(3), np.linalg.inv(np.diag([0.0066, 0.0333, 0.0333]))
+    changed = 0
+    for _ in range(100):
+        dipole, field, rate = (
+            0.2 * rng.standard_normal(3),
+            4e-5 * rng.standard_normal(3),
+            rng.standard_normal(3),
+        )
+        left = without_speed_up(dipole, field, rate, inverse)
+        before, after = (float(rate @ inverse @ np.cross(m, field)) for m in (dipole, left))
+        assert after <= 1e-9 * abs(before) or before <= 0.0
+        assert np.abs(left).max() <= np.abs(dipole).max() * (1.0 + 1e-12)
+        if before <= 0.0:
+            np.testing.assert_array_equal(left, dipole)
+        changed += before > 0.0
+    assert 30 < changed < 70

@@ -1,0 +1,215 @@
+"""Pointing with coils alone: it stays pointed, knows torques ahead, and never exceeds the coils.
+
+A body that is astray is held still: damping takes energy in any attitude, until the body is slow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import AIR, CONSTANT, SIZES, pressures, shapes
+from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from knightcube.errors import PlanningError, UsageError
+from knightcube.gnc.control.pointing_law import (
+    FAR,
+    LEAVING,
+    PATIENCE,
+    SLOW,
+    PathRecovery,
+    PointingLaw,
+    damping_dipole,
+)
+from knightcube.gnc.control.pointing_table import (
+    PointingPreview,
+    PointingTable,
+    pointing_table,
+)
+from knightcube.gnc.guidance.three_axes.attitude_law import approach, references
+from tests.knightcube.gnc.control.pointing_cases import (
+    INERTIA,
+    LAW,
+    LIMIT,
+    ORBIT,
+    RESIDUAL,
+    SIZE,
+    STEP,
+    WEIGHTS,
+    pushed,
+)
+
+
+def table_from(start: FloatArray, spin: FloatArray, kept: int, until: float = 9_000.0) -> PointingTable:
+    """Plan from a turn (3,) rad and a rate (3,) rad/s off the law."""
+    times = np.arange(STEP, until, STEP)
+    wanted = references(LAW, ORBIT, times)
+    begin = multiply(from_rotation_vector(start), wanted.quaternion[0])
+    way = approach(LAW, begin, wanted.rate[0] + spin, STEP, STEP + 500.0)
+    begun = references(way, ORBIT, times[: kept + 1])
+    field, position = ORBIT.field_at(times), ORBIT.position_at(times)
+    ahead = PointingPreview(wanted, begun, field, position, pressures(ORBIT, times), SIZE)
+    return pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
+
+
+@pytest.fixture(scope="module")
+def law() -> PointingLaw:
+    """Nadir along the flight; the orbit lies in the plane of the dipole, where the field turns least."""
+    return PointingLaw(table_from(np.zeros(3), np.zeros(3), 290, until=6_500.0), LIMIT)
+
+
+def fly(
+    law: PointingLaw, start: FloatArray, sizes: FloatArray, residual: FloatArray, seconds: float
+) -> FloatArray:
+    """Return the turns (n, 3), rad, against the reference, under `SIZE` and `RESIDUAL`; a step of 10 s."""
+    now = law.wanted(STEP)
+    q, w = multiply(from_rotation_vector(start), now.quaternion), now.rate
+    turns = []
+    for time in np.arange(STEP, seconds, STEP):
+        at = np.array([time])
+        field = attitude_matrix(q) @ ORBIT.field_at(at)[0]
+        command = law.command(time, q, w, field, residual, sizes)
+        assert np.abs(command.dipole).max() <= LIMIT
+        turns.append(command.turn)
+        for part in range(2):
+            at = np.array([time + 0.5 * STEP * part])
+            q, w = pushed(q, w, attitude_matrix(q), at, command.dipole + RESIDUAL, 0.5 * STEP)
+    return np.degrees(turns)
+
+
+def test_it_holds_nadir_and_torques_known_ahead_cost_less_than_half_the_error(law: PointingLaw) -> None:
+    known = fly(law, np.zeros(3), SIZE, RESIDUAL, 3000.0)[100:]
+    unknown = fly(law, np.zeros(3), np.zeros(SIZES), RESIDUAL, 3000.0)[100:]
+    error = [float(np.sqrt(np.mean(np.sum(turns**2, axis=1)))) for turns in (known, unknown)]
+    assert error[0] < 2.0
+    assert error[0] < 0.6 * error[1]
+
+
+def test_ten_degrees_of_error_are_taken_out_within_half_a_revolution(law: PointingLaw) -> None:
+    turns = fly(law, np.radians([8.0, -5.0, 4.0]), SIZE, RESIDUAL, 2800.0)
+    assert np.linalg.norm(turns[-30:], axis=1).max() < 2.0
+    assert np.linalg.norm(turns, axis=1).max() < 30.0
+
+
+def test_the_dipole_has_no_part_along_the_field_but_the_residual_s_cancellation(law: PointingLaw) -> None:
+    wanted = law.reference(500.0)
+    field = np.array([1e-5, -2e-5, 1.5e-5])
+    q = multiply(from_rotation_vector(np.array([0.01, -0.02, 0.005])), wanted.quaternion)
+    command = law.command(500.0, q, wanted.rate, field, np.zeros(3), np.zeros(SIZES))
+    assert abs(command.dipole @ field) < 1e-9 * np.linalg.norm(command.dipole) * np.linalg.norm(field)
+    other = law.command(500.0, q, wanted.rate, field, RESIDUAL, np.zeros(SIZES))
+    np.testing.assert_allclose(other.dipole, command.dipole - RESIDUAL, atol=1e-12)
+    np.testing.assert_allclose(command.turn, [0.01, -0.02, 0.005], atol=1e-9)
+
+
+def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
+    times = np.array([0.0, 1000.0])
+    to_body = np.tile(np.eye(3), (2, 1, 1))
+    torque = shapes(pressures(ORBIT, times), to_body)
+    np.testing.assert_array_equal(torque[:, :, CONSTANT], np.tile(np.eye(3), (2, 1, 1)))
+    for k, time in enumerate(times):
+        place, flight = ORBIT.position_at(np.array([time]))[0], ORBIT.velocity_at(np.array([time]))[0]
+        flight = flight - np.cross([0.0, 0.0, 7.292115e-5], place)  # the air turns with the Earth
+        np.testing.assert_allclose(torque[k, :, AIR].T @ flight, 0.0, atol=1e-8)
+    day, night = (np.linalg.norm(torque[k, :, AIR]) for k in (0, 1))
+    assert day > 1.3 * night
+
+
+def test_a_path_from_upside_down_is_one_that_the_coils_manage_and_ends_in_the_law() -> None:
+    """The dipoles of the path, flown alone over ten minutes, lead along it; then the law is near."""
+    table = table_from(np.array([0.0, 2.8, 0.6]), np.radians([0.2, -0.1, 0.1]), 200, until=4_000.0)
+    off = np.degrees(angle_between(table.path.quaternion, table.wanted.quaternion))
+    assert off[0] == pytest.approx(np.degrees(np.linalg.norm([0.0, 2.8, 0.6])), abs=0.1)
+    assert off[-40:].max() < 12.0
+    assert np.abs(table.dipole).max() <= LIMIT
+    q, w = table.path.quaternion[0], table.path.rate[0]
+    for k in range(60):
+        for part in range(10):
+            turned, at = attitude_matrix(q), np.array([STEP * (k + 1) + part + 0.5])
+            q, w = pushed(q, w, turned, at, table.dipole[k], 1.0)
+    assert np.degrees(angle_between(q, table.path.quaternion[60])) < 8.0
+
+
+def test_a_body_on_its_law_flies_no_detour() -> None:
+    table = table_from(np.zeros(3), np.zeros(3), 30, until=3_000.0)
+    assert np.degrees(angle_between(table.path.quaternion, table.wanted.quaternion)).max() < 3.0
+
+
+def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
+    times = np.array([10.0, 20.0, 40.0, 50.0])
+    wanted, field = references(LAW, ORBIT, times), ORBIT.field_at(times)
+    position, pressed = ORBIT.position_at(times), pressures(ORBIT, times)
+    for begun in (wanted.until(3), wanted):
+        ahead = PointingPreview(wanted, begun, field, position, pressed, SIZE)
+        with pytest.raises(UsageError, match="equally spaced"):
+            pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
+
+
+def test_a_body_that_no_step_can_follow_is_refused_and_gives_no_path_that_is_not_finite() -> None:
+    with pytest.raises(PlanningError, match="too far in one step"):
+        table_from(np.zeros(3), np.array([0.5, 0.4, 0.0]), 30, until=1_000.0)
+
+
+def test_a_path_is_flown_up_to_where_it_turns_too_fast_unless_that_is_soon() -> None:
+    table = table_from(np.zeros(3), np.zeros(3), 30)
+    limit = 2.0 * table.fastest
+    assert table.below(limit) is table
+
+    def with_spike(place: int) -> PointingTable | None:
+        rate = table.path.rate.copy()
+        rate[place] = [limit, 0.0, 0.0]
+        return replace(table, path=replace(table.path, rate=rate)).below(limit)
+
+    at_the_end = with_spike(30)
+    assert at_the_end is not None
+    assert (len(at_the_end.dipole), len(at_the_end.path.times)) == (29, 30)
+    assert at_the_end.fastest < limit
+    assert with_spike(5) is None
+
+
+def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
+    rng, inertia = np.random.default_rng(1), np.array([1.1e-3, 1.05e-3, 0.99e-3])
+    for _ in range(50):
+        rate, field = 0.02 * rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
+        torque = np.cross(damping_dipole(inertia, rate, field), field)
+        # The power of -J rate across the field; for equal moments never positive.
+        assert float(rate @ torque) < 1e-3 * float(np.linalg.norm(rate) * np.linalg.norm(torque))
+        assert (
+            abs(float(torque @ field)) < 1e-12 * float(np.linalg.norm(torque) * np.linalg.norm(field)) + 1e-24
+        )
+
+
+def seen(astray: PathRecovery, off: float, speed: float, now: float) -> tuple[float | None, bool]:
+    astray.update(off, speed, now)
+    return astray.since, astray.ready
+
+
+def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
+    astray = PathRecovery()
+    assert seen(astray, 0.99 * FAR, 1.0, 0.0) == (None, False)
+    assert seen(astray, 1.01 * FAR, 2.0 * SLOW, 10.0) == (10.0, False)
+    # Nearer again it is held still all the same.
+    assert seen(astray, 0.0, 2.0 * SLOW, 20.0) == (10.0, False)
+    assert seen(astray, 3.0 * FAR, 0.9 * SLOW, 30.0) == (10.0, True)
+    astray.planned()
+    assert seen(astray, 0.0, SLOW, 31.0) == (None, False)
+
+
+def test_a_spin_along_the_field_is_not_waited_for() -> None:
+    astray = PathRecovery()
+    astray.update(2.0 * FAR, 5.0 * SLOW, 0.0)
+    assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE - 1.0)[1]
+    assert seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE + 1.0)[1]
+
+
+def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:
+    astray = PathRecovery()
+    for off, leaving in ((0.9 * LEAVING, False), (1.1 * LEAVING, True), (1.1 * FAR, False)):
+        astray.update(off, SLOW, 0.0)
+        assert astray.leaving == leaving
+    astray.planned()
+    astray.update(1.1 * LEAVING, SLOW, 1.0)
+    astray.planned()
+    assert not astray.leaving

@@ -1,0 +1,46 @@
+"""A residual dipole is learned from the rate under it, whatever the coils do, and never beyond its bound."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.sun_acquisition import ResidualDipole
+
+INERTIA = np.array([1.10e-3, 1.05e-3, 0.99e-3])
+DIPOLE = np.array([6e-4, -5e-4, 7e-4])
+STEP = 0.1
+
+
+def learned(coils: FloatArray, dipole: FloatArray, bound: float) -> FloatArray:
+    """Return what is learned in 1,500 s of a field that turns as along an orbit's half."""
+    observer, rng = ResidualDipole(INERTIA, bound), np.random.default_rng(5)
+    rate = np.array([1e-3, -2e-3, 5e-4])
+    for k in range(round(1500.0 / STEP)):
+        angle = 4e-3 * k * STEP
+        field = 3e-5 * np.array([np.cos(angle), np.sin(angle), 0.6])
+        acting = coils * np.sin(0.7 * k * STEP)
+        # Held by a torque that the coils know of, the body stays slow.
+        hold = np.cross(field, -2e-5 * rate) / (field @ field)
+        torque = np.cross(acting + hold + dipole, field) - np.cross(rate, INERTIA * rate)
+        rate = rate + STEP * torque / INERTIA
+        observer.follow(STEP, rate + 1e-4 * rng.standard_normal(3), field, acting + hold)
+    return observer.dipole
+
+
+def test_the_dipole_is_learned_beside_coils_that_are_a_hundred_times_stronger() -> None:
+    for coils in (np.zeros(3), np.array([0.05, -0.05, 0.02])):
+        assert np.linalg.norm(learned(coils, DIPOLE, 5e-3) - DIPOLE) < 0.25 * np.linalg.norm(DIPOLE)
+
+
+def test_nothing_is_learned_of_a_body_without_one() -> None:
+    assert np.linalg.norm(learned(np.zeros(3), np.zeros(3), 5e-3)) < 2e-4
+
+
+def test_no_dipole_beyond_the_bound_is_believed_and_a_gap_begins_again() -> None:
+    assert np.abs(learned(np.zeros(3), 20.0 * DIPOLE, 5e-3)).max() <= 5e-3
+    observer = ResidualDipole(INERTIA, 5e-3)
+    field = np.array([0.0, 0.0, 3e-5])
+    for seconds in (0.1, 5.0):
+        observer.follow(seconds, np.array([seconds, 0.0, 0.0]), field, np.zeros(3))
+    np.testing.assert_array_equal(observer.dipole, np.zeros(3))

@@ -1,1 +1,0 @@
-"""Tests of the classical star identification."""
