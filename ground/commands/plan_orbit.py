@@ -24,7 +24,7 @@ from knightcube.gnc.guidance.planners import STRETCH
 from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import (
     HORIZON_RANGE,
-    LEAST_TIME,
+    MINIMUM_TIME,
     NODES,
     BoresightEnd,
 )
@@ -130,7 +130,7 @@ def _planned(
         duration=options.within,
         longest=longest,
         window=options.window or 0.0,
-        time_cost=LEAST_TIME if options.least_time else options.time_price,
+        time_cost=MINIMUM_TIME if options.least_time else options.time_price,
         pointing_axis=config.pointing.axis,
         across_axis=config.pointing.across,
         camera_axis=_boresight(config),

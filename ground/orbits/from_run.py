@@ -13,7 +13,7 @@ from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_velocity
 from knightcube.errors import UsageError
 from knightcube.gnc.first_orbit import (
-    LEAST_SIGHTINGS,
+    MINIMUM_SIGHTINGS,
     ArcError,
     Bearings,
     FirstOrbit,
@@ -65,8 +65,8 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
     span = float(times[-1] - times[0]) if len(times) else 0.0
     found = ObjectOrbit(number, len(seen), span, None, None, "")
     placed = seen[np.isfinite(seen["place"]).all(axis=1)]
-    if len(placed) < LEAST_SIGHTINGS:
-        reason = f"{len(placed)} sightings with the craft's own place: {LEAST_SIGHTINGS} or more are needed"
+    if len(placed) < MINIMUM_SIGHTINGS:
+        reason = f"{len(placed)} sightings with the craft's own place: {MINIMUM_SIGHTINGS} or more are needed"
         return replace(found, reason=reason)
     times = placed["middle_ns"] * 1e-9
     middle = len(times) // 2

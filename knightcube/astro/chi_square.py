@@ -1,14 +1,14 @@
-"""The value that a chi-square of few degrees of freedom exceeds with a given probability.
+"""Upper quantiles of the chi-square distribution with few degrees of freedom.
 
-That probability has a closed form (Abramowitz and Stegun 26.4.4, 26.4.5, and 26.4.8 for two more degrees),
-whose root is bracketed. scipy would cost the control process 13 MB for three numbers.
+The probability has a closed form (Abramowitz and Stegun 26.4.4, 26.4.5, and 26.4.8 for two more degrees); its
+root is found by bisection. scipy would cost the control process 13 MB for three numbers.
 """
 
 from __future__ import annotations
 
 import math
 
-_TURNS = 200
+_BISECTIONS = 200
 
 
 def chance_beyond(x: float, degrees: int) -> float:
@@ -25,7 +25,7 @@ def bound(chance: float, degrees: int) -> float:
     low, high = 0.0, 1.0
     while chance_beyond(high, degrees) > chance:
         low, high = high, 2.0 * high
-    for _ in range(_TURNS):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         if not low < middle < high:
             break

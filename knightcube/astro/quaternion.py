@@ -24,7 +24,7 @@ IDENTITY: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def _components(q: FloatArray) -> Iterable[Any]:
-    """Return the components of q (..., 4): four arrays (...), or of one quaternion the faster floats."""
+    """Return the components of q (..., 4) as four arrays (...), or as floats, which are faster, for one q."""
     return q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
 
 
@@ -93,15 +93,16 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
 def from_rotation_vector(vector: FloatArray) -> FloatArray:
     """Return the quaternion (..., 4) of a rotation by |vector| rad about vector (..., 3).
 
-    A body that turns with constant rate w for t has q(t) = multiply(from_rotation_vector(w t), q(0)).
+    A body that rotates with constant rate w for a time t has q(t) = multiply(from_rotation_vector(w t),
+    q(0)).
     """
     v = np.asarray(vector, dtype=float)
     if v.ndim == 1:
         x, y, z = v.tolist()
-        turn = 0.5 * math.sqrt(x * x + y * y + z * z)
-        phase = np.pi * (turn / np.pi)  # rounded as numpy's sinc does
+        half_angle = 0.5 * math.sqrt(x * x + y * y + z * z)
+        phase = np.pi * (half_angle / np.pi)  # rounded as numpy's sinc does
         scale = 0.5 * (np.sin(phase) / phase) if phase else 0.5
-        return np.array([scale * x, scale * y, scale * z, np.cos(turn)])
+        return np.array([scale * x, scale * y, scale * z, np.cos(half_angle)])
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     # sin(x)/x through numpy's sinc keeps the small-angle limit exact.
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
@@ -130,12 +131,12 @@ def angle_between(p: FloatArray, q: FloatArray) -> FloatArray:
 
 
 def about_axis_y(angle: float) -> FloatArray:
-    """Return the quaternion of a turn by `angle` rad about the y axis: the testbed's thread."""
+    """Return the quaternion of a rotation by `angle` rad about the y axis, the testbed's thread."""
     return np.array([0.0, np.sin(0.5 * angle), 0.0, np.cos(0.5 * angle)])
 
 
 def angle_about_axis_y(q: FloatArray) -> float:
-    """Return the rotation of q (4,) about the y axis, its twist about the thread: rad, [-pi, pi)."""
+    """Return the rotation of q (4,) about the y axis, the twist about the thread, rad in [-pi, pi)."""
     angle = 2.0 * np.arctan2(q[1], q[3])
     return float(np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi)
 
@@ -144,9 +145,10 @@ NED_TO_TESTBED: FloatArray = np.array([0.5, -0.5, -0.5, 0.5])
 
 
 def attitude_map(mounting: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the matrix M (4, 4) that maps the attitude of a unit to that of the body.
+    """Return the matrix M (4, 4) that maps the attitude of an inertial unit to that of the body.
 
-    The unit measures q (4,), NED into sensor. With `mounting` (4,) sensor into body and `reference` (4,) NED
-    into the mission's reference frame, M q = mounting q conj(reference), the reference frame into the body.
+    The unit measures q (4,), NED into sensor axes. `mounting` (4,) rotates sensor into body axes and
+    `reference` (4,) rotates NED into the mission's reference frame. M q = mounting q conj(reference) rotates
+    the reference frame into body axes.
     """
     return np.asarray(multiply(multiply(mounting, np.eye(4)), conjugate(reference)).T)

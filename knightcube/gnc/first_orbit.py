@@ -89,7 +89,7 @@ def _derivative(state: FloatArray) -> FloatArray:
     return np.hstack([state[:, 3:], -GRAVITATIONAL_PARAMETER / square**1.5 * scale * position])
 
 
-LEAST_SIGHTINGS = 6
+MINIMUM_SIGHTINGS = 6
 RATIO = 1.5
 """Largest ratio of the ends of the distance interval for which an orbit is returned."""
 GROUND_CLEARANCE = 80e3
@@ -160,8 +160,8 @@ class FirstOrbit:
 def first_orbit(seen: Bearings) -> FirstOrbit:
     """Return the orbit of an object. Raises ArcError if the sightings determine none."""
     count = len(seen.times)
-    if count < LEAST_SIGHTINGS:
-        raise ArcError(f"{count} sightings: an orbit needs {LEAST_SIGHTINGS} or more")
+    if count < MINIMUM_SIGHTINGS:
+        raise ArcError(f"{count} sightings: an orbit needs {MINIMUM_SIGHTINGS} or more")
     fit = _ArcFit(seen)
     logarithms = np.linspace(math.log(_NEAREST), math.log(_FARTHEST), _GRID)
     inner, _ = _within(logarithms, fit.chi_square(fit.scan(logarithms)))
@@ -175,11 +175,11 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
         span = float(seen.times[-1] - seen.times[0])
         raise ArcError(_too_short(span, (low, high), logarithms[possible]))
     unknowns, covariance = fit.refine(tried[int(np.argmin(chi_square))])
-    least = float(fit.chi_square(unknowns[None])[0])
+    smallest = float(fit.chi_square(unknowns[None])[0])
     degrees = 2 * count - 6
-    if least > bound(_MISFIT, degrees):
+    if smallest > bound(_MISFIT, degrees):
         raise ArcError(
-            f"no free fall fits the sightings: chi-square {least:.0f} with {degrees} degrees of freedom"
+            f"no free fall fits the sightings: chi-square {smallest:.0f} with {degrees} degrees of freedom"
         )
     if not possible.any():
         near, far = 1e-3 * np.exp([low, high])
@@ -194,7 +194,7 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
         math.exp(unknowns[5]),
         (math.exp(low), math.exp(high)),
         bool(fit.admissible(unknowns[None])[0]),
-        least,
+        smallest,
         degrees,
     )
 
@@ -277,9 +277,9 @@ class _ArcFit:
         position, motion = states[:, :3], states[:, 3:]
         radius = np.linalg.norm(position, axis=1)
         energy = 0.5 * np.sum(motion**2, axis=1) - GRAVITATIONAL_PARAMETER / radius
-        turn = np.sum(np.cross(position, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
+        latus_rectum = np.sum(np.cross(position, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
         size = -0.5 * GRAVITATIONAL_PARAMETER / np.where(energy < 0.0, energy, -1.0)
-        eccentricity = np.sqrt(np.maximum(1.0 - turn / size, 0.0))
+        eccentricity = np.sqrt(np.maximum(1.0 - latus_rectum / size, 0.0))
         clear = size * (1.0 - eccentricity) > EARTH_RADIUS + GROUND_CLEARANCE
         return np.asarray((energy < 0.0) & clear)
 

@@ -228,9 +228,9 @@ class TrackSettings:
         within: in this many frames.
         missed: probability that the gate rejects the object's own sighting.
         moving: standard deviations of the rate by which a confirmed track must differ from the stars.
-        least_rate: rad/s, below which an object cannot be distinguished from an uncatalogued star.
+        minimum_rate: rad/s, below which an object cannot be distinguished from an uncatalogued star.
         coast: s that a confirmed track lasts without a sighting.
-        most_tracks: largest number of tracks, tentative ones included.
+        maximum_tracks: largest number of tracks, tentative ones included.
         brightness: magnitudes, standard deviation between sightings of one object.
     """
 
@@ -239,9 +239,9 @@ class TrackSettings:
     within: int = 6
     missed: float = 1e-4
     moving: float = 8.0
-    least_rate: float = 1e-4
+    minimum_rate: float = 1e-4
     coast: float = 15.0
-    most_tracks: int = 32
+    maximum_tracks: int = 32
     brightness: float = 0.75
 
 
@@ -324,7 +324,11 @@ class ObjectTracker:
             replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
-        spread = _with_attitude(frame)
+        # The covariance of the directions includes that of the attitude.
+        crosses = cross_matrices(frame.directions)
+        spread = np.asarray(
+            frame.covariance + crosses @ frame.attitude @ crosses.transpose(0, 2, 1), dtype=float
+        )
         taken = self._associated(tracks, frame, spread)
         after = []
         for index, track in enumerate(tracks):
@@ -336,8 +340,15 @@ class ObjectTracker:
                 after.append(self._updated(replace(track, history=history | 1), frame, number, spread))
         alive = [track for track in after if self._is_alive(track, frame.time_ns)]
         ended = [track for track in after if track.confirmed and track not in alive]
-        alive, confirmed = self._confirm(alive)
-        alive += self._new_tracks(frame, spread, set(taken.values()), self._settings.most_tracks - len(alive))
+        confirmed = []
+        for index, track in enumerate(alive):
+            if not track.confirmed and self._is_object(track):
+                self._confirmed += 1
+                alive[index] = replace(track, number=self._confirmed)
+                confirmed.append(alive[index])
+        alive += self._new_tracks(
+            frame, spread, set(taken.values()), self._settings.maximum_tracks - len(alive)
+        )
         self._tracks = alive
         return confirmed, ended
 
@@ -387,17 +398,6 @@ class ObjectTracker:
         remaining = settings.within - track.frames
         return track.history.bit_count() + max(remaining, 0) >= settings.needed
 
-    def _confirm(self, tracks: list[Track]) -> tuple[list[Track], list[Track]]:
-        """Return all tracks, and the newly confirmed ones among them."""
-        after, confirmed = [], []
-        for track in tracks:
-            if not track.confirmed and self._is_object(track):
-                self._confirmed += 1
-                track = replace(track, number=self._confirmed)  # noqa: PLW2901
-                confirmed.append(track)
-            after.append(track)
-        return after, confirmed
-
     def _is_object(self, track: Track) -> bool:
         if track.history.bit_count() < self._settings.needed:
             return False
@@ -408,7 +408,7 @@ class ObjectTracker:
         rate = float(np.linalg.norm(track.line.rate))
         along = track.line.rate / max(rate, 1e-12)
         sigma = math.sqrt(max(float(along @ track.line.covariance[3:, 3:] @ along), 0.0))
-        return rate > self._settings.least_rate and rate > self._settings.moving * sigma
+        return rate > self._settings.minimum_rate and rate > self._settings.moving * sigma
 
     def _new_tracks(
         self, frame: FrameSightings, spread: FloatArray, used: set[int], room: int
@@ -448,9 +448,3 @@ def _brightness(track: Track, magnitude: float, count: int) -> tuple[float, floa
 def _sigma(covariance: FloatArray) -> float:
     """Return the standard deviation (rad) along each axis of a direction with a covariance (3, 3)."""
     return math.sqrt(0.5 * float(np.trace(covariance)))
-
-
-def _with_attitude(frame: FrameSightings) -> FloatArray:
-    """Return the covariance (n, 3, 3) of the directions, including that of the attitude."""
-    cross = cross_matrices(frame.directions)
-    return np.asarray(frame.covariance + cross @ frame.attitude @ cross.transpose(0, 2, 1))

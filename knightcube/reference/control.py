@@ -103,7 +103,7 @@ class PidController:
         self._sum = None
 
 
-_LEAST_AUTHORITY = 0.05
+_MINIMUM_AUTHORITY = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class AdaptiveController:
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         cosine = math.cos(angle)
-        if abs(cosine) < _LEAST_AUTHORITY:
+        if abs(cosine) < _MINIMUM_AUTHORITY:
             return CurrentCommand.without_authority(error)
         model = self._follow(wanted, angle, rate)
         lead, lag = math.remainder(model.angle - angle, 2.0 * math.pi), model.rate - rate
@@ -171,8 +171,8 @@ class AdaptiveController:
         demanded = (float(self.parameters @ regressor) + self._gain * slide) / cosine
         made = CurrentCommand.within(self._limit, demanded, error)
         if not made.saturated and abs(slide) > self._settings.dead_zone:
-            learnt = self._settings.adaptation * self._range**2 * regressor * slide
-            self.parameters = np.clip(self.parameters + self._period * learnt, self._low, self._high)
+            change = self._settings.adaptation * self._range**2 * regressor * slide
+            self.parameters = np.clip(self.parameters + self._period * change, self._low, self._high)
         return made
 
     def reset(self) -> None:

@@ -60,7 +60,7 @@ def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
     faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "yz"]
     config, section = slewing(105.0, *faults)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pointing_law, "PATIENCE", PATIENCE)
+        patch.setattr(pointing_law, "DAMPING_TIMEOUT", PATIENCE)
         return fly(config, tmp_path_factory.mktemp("crippled"), section=section)
 
 

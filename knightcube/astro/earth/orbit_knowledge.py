@@ -88,7 +88,7 @@ class TwoLineElements:
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
         """Read the two lines. Raises UsageError for invalid lines and for elements that describe no orbit."""
         for number, line in (("1", first), ("2", second)):
-            _check_line(number, line)
+            _check_line(number, line.rstrip())
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
         if not 1.0 <= self._satellite.epochdays < 367.0:
             # SGP4 propagates resonant orbits from their epoch in steps of half a day: 1e12 days never end.
@@ -141,7 +141,6 @@ def _flow(state: FloatArray) -> FloatArray:
 
 def _check_line(number: str, line: str) -> None:
     """Raise UsageError unless `line` is that line of a two-line element set."""
-    line = line.rstrip()
     if len(line) != 69 or not line.startswith(f"{number} "):
         raise UsageError(
             f"{line!r}: line {number} of a two-line element set has 69 columns and starts with {number}"

@@ -22,7 +22,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.errors import UsageError
 from knightcube.gnc.estimation.field_rate import rate_across
 
-MOST_SHARE = 0.5
+MAXIMUM_SHARE = 0.5
 _SECOND = 1e-9
 _REACHED_NS = 50_000_000
 """Two control cycles, the largest delay (ns) of a command to the coils."""
@@ -90,14 +90,14 @@ class DetumblerSettings:
             )
 
 
-def share_in_rotating_field(turn: float, schedule: WindowSchedule) -> float:
-    """Return the best `share` for a body free in three axes in a field that rotates at `turn` rad/s.
+def share_in_rotating_field(field_rate: float, schedule: WindowSchedule) -> float:
+    """Return the best `share` for a body free in three axes in a field that rotates at `field_rate` rad/s.
 
     The rate along the field can be removed only as the field rotates; with more gain than k = 2 Omega J the
     spin aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field rotates about
     twice per revolution.
     """
-    return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
+    return min(2.0 * field_rate * schedule.period_ns * _SECOND, MAXIMUM_SHARE)
 
 
 def braking_current(

@@ -311,7 +311,11 @@ class FieldDetumbler:
             if rate is not None and self._agreed >= TRUSTED:
                 self._filter.measure_rate(rate)
             if not self._bounded:
-                self._bounded = self._agreed >= TRUSTED and _sigma_across(self._filter) < BOUNDED
+                measured = self._filter.field
+                across = np.eye(3) - np.outer(measured, measured) / float(measured @ measured)
+                spread = across @ self._filter.covariance[RATE, RATE] @ across
+                sigma = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
+                self._bounded = self._agreed >= TRUSTED and sigma < BOUNDED
         if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
 
@@ -409,11 +413,3 @@ class FieldDetumbler:
             ahead = aligned_to(expected, found.field)
         share = self._schedule.act_ns / self._schedule.period_ns
         return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
-
-
-def _sigma_across(found: FieldRate) -> float:
-    """Return the standard deviation of the rate across the field in its worst direction, rad/s."""
-    field = found.field
-    across = np.eye(3) - np.outer(field, field) / float(field @ field)
-    spread = across @ found.covariance[RATE, RATE] @ across
-    return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))

@@ -97,10 +97,10 @@ def attitude_error(wanted: PathSample, angle: float, rate: float, disturbance: f
 
 
 LARGEST_ERROR = 1.0
-LEAST_AUTHORITY = 0.05
+MINIMUM_AUTHORITY = 0.05
 
 _BRAKING_SHARE = 0.8
-_LEAST_BRAKING = 0.05
+_MINIMUM_BRAKING = 0.05
 
 
 class LqTracker:
@@ -116,12 +116,12 @@ class LqTracker:
         state_weight: float,
         input_weight: float,
         largest_error: float = LARGEST_ERROR,
-        least_authority: float = LEAST_AUTHORITY,
+        minimum_authority: float = MINIMUM_AUTHORITY,
         as_in_thesis: bool = False,
     ) -> None:
         """Solve the Riccati equation for Q = state_weight I and R = input_weight (5.28-5.32).
 
-        `largest_error` is in rad, below pi/2; `least_authority` bounds |cos(theta)|; `as_in_thesis` leaves
+        `largest_error` is in rad, below pi/2; `minimum_authority` bounds |cos(theta)|; `as_in_thesis` leaves
         out disturbance and braking. Raises UsageError when a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
@@ -129,11 +129,11 @@ class LqTracker:
                 raise UsageError(f"LQ weight {name} is {value}: it must be finite and positive")
         if not 0.0 < largest_error < 0.5 * math.pi:
             raise UsageError(f"largest_error is {largest_error} rad: it must lie between 0 and pi/2")
-        if not 0.0 < least_authority < 1.0:
-            raise UsageError(f"least_authority is {least_authority}: it must lie between 0 and 1")
+        if not 0.0 < minimum_authority < 1.0:
+            raise UsageError(f"minimum_authority is {minimum_authority}: it must lie between 0 and 1")
         self._plant = plant
         self._largest_error = largest_error
-        self._least_authority = least_authority
+        self._minimum_authority = minimum_authority
         self._as_in_thesis = as_in_thesis
         self._strength = plant.torque_constant * plant.current_limit / plant.inertia
         self.rate_gain, self.error_gain = lq_gains(state_weight, input_weight)
@@ -146,7 +146,7 @@ class LqTracker:
         Raises UsageError when an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
-        if abs(math.cos(angle)) < self._least_authority:
+        if abs(math.cos(angle)) < self._minimum_authority:
             return CurrentCommand.without_authority(error)
         held = abs(error) > self._largest_error
         used = math.copysign(self._largest_error, error) if held else error
@@ -156,17 +156,17 @@ class LqTracker:
             v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
         else:
-            approach = self._approach(sine, self._braking(wanted.angle, angle, disturbance))
+            # The deceleration available between here and the path, rad/s^2.
+            authority = max(min(math.cos(angle), math.cos(wanted.angle)), 0.0)
+            taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
+            braking = max(
+                _BRAKING_SHARE * self._strength * authority - taken, _MINIMUM_BRAKING * self._strength
+            )
+            approach = self._approach(sine, braking)
             v = -self.rate_gain * (cosine * lag + approach)
             acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine - disturbance
         demanded = self._plant.current(angle, rate, acceleration)
         return CurrentCommand.within(self._plant.current_limit, demanded, error, held)
-
-    def _braking(self, wanted_angle: float, angle: float, disturbance: float) -> float:
-        """Return the deceleration available between here and the path, rad/s^2."""
-        authority = max(min(math.cos(angle), math.cos(wanted_angle)), 0.0)
-        taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
-        return max(_BRAKING_SHARE * self._strength * authority - taken, _LEAST_BRAKING * self._strength)
 
     def _approach(self, error: float, braking: float) -> float:
         """Return the rate at which to reduce `error`, 1/s, with its sign."""
@@ -194,7 +194,7 @@ def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
 _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
-_PATIENCE = 60.0
+_TIMEOUT = 60.0
 _REACH = 0.45  # of the bound: a body with 1.4 times the modelled response stays within it
 _WEAK = 0.7  # of the modelled torque is assumed available for braking
 _SHORT_PULSE = 1.0
@@ -279,11 +279,21 @@ class ExcitationController:
             return CurrentCommand.without_authority(error)
         if self._phase is _Phase.MOVING:
             pulse = self._pulse()
-            if pulse is not None and self._has_room(angle, rate):
+            # The body can be stopped within the bound, or moves inwards.
+            outward = rate if angle >= 0.0 else -rate
+            braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
+            has_room = abs(angle) + 0.5 * max(outward, 0.0) ** 2 / braking < self._bound
+            if pulse is not None and has_room:
                 self._elapsed += self._period
                 return CurrentCommand.within(self._limit, pulse.share * self._limit, error)
             self._come_to_rest()
-        self._wait(error, rate)
+        quiet = abs(error) < _REST_ANGLE and abs(rate) < _REST_RATE
+        self._resting = self._resting + self._period if quiet else 0.0
+        self._waited += self._period
+        if self._resting >= _REST_TIME:
+            self._phase = _Phase.MOVING
+        elif self._waited >= _TIMEOUT:
+            self._phase = _Phase.GIVEN_UP
         return self._tracker.command(wanted, angle, rate, disturbance)
 
     def reset(self) -> None:
@@ -301,27 +311,10 @@ class ExcitationController:
                 return pulse
         return None
 
-    def _has_room(self, angle: float, rate: float) -> bool:
-        """Return whether the body can be stopped within the bound, or moves inwards."""
-        outward = rate if angle >= 0.0 else -rate
-        braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
-        run_out = 0.5 * max(outward, 0.0) ** 2 / braking
-        return abs(angle) + run_out < self._bound
-
     def _come_to_rest(self) -> None:
         self._phase = _Phase.COMING_TO_REST
         self._next += 1
         self._elapsed = self._resting = self._waited = 0.0
-
-    def _wait(self, error: float, rate: float) -> None:
-        """Begin the next manoeuvre once the body has rested long enough; give up when that takes too long."""
-        quiet = abs(error) < _REST_ANGLE and abs(rate) < _REST_RATE
-        self._resting = self._resting + self._period if quiet else 0.0
-        self._waited += self._period
-        if self._resting >= _REST_TIME:
-            self._phase = _Phase.MOVING
-        elif self._waited >= _PATIENCE:
-            self._phase = _Phase.GIVEN_UP
 
 
 def manoeuvres(strength: float, reach: float, swing: float) -> tuple[Manoeuvre, ...]:

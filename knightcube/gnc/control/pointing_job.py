@@ -39,7 +39,6 @@ from knightcube.gnc.control.pointing_table import (
 )
 from knightcube.gnc.guidance.three_axes.attitude_law import (
     AttitudeReferences,
-    Attitudes,
     BodyAxes,
     approach,
     following,
@@ -181,7 +180,15 @@ def slew_table(
     step, first = float(begin.times[1] - begin.times[0]) / FINE, float(begin.times[0])
     law = law_of(target, axes, path.quaternion[-1], ahead, first + path.horizon)
     coarse = math.ceil(path.horizon / (FINE * step))
-    after = _since(expected, references(law, ahead, begin.times), coarse, begin.kept)
+    lawful = references(law, ahead, begin.times).since(coarse)
+    after = PointingPreview(
+        lawful,
+        lawful.until(begin.kept + 1 - coarse),
+        expected.field[coarse:],
+        expected.position[coarse:],
+        Pressures(expected.pressures.air[coarse:], expected.pressures.light[coarse:]),
+        expected.sizes,
+    )
     held = pointing_table(after, begin.inertia, begin.limit, weights)
     count = FINE * coarse
     times = np.asarray(first + step * np.arange(FINE * begin.kept + 1), dtype=float)
@@ -223,16 +230,6 @@ def _joined(first: AttitudeReferences, then: AttitudeReferences) -> AttitudeRefe
         np.concatenate([first.quaternion, then.quaternion[count:]]),
         np.concatenate([first.rate, then.rate[count:]]),
         np.concatenate([first.acceleration, then.acceleration[count:]]),
-    )
-
-
-def _since(expected: PointingPreview, wanted: AttitudeReferences, count: int, kept: int) -> PointingPreview:
-    """Return the preview from instant `count` on, when the body is in the law."""
-    pressed = Pressures(expected.pressures.air[count:], expected.pressures.light[count:])
-    after = wanted.since(count)
-    begun = after.until(kept + 1 - count)
-    return PointingPreview(
-        after, begun, expected.field[count:], expected.position[count:], pressed, expected.sizes
     )
 
 
@@ -347,9 +344,17 @@ def run(job: PointingJob) -> PointingTable:
     times = np.arange(LEAD, span.preview, span.step)
     kept = round(span.kept / span.step)
     quaternion = multiply(from_rotation_vector(LEAD * job.rate), job.quaternion)
-    law = _law(job, quaternion, ahead)
+    sight, axis = job.sight, job.axes.pointing
+    if sight is None:
+        law = law_of(job.target, job.axes, quaternion, ahead, LEAD)
+    else:
+        law = following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
     field, wanted = ahead.field_at(times), references(law, ahead, times)
-    way = approach(law, quaternion, job.rate, LEAD, LEAD + _seconds(job, field))
+    # The duration of the initial guess: WAY times the time scale given by the weights.
+    strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
+    square = strength * job.weights.dipole / (inertia * job.weights.turn)
+    seconds = min(max(WAY / math.sqrt(square), 10.0 * span.step), span.kept)
+    way = approach(law, quaternion, job.rate, LEAD, LEAD + seconds)
     found = PointingPreview(
         wanted,
         references(way, ahead, times[: kept + 1]),
@@ -365,18 +370,3 @@ def run(job: PointingJob) -> PointingTable:
         if path is not None:
             return slew_table(begin, path, wish.residual, job.target, job.axes, ahead, found, job.weights)
     return pointing_table(found, job.inertia, job.limit, job.weights)
-
-
-def _law(job: PointingJob, quaternion: FloatArray, ahead: Ephemeris) -> Attitudes:
-    """Return the law of a job that starts at an attitude (4,)."""
-    sight, axis = job.sight, job.axes.pointing
-    if sight is None:
-        return law_of(job.target, job.axes, quaternion, ahead, LEAD)
-    return following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
-
-
-def _seconds(job: PointingJob, field: FloatArray) -> float:
-    """Return the duration, s, of the initial guess: WAY times the time scale given by the weights."""
-    strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
-    square = strength * job.weights.dipole / (inertia * job.weights.turn)
-    return min(max(WAY / math.sqrt(square), 10.0 * job.span.step), job.span.kept)

@@ -24,7 +24,7 @@ from knightcube.astro.quaternion import (
 from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReference
 
-LARGEST_TURN = math.radians(20.0)
+LARGEST_ROTATION = math.radians(20.0)
 """Largest rotation error (rad); a larger one is shortened, because the law is linear in small rotations."""
 LARGEST_RATE = math.radians(1.0)
 """Largest rate error (rad/s); a larger one is shortened."""
@@ -36,12 +36,12 @@ class PointingCommand:
 
     Attributes:
         dipole: (3,) A m^2, within the limit.
-        turn: (3,) rad, rotation error of the body relative to the reference.
+        rotation: (3,) rad, rotation error of the body relative to the reference.
         rate: (3,) rad/s, rate error of the body relative to the reference.
     """
 
     dipole: FloatArray
-    turn: FloatArray
+    rotation: FloatArray
     rate: FloatArray
 
 
@@ -82,29 +82,26 @@ class PointingLaw:
         estimated disturbances: the dipole is cancelled at once, the torques as the field allows.
         """
         wanted = self.reference(time)
-        turn = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
+        rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
         # Both rates in body axes: for a large rotation error they differ from the reference's axes.
-        missed = rate - attitude_matrix(from_rotation_vector(turn)) @ wanted.rate
-        cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
+        missed = rate - attitude_matrix(from_rotation_vector(rotation)) @ wanted.rate
+        cut_rotation, cut_rate = _cut(rotation, LARGEST_ROTATION), _cut(missed, LARGEST_RATE)
         # The rate error of the table is the difference of components in the axes of each.
-        error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
+        error = np.concatenate([cut_rotation, cut_rate - np.cross(cut_rotation, wanted.rate)])
         k, table = self._table.path.position(time)[0], self._table
         beyond = sizes - table.sizes
         pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
         # A dipole along the field makes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
-        return PointingCommand(_limited(dipole, self._limit), turn, missed)
+        # Scaled as a whole, so that the direction of the torque is kept.
+        largest = float(np.abs(dipole).max())
+        limited = dipole if largest <= self._limit else dipole * (self._limit / largest)
+        return PointingCommand(limited, rotation, missed)
 
 
 def _cut(vector: FloatArray, longest: float) -> FloatArray:
     length = math.sqrt(float(vector @ vector))
     return vector if length <= longest else vector * (longest / length)
-
-
-def _limited(dipole: FloatArray, limit: float) -> FloatArray:
-    """Return the dipole, scaled to the limit of the coils so that the direction of its torque is kept."""
-    largest = float(np.abs(dipole).max())
-    return dipole if largest <= limit else dipole * (limit / largest)
 
 
 FAR = math.radians(15.0)
@@ -114,7 +111,7 @@ LEAVING = math.radians(5.0)
 predicted."""
 SLOW = math.radians(0.1)
 """Rate (rad/s) below which a body is slow; the orbital rate is 0.06 deg/s."""
-PATIENCE = 180.0
+DAMPING_TIMEOUT = 180.0
 """Time (s) after which a path is planned although the body is not slow: the momentum along the field takes a
 quarter of an orbit."""
 DAMPING = 0.01
@@ -139,7 +136,7 @@ class PathRecovery:
         if self.since is None and off > FAR:
             self.since = now
         self.leaving = self.since is None and off > LEAVING
-        self.ready = self.since is not None and (speed < SLOW or now - self.since > PATIENCE)
+        self.ready = self.since is not None and (speed < SLOW or now - self.since > DAMPING_TIMEOUT)
 
     def planned(self) -> None:
         """Return to path following after a new plan."""

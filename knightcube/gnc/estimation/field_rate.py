@@ -23,13 +23,14 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.estimation.rotation import (
-    Matrix,
     Quaternion,
     Vector,
+    added,
     compose,
     cross,
     exponential,
     matrix,
+    rows_of,
     skew,
     times,
 )
@@ -98,7 +99,7 @@ class FieldRate:
         self._settings = settings
         inertia = np.asarray(settings.inertia, dtype=float)
         self._inverse = np.linalg.inv(inertia)
-        self._inertia_rows, self._inverse_rows = _rows(inertia), _rows(self._inverse)
+        self._inertia_rows, self._inverse_rows = rows_of(inertia), rows_of(self._inverse)
         moments = np.linalg.eigvalsh(inertia)
         self._differences = float(moments[-1] - moments[0]) / np.diag(inertia)
         # About as rare as `gate_sigma` of one component, by the exponential part of the tail.
@@ -227,9 +228,9 @@ class FieldRate:
         """Correct the state by a gain (12, 3) and an innovation (3,) of the states `measured`."""
         assert self._rate is not None
         change = (gain @ innovation).tolist()
-        self._rate = _sum(self._rate, change[RATE])
-        self._field = _sum(self._field, change[FIELD])
-        self._change = _sum(self._change, change[CHANGE])
+        self._rate = added(self._rate, change[RATE])
+        self._field = added(self._field, change[FIELD])
+        self._change = added(self._change, change[CHANGE])
         self._rotate_axes(self._inertia, change[AXES])
         covariance = self._covariance - gain @ self._covariance[measured]
         self._covariance = 0.5 * (covariance + covariance.T)
@@ -287,7 +288,7 @@ class FieldRate:
         rotation = np.array(matrix(exponential(x, y, z))).T
         self._inertia = rotation @ inertia @ rotation.T
         self._inverse = np.linalg.inv(self._inertia)
-        self._inertia_rows, self._inverse_rows = _rows(self._inertia), _rows(self._inverse)
+        self._inertia_rows, self._inverse_rows = rows_of(self._inertia), rows_of(self._inverse)
 
     def _step(self, dipole: Vector, dt: float) -> None:
         """Propagate state and covariance by one step of the midpoint rule."""
@@ -349,15 +350,6 @@ def _difference(a: Vector, b: Vector) -> Vector:
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-def _sum(a: Vector, b: list[float]) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
 def _floats(array: FloatArray) -> Vector:
     x, y, z = array.tolist()
     return x, y, z
-
-
-def _rows(array: FloatArray) -> Matrix:
-    a, b, c = (tuple(row) for row in array.tolist())
-    return a, b, c

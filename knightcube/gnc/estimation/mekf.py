@@ -45,6 +45,7 @@ from knightcube.gnc.estimation.measurements import (
 from knightcube.gnc.estimation.rigid_body import Accelerated
 from knightcube.gnc.estimation.rotation import (
     Vector,
+    added,
     compose,
     exponential,
     inverse,
@@ -240,16 +241,16 @@ def correct(
     covariance *= 0.5
     corrected = FilterState(
         compose(exponential(*error[0:3]), state.quaternion),
-        _sum(state.rate, error[3:6]),
-        _sum(state.bias, error[6:9]),
-        _sum(state.disturbance, error[9:12]),
-        Parameters(*_sum(state.parameters, error[12:15])),
+        added(state.rate, error[3:6]),
+        added(state.bias, error[6:9]),
+        added(state.disturbance, error[9:12]),
+        Parameters(*added(state.parameters, error[12:15])),
         tuple(
             (measurement, compose(exponential(*error[first : first + 3]), quaternion))
             for first, (measurement, quaternion) in zip(range(SIZE, len(error), 3), state.kept, strict=True)
         ),
         state.latency + error[LATENCY],
-        _sum(state.field_bias, error[FIELD_BIAS]),
+        added(state.field_bias, error[FIELD_BIAS]),
     )
     return corrected, covariance
 
@@ -277,10 +278,6 @@ def release_attitude(
 @functools.cache
 def _identity(size: int) -> FloatArray:
     return np.eye(size)
-
-
-def _sum(a: Vector, b: list[float]) -> Vector:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def _inverted(s: FloatArray) -> FloatArray:

@@ -42,6 +42,7 @@ from knightcube.gnc.estimation.rotation import (
     cross,
     exponential,
     matrix,
+    rows_of,
     skew,
     times,
     twist,
@@ -125,8 +126,8 @@ class RigidBody:
         if self.suspended:
             response = np.diag([0.0, 1.0 / inertia[1, 1], 0.0])
         object.__setattr__(self, "response", response)
-        object.__setattr__(self, "_response", _rows(response))
-        object.__setattr__(self, "_inertia", _rows(inertia))
+        object.__setattr__(self, "_response", rows_of(response))
+        object.__setattr__(self, "_inertia", rows_of(inertia))
 
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
@@ -199,11 +200,6 @@ class RigidBody:
             (jz + x * g - z * a, x * h - z * b, -jx + x * i - z * c),
             (-jy + y * a - x * d, jx + y * b - x * e, y * c - x * f),
         )
-
-
-def _rows(array: FloatArray) -> Matrix:
-    a, b, c = (tuple(row) for row in array.tolist())
-    return a, b, c
 
 
 LONGEST_STEP = 0.025

@@ -7,6 +7,9 @@ numpy call on three or four numbers takes ten times as long as the arithmetic.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+from knightcube.astro.arrays import FloatArray
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -81,3 +84,14 @@ def skew(v: Vector) -> Matrix:
     """Return the rows of [v x], so that times(skew(v), u) = v x u."""
     x, y, z = v
     return (0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)
+
+
+def added(a: Vector, b: Sequence[float]) -> Vector:
+    """Return a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def rows_of(array: FloatArray) -> Matrix:
+    """Return the rows of an array (3, 3) as tuples."""
+    a, b, c = (tuple(row) for row in array.tolist())
+    return a, b, c

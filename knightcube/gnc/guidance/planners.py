@@ -77,7 +77,7 @@ def plan_step(
         horizon,
         nodes=nodes,
         max_stretch=max_stretch,
-        time_price=time_cost,
+        time_cost=time_cost,
         cost=PathCost(minimise),
     )
 

@@ -31,7 +31,7 @@ from knightcube.gnc.control.pointing_job import (
     slew,
 )
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from knightcube.gnc.guidance.three_axes.slew_model import LEAST_TIME, AttitudeEnd, SlewPath, SlewTask
+from knightcube.gnc.guidance.three_axes.slew_model import MINIMUM_TIME, AttitudeEnd, SlewPath, SlewTask
 from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_task
 from tests.studies.campaigns.orbit_pointing_flight import TORQUE
 from tests.support.pointing_settings import AXES, WEIGHTS
@@ -68,7 +68,7 @@ def _recorded() -> int:
     ratios = []
     for case in recorded()["problems"]:
         least = case["kind"] == "time"
-        task = task_of(case, case["T"], time_price=LEAST_TIME if least else None)
+        task = task_of(case, case["T"], time_cost=MINIMUM_TIME if least else None)
         begin = time.process_time()
         try:
             plan = plan_task(task)

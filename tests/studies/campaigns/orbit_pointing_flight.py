@@ -185,7 +185,7 @@ class PointingFlight:
             sizes = found.torque_sizes * (law != "plain")
             since = time - self._begun
             command = self._law.command(since, found.quaternion, found.rate, field, residual, sizes)
-            self._turn, dipole = command.turn, command.dipole
+            self._turn, dipole = command.rotation, command.dipole
             if self._astray.since is not None:
                 dipole = damping_dipole(np.diag(flight.inertia), found.rate, field) - residual
         dipole = dipole * CYCLE / (CYCLE - PAUSE)

@@ -199,10 +199,10 @@ class PathGuidance:
 
     def _unwanted(self, plan: StepPlan) -> str:
         if self._target_q2 is None:
-            return "no target is wanted"
+            return "no target is set"
         if not (abs(plan.target_q2 - self._target_q2) <= _SAME and self._reaches_target(plan.path)):
             ends = f"q2 {q2_of(plan.path.end_angle):.4f} at {plan.path.end_rate:.4f} rad/s"
-            return f"it ends at {ends}, wanted is {self._target_q2:.4f} at {self._target_rate:.4f} rad/s"
+            return f"it ends at {ends}, the target is {self._target_q2:.4f} at {self._target_rate:.4f} rad/s"
         return ""
 
     def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:

@@ -164,15 +164,15 @@ def current_and_slopes(
     """
     square = 1.0 - q2 * q2
     by_acceleration = 2.0 / np.sqrt(square)  # dw'/dq2'', and dw/dq2' as well
-    turn = q2_rate / square
-    swing = q2 * turn
+    ratio = q2_rate / square
+    swing = q2 * ratio
     cosine = 1.0 - 2.0 * q2 * q2
     scale = 1.0 / (plant.torque_constant * cosine)
 
     acceleration = by_acceleration * (q2_acceleration + q2_rate * swing)
     torque = plant.inertia * (acceleration - plant.disturbance)
     torque_by_q2 = plant.inertia * (
-        acceleration * q2 / square + by_acceleration * (q2_rate * turn * (1.0 + q2 * q2) / square)
+        acceleration * q2 / square + by_acceleration * (q2_rate * ratio * (1.0 + q2 * q2) / square)
     )
     torque_by_rate = plant.inertia * 2.0 * by_acceleration * swing
     if plant.stiffness:

@@ -63,10 +63,10 @@ ALONG_LIMIT = 0.99
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
-_STEP, _LEAST_STEP = 1.15, 1.01
-_MOST_EVALUATIONS = 3000
-_PRICED_STEPS = 12
-_PRICED_CHANGE = 0.03
+_STEP, _MINIMUM_STEP = 1.15, 1.01
+_MAXIMUM_EVALUATIONS = 3000
+_TIME_COST_STEPS = 12
+_TIME_COST_CHANGE = 0.03
 
 
 @dataclass(slots=True)
@@ -117,19 +117,19 @@ class HorizonSearch:
             return self._continued(program, asked, longest)
         return self._at_requested(program, trial, asked)
 
-    def priced(
-        self, guess: float, least: float, longest: float, price: float
+    def with_time_cost(
+        self, guess: float, shortest: float, longest: float, time_cost: float
     ) -> tuple[PathProgram, Trial | None]:
-        """Return the path of minimum energy plus `price` W times its horizon, initially `guess` s.
+        """Return the path of minimum energy plus `time_cost` W times its horizon, initially `guess` s.
 
         The derivative of the minimum energy by the horizon is the partial derivative at that optimum. A
         horizon is a lower bound if lengthening it saves more energy than it costs, else an upper bound. The
         next horizon follows from E ~ 1/T^3 for a slew without limits. Only the last program imposes the
         limits.
         """
-        low, high, time = least, longest, min(max(guess, least), longest)
-        price = min(price, SHORTEST_COST * self.program_at(time).bang_power)
-        for _ in range(_PRICED_STEPS):
+        low, high, time = shortest, longest, min(max(guess, shortest), longest)
+        time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
+        for _ in range(_TIME_COST_STEPS):
             program = self.program_at(time)
             relaxed = program.unlimited(program.prey(time))
             self.evaluations += program.evaluations
@@ -140,13 +140,13 @@ class HorizonSearch:
             if current > _START_BELOW:
                 low, following = time, time * math.sqrt(current / _GROW_TO)
             else:
-                low, high = (time, high) if slope < -price else (low, time)
-                following = time * min(max(max(-slope / price, 0.0) ** 0.25, 0.5), 2.0)
+                low, high = (time, high) if slope < -time_cost else (low, time)
+                following = time * min(max(max(-slope / time_cost, 0.0) ** 0.25, 0.5), 2.0)
             if not low < following < high:
                 following = math.sqrt(low * high)
-            if abs(following - time) <= _PRICED_CHANGE * time or high <= low * (1.0 + _PRICED_CHANGE):
+            if abs(following - time) <= _TIME_COST_CHANGE * time or high <= low * (1.0 + _TIME_COST_CHANGE):
                 spent = program.evaluations
-                trial = program.limited(relaxed, FreeHorizon(least, longest, price))
+                trial = program.limited(relaxed, FreeHorizon(shortest, longest, time_cost))
                 self.evaluations += program.evaluations - spent
                 if trial is not None:
                     return program, trial
@@ -175,11 +175,11 @@ class HorizonSearch:
         """
         stretched: tuple[PathProgram, Trial] | None = None
         for factor in _ANCHORS:
-            if asked * factor > longest or self.evaluations > _MOST_EVALUATIONS:
+            if asked * factor > longest or self.evaluations > _MAXIMUM_EVALUATIONS:
                 break
             program, trial = self.over(asked * factor, None)
             step = _STEP
-            while trial is not None and trial.horizon != asked and step > _LEAST_STEP:
+            while trial is not None and trial.horizon != asked and step > _MINIMUM_STEP:
                 ratio = min(max(asked / trial.horizon, 1.0 / step), step)
                 wanted = asked if 1.0 / step < ratio < step else trial.horizon * ratio
                 further, found = self.over(wanted, program.from_prey(trial))
@@ -224,8 +224,8 @@ class HorizonSearch:
 
     def _shortest(self, program: PathProgram, start: Trial, asked: float, longest: float) -> Trial | None:
         """Return the shortest path of at least `asked` s, with minimum energy if its horizon is `asked`."""
-        price = SHORTEST_COST * program.bang_power
-        trial = program.limited(start, FreeHorizon(asked, longest, price))
+        time_cost = SHORTEST_COST * program.bang_power
+        trial = program.limited(start, FreeHorizon(asked, longest, time_cost))
         if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):
             return trial
         return program.limited(Trial(trial.parameters, asked)) or trial
@@ -245,7 +245,7 @@ MAX_STRETCH = 6.0
 NODES_RANGE = (8, 40)
 HORIZON_RANGE = (1e-3, 1e5)
 FASTEST = 100.0
-LEAST_PRICED = 1.0
+SHORTEST_WITH_TIME_COST = 1.0
 
 
 class PlanStatus(StrEnum):
@@ -303,7 +303,7 @@ def plan(
     reference: float = REFERENCE,
     q2_limit: float = Q2_LIMIT,
     max_stretch: float = MAX_STRETCH,
-    time_price: float | None = None,
+    time_cost: float | None = None,
     last: PolynomialPath | None = None,
     cost: PathCost = PathCost.HEAT,
 ) -> StepPlan:
@@ -313,18 +313,18 @@ def plan(
     the horizon is stretched to at most `max_stretch` times the requested one. A stretched horizon lies about
     0.3 % above the shortest of the paths on `nodes` nodes, within 1.5 % of the bang-bang time.
 
-    With `time_price` in W the path minimises energy plus time cost, over horizons from LEAST_PRICED s to
-    `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until now,
-    its origin relative to the new start (so not positive); its remainder is the initial guess of the path.
-    `cost` selects the energy that is minimised.
+    With `time_cost` in W the path minimises energy plus time cost, over horizons from SHORTEST_WITH_TIME_COST
+    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
+    now, its origin relative to the new start (so not positive); its remainder is the initial guess of the
+    path. `cost` selects the energy that is minimised.
 
     Raises PlanningError if an argument is not finite or outside its limits, or if no allowed horizon is
     feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
     _check(states, horizon, nodes, reference, q2_limit, max_stretch)
-    if time_price is not None and not (math.isfinite(time_price) and time_price > 0.0):
-        raise PlanningError(f"time_price is {time_price} W: it must be finite and positive")
+    if time_cost is not None and not (math.isfinite(time_cost) and time_cost > 0.0):
+        raise PlanningError(f"time_cost is {time_cost} W: it must be finite and positive")
     boundary = BoundaryStates(
         start_q2, q2_rate_of(start_q2, start_rate), end_q2, q2_rate_of(end_q2, end_rate)
     )
@@ -334,20 +334,22 @@ def plan(
 
     search = HorizonSearch(program_at, _remains(last, nodes))
     longest = max_stretch * horizon
-    if time_price is None:
+    if time_cost is None:
         program, trial = search.within(horizon, longest)
     else:
-        program, trial = search.priced(horizon, min(LEAST_PRICED, longest), longest, time_price)
+        program, trial = search.with_time_cost(
+            horizon, min(SHORTEST_WITH_TIME_COST, longest), longest, time_cost
+        )
     if trial is None:
         raise PlanningError(
             f"no path was found from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at "
             f"{end_rate:.4f} rad/s with |I| <= {plant.current_limit} A and |q2| <= {q2_limit} over "
             f"{horizon:g} to {longest:.1f} s"
         )
-    asked = horizon if time_price is None else trial.horizon
+    asked = horizon if time_cost is None else trial.horizon
     found = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
     along_limit = found.peak_current >= ALONG_LIMIT * plant.current_limit
-    if time_price is not None or nodes >= FINE_NODES or not along_limit or trial.horizon > _NEARLY * asked:
+    if time_cost is not None or nodes >= FINE_NODES or not along_limit or trial.horizon > _NEARLY * asked:
         return found
     search = HorizonSearch(
         partial(program_at, count=FINE_NODES), _remains(found.path, FINE_NODES), search.evaluations
@@ -467,7 +469,7 @@ class PlanJob:
     horizon: float
     max_horizon: float
     nodes: int = NODES
-    time_price: float | None = None
+    time_cost: float | None = None
     last: PolynomialPath | None = None
     cost: PathCost = PathCost.HEAT
 
@@ -483,7 +485,7 @@ def run(job: PlanJob) -> StepPlan:
         job.horizon,
         nodes=job.nodes,
         max_stretch=max(job.max_horizon / job.horizon, 1.0),
-        time_price=job.time_price,
+        time_cost=job.time_cost,
         last=job.last,
         cost=job.cost,
     )

@@ -213,11 +213,11 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """A horizon to be optimised between `least` and `greatest` s, with a time cost of `price` W."""
+    """A horizon to be optimised between `shortest` and `longest` s, with a time cost of `time_cost` W."""
 
-    least: float
-    greatest: float
-    price: float
+    shortest: float
+    longest: float
+    time_cost: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,7 +350,10 @@ class PathProgram:
         return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
-        """Return the least-energy path over the horizon of `start` without limits; None if none is found."""
+        """Return the minimum-energy path over the horizon of `start` without limits.
+
+        None if none is found.
+        """
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
@@ -360,9 +363,9 @@ class PathProgram:
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
     def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
-        """Return the least-energy path within the limits, from `start`; None when none was found.
+        """Return the minimum-energy path within the limits, from `start`; None when none was found.
 
-        With `free` the horizon is free and its price is added to the energy.
+        With `free` the horizon is free and its time cost is added to the energy.
         """
         ratios = self.ratios(start)
         every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
@@ -391,7 +394,7 @@ class PathProgram:
     ) -> tuple[Trial, bool]:
         """Run SLSQP once from `start`; return where it ended, and whether it converged."""
         variables = _Variables(start, self.family.size, free)
-        size, price = variables.size, variables.price
+        size, time_cost = variables.size, variables.time_cost
         last = variables.first
 
         def objective(x: FloatArray, gradient: FloatArray) -> float:
@@ -403,14 +406,14 @@ class PathProgram:
             if gradient.size:
                 gradient[:size] = by_parameters
                 if free:
-                    gradient[size] = variables.root * trial.horizon * (by_horizon + price)
-            return energy + price * trial.horizon
+                    gradient[size] = variables.root * trial.horizon * (by_horizon + time_cost)
+            return energy + time_cost * trial.horizon
 
         solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
         solver.set_min_objective(objective)
         # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
         origin = variables.origin
-        solver.set_ftol_abs(_FREE_TOLERANCE * price * origin if free else self._energy_tolerance(origin))
+        solver.set_ftol_abs(_FREE_TOLERANCE * time_cost * origin if free else self._energy_tolerance(origin))
         solver.set_maxeval(_EVALUATIONS)
         variables.bound(solver)
         if limits is not None and limits.index.size:
@@ -451,8 +454,8 @@ class _Variables:
 
     def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
         self.size, self.origin, self.free = size, start.horizon, free
-        self.price = free.price if free else 0.0
-        self.root = 1.0 / math.sqrt(free.price * self.origin) if free else 0.0
+        self.time_cost = free.time_cost if free else 0.0
+        self.root = 1.0 / math.sqrt(free.time_cost * self.origin) if free else 0.0
         self.first = np.append(start.parameters, 0.0) if free else start.parameters
 
     def trial(self, x: FloatArray) -> Trial:
@@ -463,7 +466,7 @@ class _Variables:
     def bound(self, solver: nlopt.opt) -> None:
         """Keep a free horizon within its bounds."""
         if self.free is not None:
-            bounds = self.free.least, self.free.greatest
+            bounds = self.free.shortest, self.free.longest
             low, high = (math.log(bound / self.origin) / self.root for bound in bounds)
             solver.set_lower_bounds(np.append(np.full(self.size, -np.inf), low))
             solver.set_upper_bounds(np.append(np.full(self.size, np.inf), high))

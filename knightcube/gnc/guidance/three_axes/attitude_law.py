@@ -41,7 +41,7 @@ Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Function from an ephemeris and times (n,), s of the ephemeris, to unit vectors (n, 3), ICRS."""
 DIFFERENCE = 1.0
 """Step of the central differences for rate and acceleration, s."""
-LEAST_SINE = 1e-3
+MINIMUM_SINE = 1e-3
 """Smallest sine of the angle between the two directions; closer to parallel they determine no attitude."""
 
 
@@ -263,22 +263,15 @@ def approach(
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
-        turn = rest * left + drift * _before_turn(left, rate - shown)
-        return multiply(from_rotation_vector(turn), wanted)
+        # The derivative of the rotation vector `left` for the relative rate: the inverse of the left Jacobian
+        # of the rotation group, for quaternions that rotate inertial into body axes.
+        angle, relative = float(np.linalg.norm(left)), rate - shown
+        second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+        crossed = np.cross(left, relative)
+        derivative = np.asarray(relative + 0.5 * crossed + second * np.cross(left, crossed))
+        return multiply(from_rotation_vector(rest * left + drift * derivative), wanted)
 
     return at
-
-
-def _before_turn(turn: FloatArray, rate: FloatArray) -> FloatArray:
-    """Return the derivative (3,) of a rotation vector `turn` (3,) for a body rate `rate` (3,), body axes.
-
-    The inverse of the left Jacobian of the rotation group, for quaternions that rotate inertial into body
-    axes.
-    """
-    angle = float(np.linalg.norm(turn))
-    second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    crossed = np.cross(turn, rate)
-    return np.asarray(rate + 0.5 * crossed + second * np.cross(turn, crossed))
 
 
 def _orbital_axes(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -306,7 +299,7 @@ def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return right-handed frames (n, 3, 3) as rows, from unit vectors (n, 3)."""
     normal = np.cross(first, second)
     sine = np.linalg.norm(normal, axis=1, keepdims=True)
-    if float(np.min(sine)) < LEAST_SINE:
+    if float(np.min(sine)) < MINIMUM_SINE:
         raise UsageError(
             "the two directions of the attitude law are parallel, so that the roll is undetermined"
         )

@@ -95,8 +95,8 @@ class PointingTarget:
         elif self.goal is Goal.INERTIAL:
             return text + " {:.4f} {:.4f} {:.4f} {:.4f}".format(*self.numbers)
         elif self.goal is Goal.OBJECT:
-            place = " near RA {:.4f}, Dec {:.4f} deg"
-            return text + (place.format(*map(math.degrees, self.numbers)) if self.numbers else "")
+            near = " near RA {:.4f}, Dec {:.4f} deg"
+            return text + (near.format(*map(math.degrees, self.numbers)) if self.numbers else "")
         return text + (", roll free" if self.roll is None else f", roll {math.degrees(self.roll):g} deg")
 
 

@@ -142,8 +142,8 @@ class SlewDynamics:
         self._pushes = scale**2 * _pushes(craft, around)
         self._quadratic = _quadratic(craft.inertia)
         self._parts = np.zeros((len(down), _Z, 10))
-        for part, place in ((_M, _DIPOLE), (_W, _RATE), (_Q, _ATTITUDE)):
-            self._parts[:, part, place] = np.eye(part.stop - part.start)
+        for part, columns in ((_M, _DIPOLE), (_W, _RATE), (_Q, _ATTITUDE)):
+            self._parts[:, part, columns] = np.eye(part.stop - part.start)
 
     def field(self, q: FloatArray) -> FloatArray:
         """Return the field b (n, 3) at attitudes (n, 4), in the units of the motion and body axes."""
@@ -474,8 +474,8 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
     moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)
 
     def towards_earth(times: FloatArray) -> FloatArray:
-        place = ephemeris.position_at(begin + times)
-        return np.asarray(-place / np.linalg.norm(place, axis=1, keepdims=True))
+        position = ephemeris.position_at(begin + times)
+        return np.asarray(-position / np.linalg.norm(position, axis=1, keepdims=True))
 
     def towards_moon(times: FloatArray) -> FloatArray:
         away = moon - ephemeris.position_at(begin + times)
@@ -495,12 +495,12 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 
 NODES = 24
-"""Intervals of the dipole. The heat is within 0.1 % of that on 48, the least time within 0.6 %."""
+"""Intervals of the dipole. The heat is within 0.1 % of that on 48, the shortest time within 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
 """Depth (rad) inside a cone, and rate (rad/s) below which a target is at rest among the stars."""
-LEAST_TIME = math.inf
+MINIMUM_TIME = math.inf
 """Time cost at which only the duration counts."""
 
 
@@ -513,7 +513,7 @@ class SlewTask:
         quaternion, rate: the start, (4,) ICRS into body and (3,) rad/s, body axes.
         end: the end of a slew as a function of its duration.
         horizon, longest: s; the horizon is stretched up to `longest` if no path over it is found.
-        time_price: cost of time, W; None keeps the horizon, LEAST_TIME minimises it.
+        time_cost: cost of time, W; None keeps the horizon, MINIMUM_TIME minimises it.
         cones: exclusion cones kept during the whole slew.
         nodes: intervals of the collocation.
     """
@@ -525,7 +525,7 @@ class SlewTask:
     end: EndLaw
     horizon: float
     longest: float
-    time_price: float | None = None
+    time_cost: float | None = None
     cones: tuple[Cone, ...] = ()
     nodes: int = NODES
 
@@ -559,8 +559,8 @@ def check(task: SlewTask) -> None:
         )
     if not NODES_RANGE[0] <= task.nodes <= NODES_RANGE[1]:
         raise PlanningError(f"nodes is {task.nodes}: must be {NODES_RANGE[0]} to {NODES_RANGE[1]}")
-    if task.time_price is not None and not task.time_price > 0.0:
-        raise PlanningError(f"the cost of time is {task.time_price} W: it must be positive")
+    if task.time_cost is not None and not task.time_cost > 0.0:
+        raise PlanningError(f"the cost of time is {task.time_cost} W: it must be positive")
     end = task.end(task.horizon)
     for cone in task.cones:
         inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
@@ -569,7 +569,10 @@ def check(task: SlewTask) -> None:
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
         # The cones move by some degrees during a slew. For an end deep inside no other horizon helps.
-        if isinstance(end, AttitudeEnd) and _is_deep_inside(end, cone, task.horizon):
+        if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
+            clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
+            if float(clearance[0]) >= -_DEEP:
+                continue
             raise PlanningError(f"the end lies inside the exclusion cone of the {cone.name}")
 
 
@@ -583,9 +586,3 @@ def blocking_cone(task: SlewTask, horizon: float) -> Cone | None:
         return None
     shown, time = end.quaternion[None], np.array([horizon])
     return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
-
-
-def _is_deep_inside(end: AttitudeEnd, cone: Cone, time: float) -> bool:
-    """Return whether an end at rest among the stars lies deep inside a cone."""
-    inside = float(cone.clearance(end.quaternion[None], np.array([time]))[0])
-    return inside < -_DEEP and float(np.abs(end.rate).max()) < _STILL

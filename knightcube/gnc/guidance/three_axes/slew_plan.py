@@ -139,7 +139,7 @@ class SlewPlan:
         horizon_asked, horizon: s.
         energy: J, heat of the coils.
         peak: the largest dipole over its limit.
-        clearance: rad, least distance outside each cone, in the order of the task's cones.
+        clearance: rad, smallest distance outside each cone, in the order of the task's cones.
         steps: Newton steps over all guesses.
     """
 
@@ -223,7 +223,7 @@ def _plan(task: SlewTask, search: SlewSearch, found: SolvedPath) -> SlewPlan | N
     if not all(np.isfinite(part).all() for part in parts):
         return None
     clear = _clearances(task, path)
-    kept = task.time_price is not None or path.horizon <= task.horizon * (1.0 + 1e-6)
+    kept = task.time_cost is not None or path.horizon <= task.horizon * (1.0 + 1e-6)
     return SlewPlan(
         path,
         SlewStatus.OPTIMAL if kept else SlewStatus.STRETCHED,
@@ -277,7 +277,7 @@ class SlewOrder:
         goal: the target at the end; with a free roll only its direction counts.
         horizon, longest: s, as in `SlewTask`.
         window: s, within which the slew begins.
-        time_price: W, as in `SlewTask`.
+        time_cost: W, as in `SlewTask`.
         angles: rad, of the exclusion cones of `sun`, `earth` and `moon`.
         nodes: intervals of the collocation.
     """
@@ -290,7 +290,7 @@ class SlewOrder:
     horizon: float
     longest: float
     window: float = 0.0
-    time_price: float | None = None
+    time_cost: float | None = None
     angles: dict[str, float] = field(default_factory=dict)
     nodes: int = NODES
 
@@ -340,7 +340,14 @@ def plan_order(order: SlewOrder, ephemeris: Ephemeris, first: float) -> OrderedS
         except PlanningError as error:
             failed = error
         else:
-            compared.append((_value(plan, order.time_price), float(begin)))
+            # First the stretched horizon, then the cost.
+            if order.time_cost is None:
+                value = (plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0, plan.energy)
+            elif math.isinf(order.time_cost):
+                value = (0.0, plan.horizon)
+            else:
+                value = (0.0, plan.energy + order.time_cost * plan.horizon)
+            compared.append((value, float(begin)))
     # Without a window, or if no coarse slew was found, only the first start time is used.
     for begin in [begin for _, begin in sorted(compared)] or [first]:
         task = task_at(order, ephemeris, begin)
@@ -363,7 +370,7 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
         end_law(order.goal, order.axes, ephemeris, begin),
         order.horizon,
         order.longest,
-        order.time_price,
+        order.time_cost,
         cones(ephemeris, begin, order.camera, **order.angles),
         order.nodes,
     )
@@ -394,11 +401,3 @@ def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArr
     """Return the attitude (4,) and the rate (3,) rad/s, body axes, of a law at a time, s."""
     found = references(law, ephemeris, np.array([time]))
     return found.quaternion[0], found.rate[0]
-
-
-def _value(plan: SlewPlan, price: float | None) -> tuple[float, float]:
-    """Return the ordering key of slews: first the stretched horizon, then the cost."""
-    if price is None:
-        late = plan.horizon if plan.status is SlewStatus.STRETCHED else 0.0
-        return late, plan.energy
-    return 0.0, plan.horizon if math.isinf(price) else plan.energy + price * plan.horizon

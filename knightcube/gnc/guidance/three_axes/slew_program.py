@@ -475,13 +475,13 @@ class SlewProgram:
         """Return the next iterate and the convexification used; the iterate is None if no step is found."""
         lack = self.lack(point)[0]
         is_far = lack > _FAR
-        least = _DAMPED * min(1.0, lack) if is_far else 0.0
+        minimum = _DAMPED * min(1.0, lack) if is_far else 0.0
         bent = np.zeros_like(point.dual) if is_far else point.dual
         stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
         multipliers = np.zeros_like(point.multipliers) if is_far else point.multipliers
         states, heavy = stiffness
         for _ in range(10):
-            more = max(convex, least)
+            more = max(convex, minimum)
             stiff = states + more * _EYE7, heavy + more
             step = self._newton(point, barrier, more, self.equations.band(point.linear, multipliers, *stiff))
             if step is not None:
@@ -512,7 +512,7 @@ class SlewProgram:
 
     def _searched(self, point: Iterate, step: NewtonStep, barrier: float, error: float) -> Iterate | None:
         """Return the iterate along a step that lowers the error or the merit; None if there is none."""
-        equal, missed = self._equal, point.slope[self._equal]
+        equal, missed, layout = self._equal, point.slope[self._equal], self.equations.layout
         size = _share(point.slack, self._limits.along(point.at, step.change) + step.off)
         dual = point.dual + _share(point.dual, step.dual) * step.dual
         weight = _HEAVIER * float(np.abs(point.multipliers[equal] + step.change[equal]).max())
@@ -528,10 +528,13 @@ class SlewProgram:
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)
-                there, slack = self._shifted(point, change, size * step.off)
+                there = Trajectory(
+                    point.at.states + change[layout.states], point.at.dipoles + change[layout.dipoles]
+                )
+                slack = point.slack + self._limits.along(point.at, change) + size * step.off
                 if slack.size and float((slack - (1.0 - _TO_BOUNDARY) * point.slack).min()) < 0.0:
                     break
-                left = self._violations(there)
+                left = np.concatenate([part.ravel() for part in self.equations.remainders(there)])
                 lowered = self._merit(there, slack, barrier, weight, left) < lower
                 if lowered or (attempt == 0 and correction == _CORRECTIONS):
                     multipliers = point.multipliers.copy()
@@ -541,16 +544,6 @@ class SlewProgram:
                         return moved
             size *= 0.5
         return None
-
-    def _shifted(self, point: Iterate, change: FloatArray, off: FloatArray) -> tuple[Trajectory, FloatArray]:
-        """Return trajectory and slacks after a change (size,); the slacks also remove the residuals `off`."""
-        at, layout = point.at, self.equations.layout
-        there = Trajectory(at.states + change[layout.states], at.dipoles + change[layout.dipoles])
-        return there, point.slack + self._limits.along(at, change) + off
-
-    def _violations(self, at: Trajectory) -> FloatArray:
-        """Return the residuals of all equations."""
-        return np.concatenate([part.ravel() for part in self.equations.remainders(at)])
 
     def _merit(
         self, at: Trajectory, slack: FloatArray, barrier: float, weight: float, missed: FloatArray
@@ -594,16 +587,16 @@ class NewtonRun:
         """Constraint violation."""
         return sum(self.program.lack(self.point))
 
-    def run(self, most: int) -> Iterate | None:
-        """Return the optimum found within `most` more steps; None if none was found."""
+    def run(self, maximum: int) -> Iterate | None:
+        """Return the optimum found within `maximum` more steps; None if none was found."""
         if self.is_over:
             return None
         with np.errstate(over="ignore", invalid="ignore"):  # a step too long is shortened
-            return self._run(most)
+            return self._run(maximum)
 
-    def _run(self, most: int) -> Iterate | None:
+    def _run(self, maximum: int) -> Iterate | None:
         program, last = self.program, self._last
-        for _ in range(most):
+        for _ in range(maximum):
             error = program.error(self.point, self._barrier)
             while error < 10.0 * self._barrier and self._barrier > last:
                 self._barrier = max(last, min(0.2 * self._barrier, self._barrier**1.5))

@@ -26,7 +26,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from knightcube.gnc.guidance.three_axes.slew_model import (
     HORIZON_RANGE,
-    LEAST_TIME,
+    MINIMUM_TIME,
     BoresightEnd,
     ConeConstraints,
     End,
@@ -174,13 +174,13 @@ class SlewSolver:
                 break
         return found
 
-    def found(self, descent: NewtonRun, most: int, enough: float = 0.0) -> SolvedPath | None:
-        """Return the path found within `most` more steps; None if there is none.
+    def found(self, descent: NewtonRun, maximum: int, enough: float = 0.0) -> SolvedPath | None:
+        """Return the path found within `maximum` more steps; None if there is none.
 
         An iterate whose constraint violation is less than `enough` is accepted although it is no optimum.
         """
         program, before = descent.program, descent.program.steps
-        point = descent.run(most)
+        point = descent.run(maximum)
         if point is None and descent.missed < enough:
             point = descent.point
         self.steps += program.steps - before
@@ -248,7 +248,12 @@ def guesses(
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
     found = []
     for states in fit.found():
-        found.append(Trajectory(states, _dipoles(motion, craft, states)[::2]))
+        # The smallest dipoles for the component of the states' torque normal to the field.
+        still = motion.flow(states, np.zeros((len(states), 3)))
+        wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
+        field = motion.field(states[:, :4])
+        square = np.sum(field * field, axis=1, keepdims=True)
+        found.append(Trajectory(states, np.asarray(cross(field, wanted @ craft.inertia) / square)[::2]))
     return found
 
 
@@ -391,14 +396,6 @@ def _unit(q: FloatArray) -> FloatArray:
     return np.asarray(q / np.sqrt(np.sum(q * q, axis=1, keepdims=True)))
 
 
-def _dipoles(motion: SlewDynamics, craft: SlewCraft, states: FloatArray) -> FloatArray:
-    """Return the smallest dipoles (n, 3) for the component of the states' torque normal to the field."""
-    still = motion.flow(states, np.zeros((len(states), 3)))
-    wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
-    field = motion.field(states[:, :4])
-    return np.asarray(cross(field, wanted @ craft.inertia) / np.sum(field * field, axis=1, keepdims=True))
-
-
 ENOUGH = 3
 """Number of relaxed paths from which the best is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
@@ -438,7 +435,7 @@ class HorizonContinuation:
         coarse = self._over(start, time)
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
-    def shortened(self, relaxed: list[SolvedPath], least: float, time_cost: float) -> SolvedPath | None:
+    def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path found by shortening the horizon as long as `time_cost` W makes that cheaper.
 
         Continuation starts where a relaxed path just keeps the dipole limit, with the path that needs the
@@ -446,19 +443,19 @@ class HorizonContinuation:
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
-            times = self._begins(start, least)
+            times = self._begins(start, shortest)
             ways = (self._over(start, time) for time in times)
             begun = next(filter(None, ways), None)
             if begun is None:
                 continue
             if self._task.cones:
                 begun = self._finer(begun, begun.horizon, WALK_BARRIER) or begun
-            ended = self._walked(begun, least, time_cost, _COARSE_STEPS)
+            ended = self._walked(begun, shortest, time_cost, _COARSE_STEPS)
             if best is None or self._value(ended, time_cost) < self._value(best, time_cost):
                 best = ended
-            if best.horizon <= least or self._solver.work > self._budget:
+            if best.horizon <= shortest or self._solver.work > self._budget:
                 break
-        return None if best is None else self._refined(best, least, time_cost)
+        return None if best is None else self._refined(best, shortest, time_cost)
 
     def distinct(self, relaxed: list[SolvedPath]) -> list[SolvedPath]:
         """Return the distinct relaxed paths, the cheapest first."""
@@ -493,7 +490,7 @@ class HorizonContinuation:
         if peak > _LOST:
             return None
         solver.share /= peak
-        if task.time_price is None and time <= task.horizon * (1.0 + 1e-6):
+        if task.time_cost is None and time <= task.horizon * (1.0 + 1e-6):
             eased = solver.limited(found, task.nodes, time, LAST_BARRIER)
             if eased is not None:
                 return eased
@@ -502,15 +499,15 @@ class HorizonContinuation:
             return None
         return solver.limited(found, task.nodes, time, LAST_BARRIER)
 
-    def _refined(self, best: SolvedPath, least: float, time_cost: float) -> SolvedPath | None:
+    def _refined(self, best: SolvedPath, shortest: float, time_cost: float) -> SolvedPath | None:
         """Return the best path on the fine grid, by continuation from a coarse one."""
         times = best.horizon * np.array([1.0, 1.02, 1.1])
         longer = (self._finer(best, float(time), WALK_BARRIER) for time in times)
         fine = next(filter(None, longer), None)
         if fine is None:
             return None
-        ratios = _STRETCHED_STEPS if self._task.time_price is None else _FINE_STEPS
-        fine = self._walked(fine, least, time_cost, ratios)
+        ratios = _STRETCHED_STEPS if self._task.time_cost is None else _FINE_STEPS
+        fine = self._walked(fine, shortest, time_cost, ratios)
         return self._solver.limited(fine, self._task.nodes, fine.horizon, LAST_BARRIER) or fine
 
     def _finer(self, coarse: SolvedPath, time: float, last: float) -> SolvedPath | None:
@@ -528,12 +525,12 @@ class HorizonContinuation:
         return fine
 
     def _walked(
-        self, best: SolvedPath, least: float, time_cost: float, ratios: tuple[float, float]
+        self, best: SolvedPath, shortest: float, time_cost: float, ratios: tuple[float, float]
     ) -> SolvedPath:
         """Return the best path in a continuation to shorter horizons, down to the last ratio."""
         (first, last), failed = ratios, 0.0
-        while best.horizon > max(least, last * failed) and self._solver.work < self._budget:
-            time = max(best.horizon / first, least, math.sqrt(best.horizon * failed))
+        while best.horizon > max(shortest, last * failed) and self._solver.work < self._budget:
+            time = max(best.horizon / first, shortest, math.sqrt(best.horizon * failed))
             further = self._over(best, time)
             if further is not None and self._value(further, time_cost) < self._value(best, time_cost):
                 best = further
@@ -545,11 +542,11 @@ class HorizonContinuation:
         """Return the approximate horizon, s, over which a relaxed path would keep the dipole limit."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
-    def _begins(self, start: SolvedPath, least: float) -> list[float]:
+    def _begins(self, start: SolvedPath, shortest: float) -> list[float]:
         """Return the horizons, s, at which continuation from a relaxed path may begin, the shortest first."""
-        time = max(self._fastest(start), least)
+        time = max(self._fastest(start), shortest)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
-        if start.horizon == self._task.horizon and self._task.time_price is None and start.horizon in times:
+        if start.horizon == self._task.horizon and self._task.time_cost is None and start.horizon in times:
             times.remove(start.horizon)  # already tried
         task = self._task
         return [each for each in times if each <= task.longest and blocking_cone(task, each) is None]
@@ -571,7 +568,7 @@ after which no further guess is tried. A thousand take about a tenth of a second
 around cones differ too much from those on the fine grid."""
 _WALKS = 1.8
 """Factor on the budget of a search, after which continuation ends with the best path so far."""
-_MOST_TRIED = 16
+_MAXIMUM_TRIED = 16
 """Largest number of guesses over one horizon."""
 _LOOK = 8
 """Newton steps of every guess before its violation is judged."""
@@ -579,7 +576,7 @@ _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
 """Further Newton steps of a guess, in stages, and the violation above which it is deferred instead. Four of
 five guesses that lead to a path have a violation below 1.5 after eight steps, three of four that do not have
 more (320 guesses, seed 41 of the bench `orbit_slews`)."""
-_PATIENCE = 120
+_STEPS_WITHOUT_PATH = 120
 """Newton steps without a path after which the other guesses over a horizon are deferred."""
 _WIDENED = 4
 """Largest number of times that cones are widened or dipoles reduced for one path."""
@@ -601,7 +598,7 @@ class SlewSearch:
 
     def paths(self) -> Iterator[SolvedPath]:
         """Yield paths within all limits at the nodes, the best first."""
-        time_cost = self._task.time_price
+        time_cost = self._task.time_cost
         for batches in self._rungs():
             relaxed: list[SolvedPath] = []
             for batch in batches:
@@ -612,7 +609,7 @@ class SlewSearch:
                     yield self._fresh(found)
             if time_cost is not None or not relaxed:
                 continue
-            if (found := self._walker.shortened(relaxed, self._task.horizon, LEAST_TIME)) is not None:
+            if (found := self._walker.shortened(relaxed, self._task.horizon, MINIMUM_TIME)) is not None:
                 yield self._fresh(found)
 
     def widened(self, found: SolvedPath, depths: FloatArray) -> SolvedPath | None:
@@ -651,11 +648,22 @@ class SlewSearch:
     def _relaxed(self, horizon: float, deferred: list[NewtonRun]) -> Iterator[list[SolvedPath]]:
         """Yield batches of relaxed paths over a horizon; append other guesses to `deferred`."""
         batch: list[SolvedPath] = []
-        solver, least = self.solver, self.solver.steps + _PATIENCE
-        for guess in self._guesses(horizon)[:_MOST_TRIED]:
+        solver, patience = self.solver, self.solver.steps + _STEPS_WITHOUT_PATH
+        equations = solver.equations(horizon, self._coarse)
+        kept = solver.kept(equations)
+        starts = guesses(
+            equations.motion,
+            self._task.craft,
+            equations.start,
+            equations.end,
+            equations.around,
+            kept,
+            horizon,
+        )
+        for guess in starts[:_MAXIMUM_TRIED]:
             self.tried += 1
             descent = solver.descent(solver.equations(horizon, self._coarse), guess)
-            if solver.steps > least and not batch:
+            if solver.steps > patience and not batch:
                 deferred.append(descent)
                 continue
             found = solver.found(descent, _LOOK)
@@ -668,7 +676,7 @@ class SlewSearch:
                 deferred.append(descent)
             if len(batch) == ENOUGH:
                 yield batch
-                batch, least = [], solver.steps + _PATIENCE
+                batch, patience = [], solver.steps + _STEPS_WITHOUT_PATH
         if batch:
             yield batch
 
@@ -680,14 +688,6 @@ class SlewSearch:
             found = self.solver.found(descent, self._further[-1][0], MET)
             if found is not None:
                 yield [found]
-
-    def _guesses(self, horizon: float) -> list[Trajectory]:
-        """Return guesses over a horizon, the most promising first."""
-        equations, craft = self.solver.equations(horizon, self._coarse), self._task.craft
-        kept = self.solver.kept(equations)
-        return guesses(
-            equations.motion, craft, equations.start, equations.end, equations.around, kept, horizon
-        )
 
     def _cheapest(self, batch: list[SolvedPath]) -> list[SolvedPath]:
         """Return paths within the limits over the requested horizon, the cheapest first."""

@@ -66,7 +66,7 @@ def test_stars_without_a_position_are_left_out() -> None:
 def test_a_star_that_would_stand_twice_is_refused() -> None:
     source = _source()
     source["hip"][0] = build.ADDED[0].hip
-    with pytest.raises(UsageError, match="off ADDED"):
+    with pytest.raises(UsageError, match="remove these from ADDED"):
         build.select(source)
 
 
@@ -79,7 +79,7 @@ def test_the_right_source_passes_the_check() -> None:
     [
         ("short", "118217 rows: the Hipparcos main catalogue has 118218"),
         ("epoch", r"epochs \[1991.25, 2000.0\]"),
-        ("twice", "stands twice"),
+        ("twice", "occurs twice"),
         ("fainter", "4994 stars brighter than V 6.0: Hipparcos has 4995"),
     ],
 )

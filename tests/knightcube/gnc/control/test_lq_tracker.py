@@ -185,7 +185,7 @@ def test_an_input_that_is_not_finite_is_refused(position: int, value: float) -> 
         ({"state_weight": 0.0}, "Q"),
         ({"input_weight": math.nan}, "R"),
         ({"largest_error": 1.6}, "largest_error"),
-        ({"least_authority": 0.0}, "least_authority"),
+        ({"minimum_authority": 0.0}, "minimum_authority"),
     ],
 )
 def test_impossible_settings_are_refused_by_name(options: dict[str, Any], name: str) -> None:

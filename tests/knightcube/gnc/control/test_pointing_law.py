@@ -15,9 +15,9 @@ from knightcube.astro.earth.disturbance import AIR, CONSTANT, SIZES, pressures, 
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.control.pointing_law import (
+    DAMPING_TIMEOUT,
     FAR,
     LEAVING,
-    PATIENCE,
     SLOW,
     PathRecovery,
     PointingLaw,
@@ -72,7 +72,7 @@ def fly(
         field = attitude_matrix(q) @ ORBIT.field_at(at)[0]
         command = law.command(time, q, w, field, residual, sizes)
         assert np.abs(command.dipole).max() <= LIMIT
-        turns.append(command.turn)
+        turns.append(command.rotation)
         for part in range(2):
             at = np.array([time + 0.5 * STEP * part])
             q, w = pushed(q, w, attitude_matrix(q), at, command.dipole + RESIDUAL, 0.5 * STEP)
@@ -101,7 +101,7 @@ def test_the_dipole_has_no_part_along_the_field_but_the_residual_s_cancellation(
     assert abs(command.dipole @ field) < 1e-9 * np.linalg.norm(command.dipole) * np.linalg.norm(field)
     other = law.command(500.0, q, wanted.rate, field, RESIDUAL, np.zeros(SIZES))
     np.testing.assert_allclose(other.dipole, command.dipole - RESIDUAL, atol=1e-12)
-    np.testing.assert_allclose(command.turn, [0.01, -0.02, 0.005], atol=1e-9)
+    np.testing.assert_allclose(command.rotation, [0.01, -0.02, 0.005], atol=1e-9)
 
 
 def test_the_shapes_are_constant_with_the_flight_and_with_the_sun() -> None:
@@ -200,8 +200,8 @@ def test_far_off_its_path_a_body_is_held_still_until_it_is_slow() -> None:
 def test_a_spin_along_the_field_is_not_waited_for() -> None:
     astray = PathRecovery()
     astray.update(2.0 * FAR, 5.0 * SLOW, 0.0)
-    assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE - 1.0)[1]
-    assert seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE + 1.0)[1]
+    assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT - 1.0)[1]
+    assert seen(astray, 2.0 * FAR, 5.0 * SLOW, DAMPING_TIMEOUT + 1.0)[1]
 
 
 def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:

@@ -142,7 +142,7 @@ def test_a_plan_for_an_old_target_is_never_flown_and_the_old_path_is_flown_on(
     guidance: PathGuidance, good: StepPlan, newer: StepPlan
 ) -> None:
     guidance.aim(0.3)
-    assert "wanted is 0.3" in refused(guidance, newer, 101, 101, START, 0.004)
+    assert "the target is 0.3" in refused(guidance, newer, 101, 101, START, 0.004)
     assert guidance.sample(104 * SECOND) == good.path.sample(4 * SECOND)
     guidance.aim(TARGET)
     assert guidance.offer(newer, 101 * SECOND, 101 * SECOND, START, 0.004).accepted
@@ -198,7 +198,7 @@ def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_targe
 
 def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: PathGuidance) -> None:
     moving = plan(KNIGHTCUBE, 0.1, 0.0, TARGET, 0.01, 10.0)
-    assert "wanted is" in refused(guidance, moving, 101, 101, START, 0.0)
+    assert "the target is" in refused(guidance, moving, 101, 101, START, 0.0)
     guidance.aim(TARGET, 0.01)
     assert guidance.offer(moving, 101 * SECOND, 101 * SECOND, START, 0.0).accepted
     with pytest.raises(UsageError, match="rate"):

@@ -337,7 +337,7 @@ def test_a_price_of_time_buys_the_horizon_of_the_closed_form(angle: float, price
     """With cos(theta) = 1 the least energy is 12 R (a/g)^2 / T^3; the price is its slope."""
     gain = KNIGHTCUBE.torque_constant / KNIGHTCUBE.inertia
     expected = (36.0 * KNIGHTCUBE.resistance * (angle / gain) ** 2 / price) ** 0.25
-    found = plan(KNIGHTCUBE, 0.0, 0.0, q2_of(angle), 0.0, 10.0, time_price=price)
+    found = plan(KNIGHTCUBE, 0.0, 0.0, q2_of(angle), 0.0, 10.0, time_cost=price)
     assert found.horizon == pytest.approx(max(expected, 1.0), rel=0.01)
     assert found.horizon_asked == found.horizon
     assert found.status is PlanStatus.OPTIMAL
@@ -347,7 +347,7 @@ def test_no_horizon_nearby_is_better_at_the_price() -> None:
     """Against the collocation oracle at other horizons, energy and price of time added."""
     price = 0.2
     for problem, _ in feasible_problems(10, seed=3):
-        found = problem.planned(time_price=price)
+        found = problem.planned(time_cost=price)
         total = found.energy + price * found.horizon
         assert largest_ratio(problem, found) <= 1.001
         for factor in (0.8, 0.9, 0.95, 1.05, 1.1, 1.25):
@@ -357,7 +357,7 @@ def test_no_horizon_nearby_is_better_at_the_price() -> None:
 
 
 def test_the_dearer_the_time_the_shorter_the_horizon_down_to_the_shortest() -> None:
-    horizons = [THESIS.planned(time_price=price).horizon for price in (0.01, 0.1, 1.0, 100.0)]
+    horizons = [THESIS.planned(time_cost=price).horizon for price in (0.01, 0.1, 1.0, 100.0)]
     assert horizons == sorted(horizons, reverse=True)
     shortest = shortest_time(THESIS.slew(1.0))
     assert shortest < horizons[-1] < 1.015 * shortest
@@ -365,8 +365,8 @@ def test_the_dearer_the_time_the_shorter_the_horizon_down_to_the_shortest() -> N
 
 @pytest.mark.parametrize("price", [0.0, -1.0, math.nan, math.inf])
 def test_an_impossible_price_is_refused(price: float) -> None:
-    with pytest.raises(PlanningError, match="time_price"):
-        THESIS.planned(time_price=price)
+    with pytest.raises(PlanningError, match="time_cost"):
+        THESIS.planned(time_cost=price)
 
 
 def rest_of(problem: Problem, found: StepPlan, share: float) -> tuple[Problem, int]:
