@@ -1,5 +1,11 @@
 """The classical methods of star identification (Michalski 3.2), and `METHODS`, all methods by name.
 
+A method yields batches of candidates: observed stars and the guide stars that they may be. Each candidate
+gives an attitude. The brightest observed stars are transformed to the sky by it, and those that fall near
+guide stars are counted. The candidates with the highest counts are verified against the whole field by
+`knightcube.vision.startracker.identification.verification`, which rejects false candidates of any method. A
+field of uncertain scale is searched at several scales (`ScaledField`).
+
 - Angle matching (3.2.1; Gottlieb in Wertz 1978, 7.7): the triangles of the brightest observed stars are taken
   in order of brightness. Pairs of guide stars with the angles of two sides are joined at the star that they
   share; those with the right third angle are candidates.
@@ -28,8 +34,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import combinations, islice
 
@@ -37,14 +44,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
-from knightcube.reference.star_identification.search import (
-    DEFAULT,
-    Candidates,
-    ClassicalSettings,
-    Propose,
-    View,
-    search,
-)
+from knightcube.errors import FlightError
 from knightcube.reference.star_tables import (
     BUFFER,
     KnownSky,
@@ -58,16 +58,229 @@ from knightcube.reference.star_tables import (
     members,
     ordered,
     side_lengths,
-    tangent_places,
+    tangent_positions,
 )
 from knightcube.vision.startracker import lost_in_space
-from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
+from knightcube.vision.startracker.attitude_fit import (
+    MatchStatus,
+    StarField,
+    StarMatch,
+    stretched,
+)
 from knightcube.vision.startracker.index.sky_index import SkyIndex
-from knightcube.vision.startracker.verification import nothing, verify
+from knightcube.vision.startracker.verification import (
+    VerificationSettings,
+    nothing,
+    verify,
+)
 
 
-def propose_angles(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the triangles that match, those of the brightest observed stars first."""
+@dataclass(frozen=True, slots=True)
+class ClassicalSettings:
+    """Settings of all methods; each method uses a part of them.
+
+    Attributes:
+        brightest: number of the brightest observed stars from which patterns are made.
+        tolerance: of an angle, an area or a moment, in its sigmas.
+        patterns: largest number of triangles or pivots that are looked up in a table.
+        joins: largest number of triangles made of pairs, over all scales. Each takes half a millisecond, and
+            a list without a match needs all of them.
+        candidates: largest number of candidates of all patterns that are compared with the field.
+        screened: number of the brightest observed stars with which a candidate is compared first.
+        verified: largest number of candidates of a pattern that are verified with the whole field.
+        scale_step: relative half width of the scales that one look-up covers.
+        scales: largest number of look-ups; a field that would need more is rejected.
+        verification: conditions for the acceptance of a candidate.
+    """
+
+    brightest: int = 11
+    tolerance: float = 3.0
+    patterns: int = 80
+    joins: int = 24
+    candidates: int = 2500
+    screened: int = 14
+    verified: int = 4
+    scale_step: float = 0.002
+    scales: int = 9
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+
+
+DEFAULT = ClassicalSettings()
+
+
+class FieldUnknown(FlightError):
+    """Raised for a field of view too uncertain for the classical methods; the default method solves it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaledField:
+    """A field at one scale.
+
+    Attributes:
+        field: the field as given.
+        scale: factor on the tangents of the field.
+        direction: (n, 3) unit vectors of the scaled field.
+        sigma: (n,) rad.
+        slack: relative error of angles by the error of the scale.
+        stars: number of the brightest stars from which patterns are made.
+    """
+
+    field: StarField
+    scale: float
+    direction: FloatArray
+    sigma: FloatArray
+    slack: float
+    stars: int
+
+    def angles(
+        self, one: IntArray, other: IntArray, tolerance: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the angles (k,) between observed stars, and the limits (k,), (k,) of the true ones.
+
+        The limits add `tolerance` sigmas (31: the sum of both variances along the arc) and the slack.
+        """
+        angle = angles(self.direction[one], self.direction[other])
+        off = tolerance * np.hypot(self.sigma[one], self.sigma[other]) + self.slack * angle
+        return angle, angle - off, angle + off
+
+
+def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField]:
+    """Yield the field at the scales that cover its range, the most likely first.
+
+    Raises FieldUnknown when the range needs more scales than the settings allow.
+    """
+    low, high = (math.log(edge) for edge in field.scale)
+    steps = max(1, math.ceil((high - low) / (2.0 * settings.scale_step) - 1e-9))
+    if steps > settings.scales:
+        known = 100.0 * settings.scales * settings.scale_step
+        raise FieldUnknown(
+            f"scale known to {50.0 * (high - low):.1f} %: the classical methods need {known:.1f} %;"
+            " the default method takes any scale"
+        )
+    edges = np.linspace(low, high, steps + 1)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    for middle in middles[np.argsort(np.abs(middles - 0.5 * (low + high)), kind="stable")]:
+        scale = math.exp(middle)
+        yield ScaledField(
+            field,
+            scale,
+            stretched(field.direction, scale),
+            field.sigma * scale,
+            0.5 * (high - low) / steps,
+            min(settings.brightest, len(field)),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Patterns of observed stars that match patterns of guide stars.
+
+    Attributes:
+        observed: (k, m) indices of observed stars, m >= 2. The first two fix the attitude and are far apart.
+        star: (k, m) indices of guide stars.
+    """
+
+    observed: IntArray
+    star: IntArray
+
+    def __len__(self) -> int:
+        return len(self.observed)
+
+
+_LEAST_BASE = 10.0
+"""Smallest separation of the first two stars of a candidate, in sigmas of a direction."""
+_LEAST_JOINS = 4
+Propose = Callable[[ScaledField, KnownSky, ClassicalSettings], Iterator[Candidates]]
+
+
+def search(
+    field: StarField, sky: KnownSky, propose: Propose, settings: ClassicalSettings = DEFAULT
+) -> StarMatch:
+    """Return the identification of the first candidate of `propose` that the whole field verifies.
+
+    Raises FieldUnknown when the scale of the field is too uncertain.
+    """
+    if len(field) < settings.verification.least_matches:
+        return nothing(field, MatchStatus.TOO_FEW_STARS)
+    steps = list(views(field, settings))
+    settings = replace(settings, joins=max(_LEAST_JOINS, settings.joins // len(steps)))
+    for view in steps:
+        spent = 0
+        for candidates in propose(view, sky, settings):
+            taken = min(len(candidates), settings.candidates - spent)
+            spent += taken
+            answer = _best(view, sky, candidates, taken, settings)
+            if answer is not None:
+                return answer
+            if spent >= settings.candidates:
+                break
+    return nothing(field)
+
+
+def _best(
+    view: ScaledField, sky: KnownSky, candidates: Candidates, taken: int, settings: ClassicalSettings
+) -> StarMatch | None:
+    """Return the first of `taken` candidates that is verified, in descending order of supporting stars."""
+    if not taken:
+        return None
+    observed, star = candidates.observed[:taken], candidates.star[:taken]
+    # Two points closer than their errors fix no attitude, nor does the same guide star twice.
+    base = view.direction[observed[:, 0]] - view.direction[observed[:, 1]]
+    apart = np.linalg.norm(base, axis=-1) > _LEAST_BASE * view.sigma.max()
+    apart &= star[:, 0] != star[:, 1]
+    if not apart.any():
+        return None
+    observed, star = observed[apart], star[apart]
+    matrices = attitudes(view.direction[observed[:, :2]], sky.stars.direction[star[:, :2]])
+    support = _support(view, sky, matrices, observed, settings)
+    least = min(settings.verification.least_matches, len(view.direction))
+    for number in np.argsort(-support, kind="stable")[: settings.verified]:
+        if support[number] < least:
+            return None
+        answer = verify(
+            view.field,
+            sky.index,
+            matrices[number],
+            view.scale,
+            settings=settings.verification,
+        )
+        if answer.status is MatchStatus.IDENTIFIED:
+            return answer
+    return None
+
+
+def attitudes(observed: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the attitudes (k, 3, 3) that rotate reference pairs (k, 2, 3) onto observed ones."""
+    return np.swapaxes(_frames(observed), -1, -2) @ _frames(reference)
+
+
+def _frames(pairs: FloatArray) -> FloatArray:
+    middle = pairs[:, 0] + pairs[:, 1]
+    along = pairs[:, 0] - pairs[:, 1]
+    middle = middle / np.linalg.norm(middle, axis=-1, keepdims=True)
+    along = along / np.linalg.norm(along, axis=-1, keepdims=True)
+    return np.stack([middle, along, np.cross(middle, along)], axis=1)
+
+
+def _support(
+    view: ScaledField, sky: KnownSky, matrices: FloatArray, observed: IntArray, settings: ClassicalSettings
+) -> IntArray:
+    """Return the number of bright observed stars that each attitude (k, 3, 3) maps close to a guide star."""
+    seen = view.direction[: settings.screened]
+    pair = view.direction[observed[:, :2]]
+    base = np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1)
+    middle = 0.5 * (pair[:, 0] + pair[:, 1])
+    lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
+    sigma = float(view.sigma.max())
+    # The rotation error by the two stars of the base acts on the lever; each star has an error of its own.
+    gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
+    gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
+    distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
+    return np.asarray((distance <= gate).sum(axis=1))
+
+
+def propose_angles(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the matching triangles, in order of the brightness of the observed stars."""
     triangles = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
     for corners in triangles[: settings.joins]:
         found = matching_triangles(view, sky, corners, settings.tolerance)
@@ -75,12 +288,12 @@ def propose_angles(view: View, sky: KnownSky, settings: ClassicalSettings) -> It
 
 
 def matching_triangles(
-    view: View, sky: KnownSky, corners: tuple[int, int, int], tolerance: float
+    view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], tolerance: float
 ) -> IntArray:
-    """Return guide stars (k, 3) that may be the observed `corners`, angles and sense of turning alike.
+    """Return guide stars (k, 3) that match the observed `corners` in angles and orientation.
 
-    Pairs with the angle of the first side and of the second are joined where they share a star; the third
-    angle is tested as its cosine.
+    Pairs with the angles of the first and the second side are joined at a shared star; the third angle is
+    compared as a cosine.
     """
     pivot, second, third = corners
     one, other = np.array([pivot, pivot, second]), np.array([second, third, third])
@@ -90,15 +303,17 @@ def matching_triangles(
     a1, b1, a2, c2 = a[first], b[first], a[~first], b[~first]
     place, of = shared(a1, a2)
     triangles = np.stack([a1[of], b1[of], c2[place]], axis=-1)
-    # A range that reaches zero or pi is clipped there: the cosine is not monotonic beyond.
+    # A range beyond zero or pi is clipped, because the cosine is not monotonic there.
     alike = within(sky, triangles[:, 1], triangles[:, 2], low[2], high[2])
     triangles = triangles[alike & (triangles[:, 1] != triangles[:, 2])]
-    turns = _turning(sky.stars.direction[triangles]) == _turning(view.direction[[list(corners)]])
-    return np.asarray(triangles[turns])
+    same_orientation = _turns_left(sky.stars.direction[triangles]) == _turns_left(
+        view.direction[[list(corners)]]
+    )
+    return np.asarray(triangles[same_orientation])
 
 
 def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all places (k,) in `right` and (k,) in `left` that hold the same number."""
+    """Return all pairs of indices (k,) in `right` and (k,) in `left` with equal values."""
     order = np.argsort(right, kind="stable")
     ranked = right[order]
     place, of = members(np.searchsorted(ranked, left), np.searchsorted(ranked, left, side="right"))
@@ -109,18 +324,18 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
     """Return which pairs of guide stars (k,) have an angle within limits."""
     direction = sky.stars.direction
     cosine = np.einsum("kx,kx->k", direction[one], direction[other])
-    least, most = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
-    return np.asarray((cosine > least) & (cosine <= most))
+    minimum, maximum = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
+    return np.asarray((cosine > minimum) & (cosine <= maximum))
 
 
-def _turning(corners: FloatArray) -> BoolArray:
-    """Return which triangles (k, 3, 3) turn left, seen from within the sphere."""
+def _turns_left(corners: FloatArray) -> BoolArray:
+    """Return which triangles (k, 3, 3) turn left, seen from the centre of the sphere."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)
 
 
-def propose_pyramids(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the pyramids that match, triangle by triangle."""
+def propose_pyramids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the matching pyramids, triangle by triangle."""
     for corners in islice(cycled_triangles(view.stars), settings.joins):
         found = matching_triangles(view, sky, corners, settings.tolerance)
         if len(found):
@@ -128,7 +343,7 @@ def propose_pyramids(view: View, sky: KnownSky, settings: ClassicalSettings) -> 
 
 
 def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
-    """Yield all triangles of `stars` stars in the source's order: by the steps between their numbers."""
+    """Yield all triangles of `stars` stars in the order of the source: by the steps between their indices."""
     for step in range(1, stars - 1):
         for further in range(1, stars - step):
             for pivot in range(stars - step - further):
@@ -136,9 +351,9 @@ def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
 
 
 def _pyramids(
-    view: View, sky: KnownSky, corners: tuple[int, int, int], found: IntArray, tolerance: float
+    view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], found: IntArray, tolerance: float
 ) -> Candidates:
-    """Return the triangles `found` (k, 3) that a fourth star confirms, once for each that does."""
+    """Return the triangles `found` (k, 3) that a fourth star confirms, each once."""
     rest = np.setdiff1d(np.arange(view.stars), corners)
     pivot = np.full(len(rest), corners[0])
     _, low, high = view.angles(pivot, rest, tolerance)
@@ -155,7 +370,7 @@ def _pyramids(
         alike &= within(sky, found[of, corner], fourth, low[owner], high[owner])
     triangles, fourth, owner = found[of[alike]], fourth[alike], owner[alike]
     observed = np.column_stack([np.tile(corners, (len(owner), 1)), rest[owner]])
-    # One pyramid of each triangle is enough: verification uses the other stars.
+    # One pyramid per triangle is enough, because verification uses the other stars.
     _, once = np.unique(triangles, axis=0, return_index=True)
     return Candidates(observed[once], np.column_stack([triangles, fourth])[once])
 
@@ -163,20 +378,24 @@ def _pyramids(
 _BATCH = 10
 
 
-def propose_planar(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the plane triangles that match, see `_propose_triangles`."""
+def propose_planar(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the matching plane triangles."""
     return _propose_triangles(view, sky, settings, sky.planar, measured_planar_shape)
 
 
-def propose_spherical(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the spherical triangles that match, see `_propose_triangles`."""
+def propose_spherical(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the matching spherical triangles."""
     return _propose_triangles(view, sky, settings, sky.spherical, measured_spherical_shape)
 
 
 def _propose_triangles(
-    view: View, sky: KnownSky, settings: ClassicalSettings, table: TriangleTable, measure: MeasuredShape
+    view: ScaledField,
+    sky: KnownSky,
+    settings: ClassicalSettings,
+    table: TriangleTable,
+    measure: MeasuredShape,
 ) -> Iterator[Candidates]:
-    """Yield the matches of some triangles at a time, those of the brightest stars first."""
+    """Yield the matches in batches of triangles, those of the brightest stars first."""
     chosen = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
     triangles = np.array(chosen[: settings.patterns], dtype=np.int64).reshape(-1, 3)
     for begin in range(0, len(triangles), _BATCH):
@@ -186,19 +405,19 @@ def _propose_triangles(
 
 
 def _triangle_matches(
-    view: View,
+    view: ScaledField,
     sky: KnownSky,
     table: TriangleTable,
     triangles: IntArray,
     found: TriangleShape,
     tolerance: float,
 ) -> Candidates:
-    """Return the triangles of the table that are like the observed ones (t, 3)."""
+    """Return the triangles of the table that match the observed ones (t, 3)."""
     # An area grows as the square of the scale, a polar moment as its fourth power.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
     # float32 rounds the table's values.
     reach = reach + 1e-7 * found.area
-    # The area of a flat triangle is too uncertain.
+    # The area of a flat triangle is too uncertain to be used.
     usable = np.flatnonzero(reach < 0.2 * found.area)
     low, high = found.area[usable] - reach[usable], found.area[usable] + reach[usable]
     place, owner = members(*table.area.ranges(low, high))
@@ -222,13 +441,13 @@ _PARTNERS = 3
 _FAMILIES = 6
 
 
-def propose_families(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the family of each of the assignments with the most agreement, one pair of it a candidate."""
+def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield pairs from the families of the assignments that agree with most others."""
     voters = min(len(view.direction), _VOTERS)
     one, other = np.triu_indices(voters, 1)
     _, low, high = view.angles(one, other, settings.tolerance)
     ballot = _ballot(voters, one, other, low, high, sky)
-    # Several for each observed star: the true one is not always first.
+    # Several guide stars per observed star, because the true one does not always have the most votes.
     star = np.argpartition(-ballot, _KEPT, axis=1)[:, :_KEPT].ravel()
     observed = np.repeat(np.arange(voters), _KEPT)
     agrees = _agreement(view, sky, observed, star, settings.tolerance)
@@ -258,14 +477,16 @@ def _ballot(
     return np.asarray(member @ in_favour)
 
 
-def _agreement(view: View, sky: KnownSky, observed: IntArray, star: IntArray, tolerance: float) -> BoolArray:
+def _agreement(
+    view: ScaledField, sky: KnownSky, observed: IntArray, star: IntArray, tolerance: float
+) -> BoolArray:
     """Return which assignments (k, k) of observed to guide stars are compatible."""
     count = len(observed)
     one, other = (index.ravel() for index in np.indices((count, count)))
     _, low, high = view.angles(observed[one], observed[other], tolerance)
     direction = sky.stars.direction[star]
     true = angles(direction[one], direction[other])
-    # Two observed stars nearer than their errors may have the same guide star for their best.
+    # Two observed stars closer than their errors may have the same best guide star.
     different = (observed[one] != observed[other]) & (star[one] != star[other])
     alike = (true >= low) & (true < high) & different
     return np.asarray(alike.reshape(count, count))
@@ -276,11 +497,11 @@ _BEST = 4
 _LEAST_CELLS = 3
 
 
-def propose_grids(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the guide stars whose patterns are most like each observed star's, the central first."""
+def propose_grids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the guide stars whose patterns match each observed star best, central stars first."""
     middle = np.argsort(-view.direction[:, 2], kind="stable")
     for centre in middle[: max(1, settings.patterns // _ALIGNMENTS)]:
-        place = tangent_places(view.direction, np.full(len(view.direction), centre), view.direction)
+        place = tangent_positions(view.direction, np.full(len(view.direction), centre), view.direction)
         distance = np.hypot(*place.T)
         radius = np.tan(sky.grid.radius)
         near = np.flatnonzero((distance > 0.0) & (distance < radius))
@@ -303,10 +524,10 @@ def _grid_matches(sky: KnownSky, cells: IntArray, centre: int, neighbour: int) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMotion:
-    """How the points of a field move across it.
+    """Motion of the points of a field.
 
     Attributes:
-        velocity: (n, 3) 1/s, each direction's change with time, camera frame.
+        velocity: (n, 3) 1/s, time derivatives of the directions, camera frame.
         sigma: (n,) 1/s, its standard deviation along one axis.
     """
 
@@ -320,8 +541,8 @@ class PreviousAttitude:
 
     Attributes:
         attitude: (4,) ICRS to camera.
-        sigma: rad, its standard deviation about each axis, drift since then included.
-        elapsed: s since then.
+        sigma: rad, standard deviation about each axis, including the drift since then.
+        elapsed: s since the attitude.
     """
 
     attitude: FloatArray
@@ -330,19 +551,19 @@ class PreviousAttitude:
 
     @property
     def part_of_all_attitudes(self) -> float:
-        """The volume of the turns up to four sigmas, of that of all turns."""
+        """Volume of the rotations up to four sigmas, relative to all rotations."""
         angle = min(4.0 * self.sigma, np.pi)
         return float(angle - np.sin(angle)) / np.pi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedRate:
-    """The body rate of most points.
+    """The body rate that most points share.
 
     Attributes:
         rate: (3,) rad/s, camera axes.
         covariance: (3, 3).
-        shares: (n,) which points move by it.
+        shares: (n,) whether each point moves with it.
     """
 
     rate: FloatArray
@@ -351,7 +572,7 @@ class SharedRate:
 
 
 _CHI_SQUARE = 13.8
-"""Of two degrees of freedom; one star in a thousand lies beyond."""
+"""Bound of chi-square with two degrees of freedom; one star in a thousand exceeds it."""
 _SEEDS = 10
 
 
@@ -362,10 +583,10 @@ def identify_by_rate(
     motion: StarMotion | None = None,
     previous: PreviousAttitude | None = None,
 ) -> StarMatch:
-    """Return which points of a field are which stars.
+    """Return the identification of a field from the motion of its points.
 
-    Without `motion` all points are taken for stars, and a `previous` attitude is taken not to have turned.
-    Raises FieldUnknown if the scale is too uncertain, ValueError if motion and field differ in length.
+    Without `motion` all points count as stars, and the `previous` attitude as unchanged. Raises FieldUnknown
+    if the scale is too uncertain, ValueError if motion and field differ in length.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
@@ -374,8 +595,8 @@ def identify_by_rate(
         return nothing(field, MatchStatus.TOO_FEW_STARS)
     answer = nothing(stars)
     if previous is not None:
-        turn = np.zeros(3) if shared is None else shared.rate * previous.elapsed
-        predicted = attitude_matrix(multiply(from_rotation_vector(turn), previous.attitude))
+        rotation = np.zeros(3) if shared is None else shared.rate * previous.elapsed
+        predicted = attitude_matrix(multiply(from_rotation_vector(rotation), previous.attitude))
         answer = verify(
             stars, sky.index, predicted, 1.0, previous.part_of_all_attitudes, settings.verification
         )
@@ -389,10 +610,10 @@ def identify_by_rate(
 
 
 def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
-    """Return the body rate that most of the points (n, 3) share, by least squares over those.
+    """Return the body rate that most of the points (n, 3) share, by least squares over these points.
 
-    Two points fix a rate; of the rates of pairs among the first ten, that which most points agree with.
-    Raises ValueError when motion and directions differ in length.
+    Two points fix a rate. The initial guess is the rate, of a pair among the first ten points, with which
+    most points agree. Raises ValueError when motion and directions differ in length.
     """
     if len(motion.velocity) != len(direction):
         raise ValueError(f"{len(direction)} directions and {len(motion.velocity)} velocities: give one each")
@@ -404,7 +625,7 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # Two close points give a poor rate that many points agree with: a fit to all must hold too.
+        # Two close points give a poor rate with which many points agree: a fit to all must agree too.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
@@ -418,7 +639,7 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
 
 
 def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the rate (3,) of least squares and its covariance: v' = v x w, across v."""
+    """Return the least-squares rate (3,) and its covariance, from v' = v x w."""
     weight = 1.0 / sigma**2
     normal = np.sum(weight) * np.eye(3) - np.einsum("n,nx,ny->xy", weight, direction, direction)
     covariance = np.linalg.pinv(normal)
@@ -426,10 +647,10 @@ def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tup
 
 
 def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return which points (n,) move by `rate`, both errors considered."""
+    """Return which points (n,) move with `rate` within both errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
-    # The largest variance that the rate's error gives to any direction across the line of sight.
+    # The largest variance across the line of sight by the error of the rate.
     spread = motion.sigma**2 + float(np.linalg.eigvalsh(covariance)[-1]) * (1.0 - direction[:, 2] ** 2)
     spread = spread + float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return np.asarray(np.sum(residual**2, axis=-1) <= _CHI_SQUARE * spread)
@@ -443,8 +664,8 @@ class Method:
     """A method of identification.
 
     Attributes:
-        identify: of a field, by tables of the sky. All but the default raise FieldUnknown for a scale that is
-            too uncertain.
+        identify: function from a field and tables of the sky to the identification. All except the default
+            raise FieldUnknown for a scale that is too uncertain.
         source: publication.
     """
 
@@ -457,7 +678,7 @@ def _default(field: StarField, sky: KnownSky) -> StarMatch:
 
 
 def method_of(name: str) -> Callable[[StarField, SkyIndex], StarMatch]:
-    """Return the method `name` of METHODS for `SolveSettings`; it builds its tables for each field."""
+    """Return the method `name` of METHODS for `SolveSettings`; it builds tables for each field."""
     method = METHODS[name]
 
     def identify(field: StarField, index: SkyIndex) -> StarMatch:
@@ -471,7 +692,7 @@ def _classical(propose: Propose, source: str) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    DEFAULT_METHOD: Method(_default, "triangles by shape, turning and size, all at once; votes"),
+    DEFAULT_METHOD: Method(_default, "triangles by shape, orientation and size at once; votes"),
     "angle": _classical(propose_angles, "Gottlieb 1978"),
     "spherical-triangle": _classical(propose_spherical, "Cole & Crassidis 2004"),
     "planar-triangle": _classical(propose_planar, "Cole & Crassidis 2006"),
