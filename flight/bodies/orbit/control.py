@@ -176,7 +176,7 @@ class PointingTracker:
             reference.seconds, quaternion, rate, field, residual, self._filter.torque_sizes
         )
         dipole = found.dipole
-        if not reference.paths.led(found.turn, rate, reference.time_ns):
+        if not reference.paths.led(found.rotation, rate, reference.time_ns):
             dipole = damping_dipole(self._inertia, rate, field) - residual
         # The mean over the window equals the requested dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
