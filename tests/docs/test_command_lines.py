@@ -117,7 +117,7 @@ def test_every_flight_command_that_the_pages_name_exists() -> None:
             assert word in known, word
 
 
-@pytest.mark.parametrize("study", ["campaigns", "bench", "fuzz"])
+@pytest.mark.parametrize("study", ["campaigns", "bench"])
 def test_every_study_that_the_pages_name_exists(study: str) -> None:
     words = [sys.executable, "-m", f"tests.studies.{study}", "--help"]
     listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout

@@ -27,7 +27,7 @@ from ground.watch import FlightState, LogTail, PlainLines, state_line
 from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.support.furnishings import Listener, answer
+from tests.support.answering_flight import Listener, answer
 from tests.support.places import ROOT
 
 

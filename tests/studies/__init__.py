@@ -1,1 +1,1 @@
-"""What measures rather than checks: campaigns, benches, fuzzers, pictures."""
+"""What measures rather than checks: campaigns, benches, mutants, pictures."""

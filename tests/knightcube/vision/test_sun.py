@@ -32,7 +32,7 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 @cache
 def _campaign(name: str) -> Outcome:
-    """Return a slice of the bench's campaign; the whole is `python -m tests.studies.bench sun`."""
+    """Return the results of frames with the Sun in them."""
     return frames_with_sun(name, 12, seed=11)
 
 

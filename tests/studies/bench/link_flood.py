@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,9 @@ from flight.link.telemetry.definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.commanding import FileSession
 from ground.link.terminal import make_keys, open_terminal
-from tests.studies.fuzz.link_frames import LinkFrames
 from tests.support.flights import CONFIG
 from tests.support.flooded_flight import flood, free_port, lateness, process, wait_for
+from tests.support.link_attacker import LinkAttacker
 
 _FRAMES_A_SECOND = 10_000
 _KINDS = 500
@@ -110,8 +111,10 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
 
 def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:
     """Send forged and damaged frames until `ended`; note how many in each burst."""
-    attacker, draw = LinkFrames(), np.random.default_rng(1)
-    frames = [attacker.frame(draw)[1] for _ in range(_KINDS)]
+    chance = Random(1)
+    with tempfile.TemporaryDirectory() as folder:
+        attacker = LinkAttacker(Path(folder))
+        frames = [attacker.frame(chance)[1] for _ in range(_KINDS)]
     flood(port, frames, _FRAMES_A_SECOND, ended, forged)
 
 

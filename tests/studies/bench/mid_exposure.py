@@ -1,6 +1,6 @@
 """The attitude at mid-exposure from a fit's stars, the true ones being known, and its least error.
 
-Part of `python -m tests.studies.bench endpoints`. Each star used in the fit is named by the true star whose
+`python -m tests.studies bench mid_exposure`. Each star used in the fit is named by the true star whose
 path has both ends near its own; ESOQ2 takes its direction with an error that is the mean of both axes of its
 covariance. `refined` weighs the stars' pixels by their whole covariances, since along a streak a star is
 known several times worse than across, and does without stars that disagree with the rest by more than chance
@@ -17,27 +17,31 @@ not, the turn, the width of the point spread and the attitude common to all (Fis
 
 from __future__ import annotations
 
+import argparse
+import json
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, cross_matrices
+from knightcube.astro.arrays import FloatArray, Image, cross_matrices
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import FlightError
-from knightcube.vision.camera.lens import Pinhole
+from knightcube.vision.camera.lens import EXACT, Pinhole
 from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, SolveSettings, solve_motion
+from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.bench.streaks import estimated, scenes
 from tests.studies.campaigns import streaks as campaign
 from tests.support.attitude_errors import attitude_error, error_in_pixels
-from tests.support.scenes import FIELD, Scene, noise_floor
+from tests.support.scenes import FIELD, Scene, noise_floor, slew
 from tests.support.streak_bound import star_information
 
 _MATCH_PX = 6.0
@@ -55,6 +59,35 @@ FITS = ("first", "known sky")
 _PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
 # Median of the distance of a point whose two coordinates have the rms distance 1.
 _RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
+
+
+def estimated(pixels: Image, rate: FloatArray, exposure: float, camera: StarCameraModel) -> MotionResult:
+    """Return what the likelihood estimator says of a frame; the true `rate` (3,) only gives the sign."""
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
+    return estimate_motion(pixels, camera.pinhole, exposure, settings, rate, 0.0)
+
+
+def scenes(
+    camera: StarCameraModel,
+    frames: int,
+    percent: float,
+    thetas: tuple[float, float],
+    exposure: float,
+    seed: tuple[int, ...],
+    faintest: float,
+) -> list[Scene]:
+    """Return frames of a turn of `percent` of the field, theta spread evenly over `thetas` deg.
+
+    The sky holds stars down to magnitude `faintest`.
+    """
+    found = []
+    for frame in range(frames):
+        generator = np.random.default_rng((*seed, round(10.0 * percent), frame))
+        # One theta from each of `frames` equal parts of the range.
+        theta = thetas[0] + (thetas[1] - thetas[0]) * (frame + generator.uniform()) / frames
+        angle, fraction = float(np.deg2rad(theta)), percent / 100.0
+        found.append(slew(generator, angle, fraction, exposure, faintest, camera))
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,3 +302,42 @@ def _root_mean_square(values: FloatArray) -> float | None:
     """Return that of the values that there are, None without any."""
     there = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, or one JSON object; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies bench mid_exposure", description=__doc__)
+    parser.add_argument(
+        "--frames", type=int, default=20, help="frames for each rotation (default %(default)s)"
+    )
+    parser.add_argument(
+        "--percent", type=float, nargs="+", default=[10.0, 20.0, 35.0, 50.0], help="of the field"
+    )
+    parser.add_argument(
+        "--faintest", type=float, default=8.5, help="magnitude of the faintest star (default %(default)s)"
+    )
+    parser.add_argument("--exposure", type=float, default=EXPOSURE, help="in s (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=14_142, help="default %(default)s")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    options = parser.parse_args(arguments)
+    rows = [
+        attitude_row(percent, options.frames, options.seed, options.faintest, options.exposure)
+        for percent in options.percent
+    ]
+    if options.json:
+        sys.stdout.write(
+            json.dumps({"seed": options.seed, "exposure": options.exposure, "attitude": rows}) + "\n"
+        )
+        return 0
+    sys.stdout.write(
+        "turn %  solution     attitudes  rms px  median  largest  bound px  rms x bound  median x bound\n"
+    )
+    for row in rows:
+        for name, one in row["solutions"].items():
+            if one["attitudes"]:
+                sys.stdout.write(
+                    f"{row['percent']:6.0f}  {name:10} {one['attitudes']:3d}/{row['frames']:<3d}     "
+                    f" {one['rms_px']:7.4f} {one['median_px']:7.4f} {one['largest_px']:8.4f}"
+                    f" {row['bound_px']:9.4f} {one['over_bound']:12.2f} {one['over_bound_median']:15.2f}\n"
+                )
+    return 0

@@ -1,4 +1,4 @@
-"""Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N] [--picture PNG]`.
+"""Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N]`.
 
 Random slews over the testbed's range, with thread, disturbance and moving ends
 (tests.support.step_problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
@@ -13,7 +13,6 @@ import argparse
 import json
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,46 +82,11 @@ def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
     return {"cold_evaluations": float(np.mean(cold)), "warm_evaluations": float(np.mean(warm))}
 
 
-def draw(problem: Problem, path: Path) -> None:
-    """Draw one solution: nodes, the path between them, and the oracle."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
-
-    found = problem.planned()
-    optimum = solve(problem.slew(found.horizon))
-    assert optimum is not None
-    times = np.linspace(0.0, found.horizon * (1.0 - 1e-12), 2001)
-    angle, rate, acceleration = found.path.motion(times)
-    nodes = found.path.motion(found.node_times * (1.0 - 1e-12))
-    grid = np.linspace(0.0, found.horizon, optimum.angle.size)
-    figure = Figure(figsize=(8.0, 6.0), layout="constrained")
-    above, below = figure.subplots(2, sharex=True)
-    above.plot(grid, np.sin(0.5 * optimum.angle), color="0.6", linewidth=4, label="oracle")
-    above.plot(times, np.sin(0.5 * angle), color="#0072B2", label="flown")
-    above.plot(found.node_times, found.node_q2, "o", color="#D55E00", markersize=4, label="nodes")
-    above.set_ylabel("q2")
-    above.legend(frameon=False)
-    below.plot(grid, 1e3 * optimum.current, color="0.6", linewidth=4)
-    below.plot(times, 1e3 * problem.plant.currents(angle, rate, acceleration), color="#0072B2")
-    below.plot(found.node_times, 1e3 * problem.plant.currents(*nodes), "o", color="#D55E00", markersize=4)
-    for sign in (-1.0, 1.0):
-        below.axhline(sign * 1e3 * problem.plant.current_limit, color="0.3", linestyle=":", linewidth=1)
-    below.set_ylabel("current (mA)")
-    below.set_xlabel("time (s)")
-    above.set_title(
-        f"q2 {problem.start_q2:.2f} to {problem.end_q2:.2f} in {found.horizon:.2f} s: "
-        f"{found.energy:.4f} J, oracle {optimum.energy:.4f} J",
-        fontsize=10,
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-
-
 def main(arguments: list[str]) -> int:
     """Print the figures."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench plan", description=__doc__)
     parser.add_argument("--runs", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the tightest solution")
     parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
     options = parser.parse_args(arguments)
     if options.runs < 1:
@@ -136,9 +100,6 @@ def main(arguments: list[str]) -> int:
         "feasible": measure(feasible) | warm_gain(feasible[:100]),
         "too_short": measure(short),
     }
-    if options.picture is not None:
-        tightest, _ = min(feasible, key=lambda pair: pair[0].horizon / pair[1])
-        draw(tightest, options.picture)
     if options.json:
         sys.stdout.write(json.dumps(figures) + "\n")
         return 0

@@ -62,7 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(json.dumps(summary.facts) + "\n")
     else:
         sys.stdout.write(summary.text)
-        sys.stdout.write("".join(f"{path}\n" for path in summary.pictures))
     return 0
 
 

@@ -21,7 +21,7 @@ from ground.report.orbit import COARSE, FINE, attitude_errors
 from ground.report.signals import seconds
 from ground.telemetry import Run
 from sim_hal.settings import Simulation
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import CONFIG, fly
 
 ORBIT = CONFIG.parent / "orbit.yaml"
@@ -88,8 +88,6 @@ def _facts(flown: Run) -> Result:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return times to a fine attitude, and errors and claims afterwards, in sunlight and shadow."""
     facts: dict[str, Any] = {}
-    head = ("flights", "within 60 s", "never", "blind", "deg rms", "worst", "sigmas", "NEES")
-    lines = [f"{'':10}" + "".join(f"{name:>13}" for name in head)]
     for name, lit in (("sunlit", True), ("shadow", False)):
         mine = [r for r in results if r["sunlit"] is lit]
         if not mine:
@@ -107,10 +105,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             "nees": float(np.mean([r["nees"] for r in judged] or [math.nan])),
         }
         facts[name] = found
-        lines.append(f"{name:10}" + "".join(f"{value:>13.3g}" for value in found.values()))
-    lines.append("blind: the share of frames; deg rms of three axes while fine, median and worst flight;")
-    lines.append("the largest error in sigmas of its axis; NEES of an axis, 1 is honest")
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 ACQUISITION = Campaign(

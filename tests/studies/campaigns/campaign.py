@@ -12,6 +12,8 @@ import importlib.util
 import json
 import os
 import signal
+import sys
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
@@ -22,7 +24,48 @@ from typing import Any
 
 from knightcube.errors import FlightError, UsageError
 from tests.studies.campaigns import cluster
-from tests.studies.campaigns.progress import Progress
+
+_PLAIN_S = 10.0
+_WIDTH = 30
+
+
+class Progress:
+    """How many cases are done, and how long the rest takes at the pace so far."""
+
+    def __init__(self, total: int, done: int) -> None:
+        self._total = total
+        self._before = done
+        self._done = done
+        self._begun = self._written = time.perf_counter()
+        self._terminal = sys.stderr.isatty()
+
+    def note(self, line: str) -> None:
+        """Write a line of its own."""
+        self._write(("\r\x1b[K" if self._terminal else "") + line + "\n")
+
+    def advance(self) -> None:
+        """Count one more."""
+        self._done += 1
+        now = time.perf_counter()
+        left = (now - self._begun) / (self._done - self._before) * (self._total - self._done)
+        if self._terminal:
+            filled = _WIDTH * self._done // self._total
+            bar = "#" * filled + "." * (_WIDTH - filled)
+            self._write(f"\r\x1b[K[{bar}] {self._done}/{self._total}  {left:.0f} s left")
+        elif now - self._written >= _PLAIN_S:
+            self._written = now
+            self._write(f"{self._done} of {self._total} done, {left:.0f} s left\n")
+
+    def close(self) -> None:
+        """Take the line away."""
+        if self._terminal:
+            self._write("\r\x1b[K")
+
+    @staticmethod
+    def _write(text: str) -> None:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
@@ -46,11 +89,43 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a campaign found: text to print, facts for JSON, pictures that were drawn."""
+    """Text to print and facts for JSON."""
 
     text: str
     facts: dict[str, Any]
-    pictures: tuple[Path, ...] = ()
+
+
+def summary(facts: dict[str, Any]) -> Summary:
+    """Return facts with a text: a table for each list or dictionary of rows, a line for each value."""
+    lines: list[str] = []
+    for name, value in facts.items():
+        rows = value
+        if isinstance(value, dict) and value and all(isinstance(row, dict) for row in value.values()):
+            rows = [{name: key, **row} for key, row in value.items()]
+        if isinstance(rows, list) and rows and all(isinstance(row, dict) for row in rows):
+            lines += ["", name, *_table(rows)]
+        else:
+            lines.append(f"{name}: {_cell(value)}")
+    return Summary("\n".join(lines).lstrip("\n") + "\n", facts)
+
+
+def _table(rows: Sequence[Result]) -> list[str]:
+    """Return rows as aligned columns under their keys."""
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [keys, *([_cell(row.get(key)) for key in keys] for row in rows)]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(keys))]
+    return ["  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in cells]
+
+
+def _cell(value: Any) -> str:
+    """Return a value as text; a dash means that there is none."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return " ".join(f"{key}={_cell(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_cell, value))
+    return "-" if value is None else str(value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +135,7 @@ class Campaign:
     Attributes:
         cases: makes the cases of (runs, seed).
         run: a function at the top level of a module, so that it reaches other processes and machines.
-        summarise: takes the results in the order of the cases, and a folder for pictures.
+        summarise: takes the results in the order of the cases, and the campaign's folder.
         default_runs: what `runs` is when not given, and what it counts.
     """
 

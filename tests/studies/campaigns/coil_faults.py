@@ -26,7 +26,7 @@ from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import demo_config, demo_world, fly
 
 DURATION = 20.0
@@ -117,10 +117,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     by_fault: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         by_fault[f"{result['fault']}{'' if result['span'] is None else ' for 3'}"].append(result)
-    lines = [
-        f"{'fault':24}{'flights':>8}{'beyond 5 sigma, s':>19}{'after its end, s':>18}{'refusals':>10}"
-        f"{'last, s':>9}{'control lost':>14}{'found, s':>10}"
-    ]
     facts: dict[str, Any] = {"faults": {}}
     for name, own in by_fault.items():
         row = {
@@ -133,21 +129,12 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             "found_s": max((one["found_s"] for one in own if one["found_s"] is not None), default=None),
         }
         facts["faults"][name] = row
-        found = "-" if row["found_s"] is None else f"{row['found_s']:.2f}"
-        lines.append(
-            f"{name:24}{row['flights']:8}{row['beyond_s']:19.3f}{row['beyond_after_end_s']:18.3f}"
-            f"{row['refusals']:10}{row['last_refusal_s']:9.2f}{row['control_lost']:14}{found:>10}"
-        )
     facts["flights"] = len(results)
     facts["beyond"] = sum(
         max(one["beyond_s"], one["beyond_after_end_s"]) >= LONGEST_BEYOND for one in results
     )
     facts["refused_late"] = sum((one["last_refusal_s"] or 0.0) > LONGEST_REFUSAL for one in results)
-    lines.append(
-        f"{len(results)} flights: beyond 5 sigma for {LONGEST_BEYOND} s or more in {facts['beyond']}; "
-        f"refusals later than {LONGEST_REFUSAL} s after the onset in {facts['refused_late']}"
-    )
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _first(event: Any, names: Sequence[str], name: str, after: float) -> float | None:

@@ -29,7 +29,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import demo_config, demo_world, fly, thesis_config
 from tests.support.ideal_power import clairvoyant_power
 
@@ -148,9 +148,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     """Return each controller's mean power and worst figures over the seeds, beside the floor."""
     floor = clairvoyant_power(this_loop(), demo_world())
     facts: dict[str, Any] = {"clairvoyant_w": floor, "controllers": {}}
-    head = "".join(f"{label:>14}" for _, label in FIGURES)
-    lines = [f"{'':22}{'V |I|, mW':>11}{'thesis, mW':>12}{'R I^2, mW':>11}{'over floor':>12}{head}"]
-    lines.append(f"{'clairvoyant optimum':22}{'-':>11}{'-':>12}{1e3 * floor:11.2f}{1.0:12.3f}")
     for name in CONTROLLERS:
         own = [result for result in results if result["controller"] == name]
         heat = float(np.mean([result["heat_w"] for result in own]))
@@ -164,29 +161,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
             "over_floor": heat / floor,
             **{key: value if np.isfinite(value) else None for key, value in worst.items()},
         }
-        figures = "".join(f"{worst[key]:14.3f}" for key, _ in FIGURES)
-        thesis = f"{1e3 * THESIS_W[name]:12.0f}" if name in THESIS_W else f"{'-':>12}"
-        lines.append(f"{name:22}{1e3 * supply:11.2f}{thesis}{1e3 * heat:11.2f}{heat / floor:12.3f}{figures}")
-    picture = _draw(facts, folder / "controllers.png")
-    return Summary("\n".join(lines) + "\n", facts, (picture,))
-
-
-def _draw(facts: dict[str, Any], path: Path) -> Path:
-    """Draw R I^2 against settling time, the floor as a line."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
-
-    figure = Figure(figsize=(6.5, 4.0), layout="constrained")
-    axes = figure.subplots()
-    axes.axhline(1e3 * facts["clairvoyant_w"], color="0.5", linewidth=1, label="clairvoyant optimum")
-    for name, found in facts["controllers"].items():
-        if found["settling_s"] is not None:
-            axes.plot(found["settling_s"], 1e3 * found["heat_w"], "o", label=name)
-    axes.set_xlabel("settling time, worst step (s)")
-    axes.set_ylabel("average R I² of the mean current (mW)")
-    axes.set_ylim(bottom=0.0)
-    axes.legend(frameon=False, fontsize=8)
-    figure.savefig(path, dpi=110)
-    return path
+    return summary(facts)
 
 
 CONTROLLERS_CAMPAIGN = Campaign(

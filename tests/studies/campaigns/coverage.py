@@ -181,8 +181,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         for shape in ("square", "cone")
     }
     facts["uw_sun_over_year"] = _over_year(orbits, tables)
-    pictures = (_draw(facts, out / "coverage.png"),)
-    return Summary("\n".join(_lines(facts)) + "\n", facts, pictures)
+    return Summary("\n".join(_lines(facts)) + "\n", facts)
 
 
 def _mean_shares(orbits: Sequence[Result]) -> dict[str, Any]:
@@ -243,50 +242,6 @@ def _lines(facts: dict[str, Any]) -> list[str]:
         where = ", ".join(f"{beta:g} deg with {heading}" for heading, beta in found)
         lines.append(f"    the paper's 74 +- 3 %, {shape} field: beta of {where}")
     return lines
-
-
-def _draw(facts: dict[str, Any], path: Path) -> Path:
-    """Draw the shares of time with the horizon in each number of cameras, and the Sun's by its height."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
-
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    bars, curves = figure.subplots(1, 2)
-    shown = [(name, attitude) for attitude in ("level", "tipped 90 deg", "any") for name in SUITES]
-    labels = [f"{name}\n{attitude}" if name == "uw" else name for name, attitude in shown]
-    keys = [f"{name}/{attitude}" for name, attitude in shown]
-    bottom = np.zeros(len(keys))
-    colours = ("#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73")
-    for count, colour in enumerate(colours):
-        shares = np.array(
-            [
-                100.0 * s[count] if count < len(s := facts["suites"][key]["lit horizon"]) else 0.0
-                for key in keys
-            ]
-        )
-        bars.bar(range(len(keys)), shares, bottom=bottom, color=colour, label=f"{count}")
-        bottom += shares
-    bars.set_xticks(range(len(keys)), labels, fontsize="x-small")
-    bars.set_ylabel("share of sunlight, %")
-    bars.legend(
-        title="lit horizon in cameras",
-        fontsize="x-small",
-        title_fontsize="x-small",
-        ncols=5,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-    )
-    betas = [float(beta) for beta in facts["uw_sun_by_beta"]]
-    for heading, colour in zip(HEADINGS, ("#0072B2", "#009E73", "#D55E00"), strict=True):
-        for shape, style in (("square", "-"), ("cone", "--")):
-            shares = 100.0 * np.array([s[heading][shape] for s in facts["uw_sun_by_beta"].values()])
-            label = heading if shape == "square" else None
-            curves.plot(betas, shares, style, color=colour, linewidth=1.2, label=label)
-    curves.axhspan(PAPER - 3.0, PAPER + 3.0, color="0.5", alpha=0.25)
-    curves.set_xlabel("Sun over the orbit's plane, deg")
-    curves.set_ylabel("UW: Sun in a camera, % of sunlight")
-    curves.legend(title="side cameras (dashed: cone)", fontsize="x-small", title_fontsize="x-small")
-    figure.savefig(path, dpi=110)
-    return path
 
 
 COVERAGE = Campaign(

@@ -30,8 +30,8 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.support.scenes import EXPOSURES, FIELD, RandomSlew, Scene, usable
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from tests.support.scenes import FIELD, RandomSlew, Scene, usable
 
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
@@ -135,8 +135,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         "by_turn": _by_turn(results),
         "failures": [r for r in results if _worth_a_line(r)],
     }
-    pictures = (_picture(results, out),) if any(r["nees"] is not None for r in results) else ()
-    return Summary("\n".join(_lines(facts)) + "\n", facts, pictures)
+    return summary(facts)
 
 
 def _worth_a_line(result: Result) -> bool:
@@ -234,39 +233,6 @@ def _lines(facts: dict[str, Any]) -> list[str]:
 def _whole(facts: dict[str, Any]) -> dict[str, Any]:
     """Return the row of all turns together."""
     return {**facts, **facts["milliseconds"], "vector_median": None}
-
-
-def _picture(results: Sequence[Result], out: Path) -> Path:
-    """Draw errors over the turn, the distribution of NEES beside that of chance, and the times."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - only here, an extra
-
-    answers = [r for r in results if r["nees"] is not None]
-    figure = Figure(figsize=(15.0, 4.2), layout="constrained")
-    errors, honesty, times = figure.subplots(1, 3)
-    for exposure in EXPOSURES:
-        here = [r for r in answers if r["exposure"] == exposure]
-        turns = [r["percent"] for r in here]
-        errors.semilogy(turns, [100 * r["vector"] for r in here], ".", markersize=3, label=f"{exposure:g} s")
-    bad = [r for r in answers if r["verdict"] == WRONG]
-    errors.semilogy([r["percent"] for r in bad], [100 * r["vector"] for r in bad], "rx", label="wrong")
-    refused = [r["percent"] for r in results if r["nees"] is None]
-    errors.plot(refused, [0.02] * len(refused), "k|", transform=errors.get_xaxis_transform(), label="refused")
-    errors.set(xlabel="turn, % of the field", ylabel="error of the rate, % (vector)")
-    errors.legend()
-    ordered = np.sort([r["nees"] for r in answers])
-    beyond = 1.0 - (np.arange(len(ordered)) + 0.5) / len(ordered)
-    honesty.semilogy(ordered, beyond, drawstyle="steps-post", label="here")
-    grid = np.linspace(0.0, max(20.0, float(ordered[-1])), 200)
-    chance = chi2.sf(grid, _FREEDOM)
-    honesty.semilogy(grid, chance, "--", label="chi-square of 3")
-    honesty.axvline(WRONG_SIGMAS**2, color="grey", linewidth=0.8)
-    honesty.set(xlabel="NEES", ylabel="part of the answers beyond", ylim=(0.3 / len(ordered), 1.0))
-    honesty.legend()
-    times.plot([r["percent"] for r in results], [r["milliseconds"] for r in results], ".", markersize=3)
-    times.set(xlabel="turn, % of the field", ylabel="ms of processor", ylim=(0.0, None))
-    path = out / "failures.png"
-    figure.savefig(path, dpi=100, facecolor="white")
-    return path
 
 
 FAILURES = Campaign(

@@ -24,7 +24,7 @@ from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.fault_judgement import judge
 from tests.studies.campaigns.fault_table import OWN, part_of
 from tests.support.flights import DURATION, config_for, demo_config, demo_world, fly
@@ -85,22 +85,10 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     by_fault: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         by_fault[result["fault"]].append(result)
-    lines = [
-        f"{len(results)} flights of {DURATION:g} s; detected: of the exercised faults",
-        f"{'fault':22}{'detected':>10}{'in, s (worst)':>16}  {'first event':18}{'reaction':28}"
-        f"{'right':>7}{'recovered in, s':>16}{'blind mA':>10}{'log':>8}",
-    ]
     facts: dict[str, Any] = {"runs": len(results), "faults": {}}
     for name, own in by_fault.items():
         row = _row(own)
         facts["faults"][name] = row
-        lines.append(
-            f"{name:22}{row['detected']:>5}/{row['exercised']:<4}{_range(row['detected_s']):>16}  "
-            f"{', '.join(row['events'])[:17]:18}{', '.join(row['reactions'])[:27]:28}"
-            f"{row['reactions_right']:>4}/{row['reactions_asked']:<2}"
-            f"{_range(row['recovered_s']):>16}{1e3 * row['blind_current_a']:10.1f}"
-            f"{row['logs_intact']:>5}/{len(own)}"
-        )
     for name in ("task_failed", "service_failing"):
         facts[name] = sum(result[name] for result in results)
     facts["logs_intact"] = sum(result["log_intact"] for result in results)
@@ -108,17 +96,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     facts["exercised"] = sum(row["exercised"] for row in facts["faults"].values())
     facts["not_reported"] = [_named(one) for one in results if one["exercised"] and one["detected_s"] is None]
     facts["wrong_reaction"] = [_named(one) for one in results if one["reaction_right"] is False]
-    lines.append(
-        f"detected {facts['detected']} of {facts['exercised']} exercised faults; unhandled exceptions in "
-        f"{facts['task_failed']} flights, beside the loop in {facts['service_failing']}; log whole in "
-        f"{facts['logs_intact']} of {len(results)}"
-    )
-    for heading, found in (
-        ("exercised and not reported", facts["not_reported"]),
-        ("the table's reaction did not come", facts["wrong_reaction"]),
-    ):
-        lines += [f"{heading}: {len(found)} flights", *(f"  {text}" for text in found)]
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _named(result: Result) -> str:
@@ -153,10 +131,6 @@ def _row(own: Sequence[Result]) -> dict[str, Any]:
 
 def _median_and_worst(values: Sequence[float]) -> list[float] | None:
     return [float(np.median(values)), float(max(values))] if values else None
-
-
-def _range(pair: list[float] | None) -> str:
-    return "-" if pair is None else f"{pair[0]:.2f} ({pair[1]:.2f})"
 
 
 FAULTS = Campaign(

@@ -11,23 +11,88 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
+from flight.loop.state import StateStore, StoredState
 from ground.telemetry import Run, read_run
 from knightcube.errors import UsageError
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
-from tests.hal.guardian.live_flight import devices_running
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.kill_board import Board
+from tests.hal.guardian.live_flight import LiveFlight, devices_running, write_config
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+
+START_S = 1.5
+"""s, assumed from exec to READY until the first start was measured."""
+
+AT_MOST_S = 60.0
+
+
+@dataclass
+class Board:
+    """What outlives a flight process.
+
+    Attributes:
+        boots: flights that have counted themselves.
+        start_s: how long the last start took until READY.
+        left: processes that were children of a flight when it was killed.
+    """
+
+    place: Path
+    devices: Path
+    bus: RemoteI2cBus
+    boots: int = 0
+    start_s: float = START_S
+    left: list[int] = field(default_factory=list)
+
+    @property
+    def state(self) -> Path:
+        """The folder of the kept state."""
+        return self.place / "state"
+
+    @contextmanager
+    def flight(self, number: int, target: float, crash_limit: int) -> Iterator[LiveFlight]:
+        """Start a flight to `target` in a folder of its own; none is left at the end."""
+        folder = self.place / f"flight-{number}"
+        folder.mkdir()
+        config = write_config(folder)
+        tree = yaml.safe_load(config.read_text(encoding="utf-8"))
+        tree["steps"] = [{"at": 0.0, "q2": target}]
+        tree["state"] = {"folder": str(self.state)}
+        tree["modes"] = {"crash_limit": crash_limit}
+        config.write_text(yaml.safe_dump(tree), encoding="utf-8")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
+            notifications.bind(str(folder / "notify"))
+            flight = LiveFlight(folder, config, notifications, AT_MOST_S, "--devices", str(self.devices))
+            try:
+                yield flight
+            finally:
+                flight.process.kill()
+                flight.process.wait()
+                if flight.process.stderr is not None:
+                    flight.process.stderr.close()
+
+    def current(self) -> float:
+        """Return the largest current of the coils now, A, as the devices' process knows it."""
+        return float(np.abs(self.bus.call("currents")).max())
+
+    def kept(self) -> tuple[StoredState, list[str]]:
+        """Return the kept state, and what was wrong with its files."""
+        problems: list[str] = []
+        state = StateStore(self.state, lambda _, text: problems.append(text)).load()
+        return state, problems
+
 
 LIMIT_S = 0.5
 KILLS = 16
@@ -231,22 +296,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "left_behind": sum(end["left_behind"] for end in ends),
         "wall_s_per_kill": sum(result["took_s"] for result in results) / len(kills),
     }
-    spread = facts["zero_after_s"]
-    text = (
-        f"{facts['kills']} kills on {facts['boards']} boards, {facts['early']} of them before the flight was "
-        f"ready, {facts['driven']} with current in the coils\n"
-        f"coils at zero after: median {spread['median']:.3f} s, 99 % {spread['p99']:.3f} s, "
-        f"worst {spread['worst']:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
-        f"largest current beyond the limit: {1e3 * facts['current_after_a']:.1f} mA\n"
-        f"flight log readable: {facts['logs_readable']}, stored state whole: {facts['states_whole']}, "
-        f"kill remembered: {facts['kills_counted']} of {facts['kills']}\n"
-        f"flights that did not start: {facts['starts_failed']}\n"
-        f"last flight of a board ended cleanly: {facts['clean_ends']}, in the right mode: "
-        f"{facts['modes_right']} of {facts['boards']} (safe: {facts['safe_wanted']}), "
-        f"processes left behind: {facts['left_behind']}\n"
-        f"{facts['wall_s_per_kill']:.2f} s a kill\n"
-    )
-    return Summary(text, facts)
+    return summary(facts)
 
 
 FAULTS_KILL = Campaign(

@@ -14,7 +14,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.first_orbit import ArcError, Bearings, first_orbit
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.short_arcs import LIGHT, circular, flown_states
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)
@@ -64,20 +64,10 @@ def run(case: Case) -> Result:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each arc: what was determined, the normalised errors, and the errors."""
     rows = [_row(arc, [result for result in results if result["arc"] == arc]) for arc in ARCS]
-    head = "arc s  passes  orbits  NEES of 6 (99 %)        95 % holds   median errors: distance, km"
-    lines = [head]
     for row in rows:
         if not row["passes"]:
             continue
-        line = f"{row['arc']:5.0f}  {row['passes']:6d}  {row['orbits']:6d}  "
-        if row["orbits"]:
-            low, high = row["nees_99"]
-            line += (
-                f"{row['nees']:5.2f} ({low:.2f} to {high:.2f})"
-                f"        {row['covered']:.2f}         {row['distance']:.3f}   {row['place_km']:.1f}"
-            )
-        lines.append(line)
-    return Summary("\n".join(lines) + "\n", {"arcs": rows})
+    return summary({"arcs": rows})
 
 
 def _row(arc: float, results: list[Result]) -> Result:

@@ -37,7 +37,7 @@ from knightcube.vision.horizon.nadir import find_nadir, nadir_of_cameras
 from knightcube.vision.horizon.settings import HorizonKnowledge, SensedDirection
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.nadir import WRONG_DEG
 from tests.support.earth_truth import limb_truth
 from tests.support.limb_frames import (
@@ -218,22 +218,13 @@ def _methods(
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return the table: each method in each light and attitude."""
     facts: dict[str, Any] = {}
-    lines = [
-        f"{'':36}answers   wrong     far   error, deg: median      95 %    ms",
-    ]
     for attitude in ATTITUDES:
         for light in LIGHTS:
             mine = [r for r in results if (r["attitude"], r["light"]) == (attitude, light)]
             for method in METHODS if mine else ():
                 row = _row([result["answers"][method] for result in mine])
                 facts[f"{attitude}/{light}/{method}"] = row
-                lines.append(
-                    f"{attitude:7}{light:11}{method:18}{row['answers']:4d} of {row['frames']:<4d}"
-                    f"{row['wrong']:4d}{row['far']:8d}{row['median_deg'] or np.nan:18.3f}"
-                    f"{row['most_deg'] or np.nan:10.3f}{row['milliseconds']:6.1f}"
-                )
-    lines.append(f"wrong: more than {WRONG_DEG:g} deg off, far: more than {FAR_DEG:g}; errors of all answers")
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _row(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:

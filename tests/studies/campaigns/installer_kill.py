@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.deploy.boards import FakeBoard
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 KILLS = 10
 """Of a board; then its update comes to its end."""
@@ -91,14 +91,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "ends": ends,
         "boards": len(results),
     }
-    text = (
-        f"{len(kills)} kills on {len(results)} boards, {facts['by_time']} at a random time, the others at a "
-        f"random system call\n"
-        f"flew the old release: {labels['old']}, the new: {labels['new']}, none: {labels['none']}; "
-        f"with a complaint or wrong: {len(bad)}\n"
-        f"updates that came to their end afterwards: {ends} of {len(results)}\n"
-    )
-    return Summary(text, facts)
+    return summary(facts)
 
 
 INSTALLER_KILL = Campaign(

@@ -19,13 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.reference.star_identification import METHODS, StarMotion, identify_by_rate
 from knightcube.reference.star_tables import KnownSky, angles
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.star_lists import PIXELS, ListKind, StarList, draw
 
 NOMINAL: dict[str, float] = {
@@ -148,11 +147,8 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         for value in values
     ]
     nominal = cell([r for r in results if r["axis"] == "nominal"])
-    lines = ["right / wrong / refused, median and p95 ms (processor)", "", *_nominal_lines(nominal)]
-    for axis in AXES:
-        lines += ["", LABELS[axis], *_axis_lines([c for c in cells if c["axis"] == axis])]
     facts = {"nominal": {**NOMINAL, **nominal}, "cells": cells, "pixels": PIXELS}
-    return Summary("\n".join(lines) + "\n", facts, (_picture(cells, out),))
+    return summary(facts)
 
 
 def _results_of(results: Sequence[Result], axis: str, value: float) -> list[Result]:
@@ -172,56 +168,6 @@ def cell(results: Sequence[Result]) -> dict[str, Any]:
             "p95_ms": float(np.quantile(spent, 0.95)) if spent else None,
         }
     return row
-
-
-def _nominal_lines(nominal: dict[str, Any]) -> list[str]:
-    lines = [f"nominal, {nominal['lists']} lists"]
-    for name in METHODS:
-        row = nominal[name]
-        counts = f"{row['right']:5d} / {row['wrong']} / {row['refused']}"
-        lines.append(f"  {name:20} {counts:18} {_ms(row['median_ms'])} {_ms(row['p95_ms'])} ms")
-    return lines
-
-
-def _axis_lines(cells: Sequence[dict[str, Any]]) -> list[str]:
-    """Return one line a method: at each value % right, wrong answers in brackets, median ms."""
-    lines = ["  " + f"{'% right (wrong) ms':20}" + "".join(f"{c['value']:>17g}" for c in cells)]
-    for name in METHODS:
-        entries = []
-        for one in cells:
-            row = one[name]
-            rate = 100.0 * row["right"] / one["lists"] if one["lists"] else float("nan")
-            entries.append(f"{rate:6.1f} ({row['wrong']}){_ms(row['median_ms'])}")
-        lines.append(f"  {name:20}" + "".join(f"{entry:>17}" for entry in entries))
-    return lines
-
-
-def _ms(value: float | None) -> str:
-    return "    -" if value is None else f"{value:6.1f}"
-
-
-def _picture(cells: Sequence[dict[str, Any]], out: Path) -> Path:
-    from matplotlib.figure import Figure  # noqa: PLC0415 - only here, an extra
-
-    figure = Figure(figsize=(18.0, 7.0), layout="constrained")
-    panels = figure.subplots(2, len(AXES), sharex="col")
-    for (axis, values), (above, below) in zip(AXES.items(), panels.T, strict=True):
-        here = [c for c in cells if c["axis"] == axis]
-        for name in METHODS:
-            right: FloatArray = np.array([100.0 * c[name]["right"] / max(c["lists"], 1) for c in here])
-            spent = [np.nan if (ms := c[name]["median_ms"]) is None else ms for c in here]
-            above.plot(values, right, marker="o", markersize=3, label=name)
-            below.semilogy(values, spent, marker="o", markersize=3)
-        above.set_ylim(-3.0, 103.0)
-        below.set_xlabel(LABELS[axis])
-        if axis == "noise_px":
-            below.set_xscale("log")
-    panels[0, 0].set_ylabel("identified rightly, %")
-    panels[1, 0].set_ylabel("median time, ms")
-    panels[0, -1].legend(fontsize=8)
-    path = out / "lost_in_space.png"
-    figure.savefig(path, dpi=100, facecolor="white")
-    return path
 
 
 LOST_IN_SPACE = Campaign(

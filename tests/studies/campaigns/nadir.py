@@ -25,7 +25,7 @@ import numpy as np
 from knightcube.vision.horizon.nadir import HorizonStatus, find_nadir
 from sim_hal.earth_camera import nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings, random_air
 
 VIEWS = ("sunlit", "terminator")
@@ -95,21 +95,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         if (of := [r for r in results if (r["view"], r["air"]) == (view, air)])
     ]
     poor = [r for r in results if _worth_a_line(r)]
-    lines = [
-        "view        air      frames  right  wrong  ambiguous  refused  none   rms deg    p99  worst  NEES/2"
-        "   ms median   p95    max   px read"
-    ]
-    lines += [_line(each) for each in rows]
-    lines += ["", "seed  air  verdict  error deg  NEES  edges  altitude km  why"]
-    for one in poor:
-        error = "-" if one["error_deg"] is None else f"{one['error_deg']:.3f}"
-        nees = "-" if one["nees"] is None else f"{one['nees']:.1f}"
-        lines.append(
-            f"{one['seed']}  {one['air']:7}  {one['verdict']:10} {error:>7} {nees:>6}"
-            f" {one.get('edges', 0):5d}  {one['altitude_km']:8.0f}"
-            f"  {'; '.join([one['reason'], *one['warnings']])}"
-        )
-    return Summary("\n".join(lines) + "\n", {"views": rows, "to_look_at": poor})
+    return summary({"views": rows, "to_look_at": poor})
 
 
 def row(results: Sequence[Result]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveS
 from knightcube.vision.streaks.geometry import CameraMotion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.object_passes import Pass, a_pass
 from tests.support.scenes import catalogue
 from tests.support.streak_bound import star_information
@@ -226,32 +226,19 @@ def _nees(line: LineOfSightState, frame: _Frame) -> list[float]:
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each length and magnitude."""
-    lines = [
-        "pass   V      found/passes  frames seen   error, claim, bound px (rms)   "
-        "NEES of 2: place, direction, rate; tracks judged"
-    ]
     rows = []
     for length in ("short", "long"):
         for magnitude in MAGNITUDES:
             own = [r for r in results if (r["length"], r["magnitude"]) == (length, magnitude)]
             row = _row(own)
             rows.append({"length": length, "magnitude": magnitude, **row})
-            if row["seen"] and row["nees"] is not None:
-                figures = ", ".join(f"{row[name]:.3f}" for name in ("error", "claim", "bound"))
-                nees = ", ".join(f"{value:.2f}" for value in (row["sighting_nees"], *row["nees"]))
-                share = f"{row['found']}/{row['passes']}    {row['seen']}/{row['frames']:>4}"
-                lines.append(
-                    f"{length:5}  {magnitude:3.1f}    {share}    {figures}    {nees}; {row['judged']}"
-                )
     empty = [result for result in results if result["magnitude"] is None]
     frames = sum(frame["solved"] for result in empty for frame in result["frames"])
     false = sum(result["false_tracks"] for result in results)
     every = sum(frame["solved"] for result in results for frame in result["frames"])
     taken = sum(len(result["frames"]) for result in results)
-    lines.append(f"false tracks: {false} in all passes; frames without an object searched: {frames}")
-    lines.append(f"frames with an attitude: {every} of {taken}")
     facts = {"rows": rows, "false_tracks": false, "empty_frames": frames, "solved": every, "taken": taken}
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _row(own: Sequence[Result]) -> Result:

@@ -20,13 +20,83 @@ from knightcube.astro.earth.geomagnetism import field as believed_field
 from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, Estimate
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
-from tests.studies.campaigns.orbit_attitude_figures import WHENS, draw, line_of, variant_facts
 from tests.support import orbit_world
 from tests.support.orbit_geometry import suite as suite_of
 from tests.support.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
 from tests.support.sensor_suite import SensorSuite
+
+SETTLED = 300.0
+"""s after which the sunlit figures count."""
+WHENS = {"both": "Sun and nadir in view", "sunlit": "all sunlight", "eclipse": "end of eclipse"}
+
+
+def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of one variant's runs."""
+    parts = [_parts(np.array(result["notes"])) for result in results]
+    low, high = band(len(results) * 6)
+    # Instants that all runs have, counted from the end: eclipses end together.
+    shortest = min(len(result["notes"]) for result in results)
+    nees = np.array([np.array(result["notes"])[-shortest:, 8] for result in results])
+    # Only instants at which every run has an attitude: the band is for their number.
+    whole = np.all(np.isfinite(nees), axis=0)
+    whole[: round(SETTLED / 10.0)] = False
+    settled = np.mean(nees[:, whole], axis=0) / 6.0
+    kinds = sorted({kind for result in results for kind in result["nis"]})
+    return {
+        "runs": len(results),
+        **{name: _figures(parts, name) for name in WHENS},
+        "nees_band": [low, high],
+        "share_in_band": float(np.mean((settled >= low) & (settled <= high))),
+        "nees_mean": float(np.mean(settled)),
+        "nis": {
+            kind: float(np.divide(*np.sum([r["nis"].get(kind, [0.0, 0.0]) for r in results], axis=0)))
+            for kind in kinds
+        },
+        "refused": {kind: sum(r["refused"].get(kind, 0) for r in results) for kind in kinds},
+        "starts": max(result["starts"] for result in results),
+        "never": sum(result["starts"] == 0 for result in results),
+    }
+
+
+def _parts(notes: FloatArray) -> dict[str, float]:
+    """Return rms errors of an axis, deg, what was said of them, and NEES.
+
+    "both" with Sun and nadir in use, "sunlit" with or without, "eclipse" in its last minute.
+    """
+    seconds, sunlit = notes[:, 0], notes[:, 1] > 0.5
+    error, sigma, nees = notes[:, 2:5], notes[:, 5:8], notes[:, 8] / 6.0
+    day = sunlit & (seconds >= SETTLED)
+    end = ~sunlit & (seconds > seconds[-1] - 60.0)
+    found = {}
+    both = day & (notes[:, 9] > 0.5)
+    for name, when in (("both", both), ("sunlit", day), ("eclipse", end)):
+        found[name] = _rms(error[when])
+        found[f"{name} said"] = _rms(sigma[when])
+        found[f"{name} NEES"] = float(np.nanmean(nees[when])) if np.any(np.isfinite(nees[when])) else np.nan
+    return found
+
+
+def _figures(parts: Sequence[dict[str, float]], name: str) -> dict[str, float | None]:
+    """Return over the runs: rms, the worst run's, the median of what was said, and the mean NEES."""
+    rms = np.array([part[name] for part in parts])
+    known = rms[np.isfinite(rms)]
+    if not known.size:
+        return {"rms": None, "worst": None, "said": None, "nees": None}
+    return {
+        "rms": float(np.sqrt(np.mean(known**2))),
+        "worst": float(np.max(known)),
+        "said": float(np.sqrt(np.nanmean([part[f"{name} said"] ** 2 for part in parts]))),
+        "nees": float(np.nanmean([part[f"{name} NEES"] for part in parts])),
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    """Return the root mean square of an axis, of rows (n, 3)."""
+    return float(np.sqrt(np.nanmean(values**2))) if np.any(np.isfinite(values)) else float("nan")
+
 
 SUITE = "uw"
 LOST_AT = 600.0
@@ -194,20 +264,11 @@ def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tup
 def summarise(results: Sequence[Result], out: Path) -> Summary:
     """Return accuracy and NEES of each variant, and the picture of one orbit."""
     facts: dict[str, Any] = {}
-    lines = [
-        "attitude error of an axis, deg rms (all runs, worst run, what the filter says) and NEES",
-        f"{'':17}" + "".join(f"{name:>30}" for name in WHENS.values()) + "   NEES in band",
-    ]
     for variant in VARIANTS:
         mine = [result for result in results if result["variant"] == variant]
         if mine:
             facts[variant] = variant_facts(mine)
-            lines.append(line_of(variant, facts[variant]))
-    first = next(iter(facts.values()))
-    low, high = first["nees_band"]
-    lines.append(f"{first['runs']} orbits each; NEES over six errors, 95 % band {low:.2f}..{high:.2f}")
-    pictures = (draw(results, out / "orbit_attitude.png"),)
-    return Summary("\n".join(lines) + "\n", facts, pictures)
+    return summary(facts)
 
 
 ORBIT_ATTITUDE = Campaign(

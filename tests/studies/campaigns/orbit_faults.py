@@ -24,7 +24,7 @@ from sim_hal.faults.bench import FaultKind, Where
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for
 from tests.studies.campaigns.orbit_fault_judgement import judge
 from tests.support.flights import fly
@@ -128,15 +128,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     by_cell: dict[str, dict[str, list[Result]]] = {}
     for result in results:
         by_cell.setdefault(result["fault"], {}).setdefault(result["mode"], []).append(result)
-    lines = [
-        f"{len(results)} flights of {DURATION:g} s; a cell is the worst delay, s, until the fault was told,",
-        "- where it was not exercised, ! where it was not told",
-        f"{'fault':36}" + "".join(f"{mode:>10}" for mode in MODES) + "  events",
-    ]
-    for name, row in by_cell.items():
-        told = sorted({r["event"] for cell in row.values() for r in cell if r["event"]})
-        cells = "".join(f"{_cell(row.get(mode, [])):>10}" for mode in MODES)
-        lines.append(f"{name:36}{cells}  {', '.join(told)[:44]}")
     exercised = [r for r in results if r["exercised"]]
     defects = {
         "not told": [r for r in exercised if r["told_s"] is None and not r["fault"].startswith("elements")],
@@ -149,10 +140,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     facts: dict[str, Any] = {"runs": len(results), "exercised": len(exercised)}
     facts["told"] = sum(r["told_s"] is not None for r in exercised)
     facts["defects"] = {name: [_named(r) for r in found] for name, found in defects.items()}
-    lines.append(f"told {facts['told']} of {facts['exercised']} exercised faults")
-    for name, found in facts["defects"].items():
-        lines += [f"{name}: {len(found)}", *(f"  {text}" for text in found)]
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _cell(own: Sequence[Result]) -> str:

@@ -38,7 +38,7 @@ from knightcube.vision.solar_cells import CoarseSun, SolarStringModel, coarse_su
 from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.emulators.solar_cells import SolarCellsModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
@@ -282,34 +282,12 @@ def _turned(truth: World, rng: np.random.Generator) -> World:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return accuracy, honesty, availability and time of each variant."""
     facts: dict[str, Any] = {}
-    lines = [
-        "deg rms of an axis (the filter's own sigma) in sunlight after 300 s, and in eclipse; NEES over six",
-        f"{'':8}{'sunlit':>18}{'eclipse':>18}{'NEES':>7}   nadir: share, deg rms   Sun: camera, strings"
-        "   ms: median  95 %  most",
-    ]
     for variant in VARIANTS:
         mine = [result for result in results if result["variant"] == variant]
         if not mine:
             continue
-        row = facts[variant] = _row(mine)
-        lines.append(
-            f"{variant:8}{_pair(row['sunlit']):>18}{_pair(row['eclipse']):>18}{row['nees']:7.2f}"
-            f"{100.0 * row['nadir_share']:12.0f} %{row['nadir_deg']:10.3f}"
-            f"{100.0 * row['sun_camera']:14.0f} %{100.0 * row['sun_strings']:7.0f} %"
-            f"{row['ms'][0]:14.1f}{row['ms'][1]:7.1f}{row['ms'][2]:6.1f}"
-        )
-        low, high = row["nees_band"]
-        lines.append(
-            f"        {row['runs']} orbits, refused {row['refused']}, 95 % band of NEES {low:.2f}..{high:.2f}"
-            " were its instants independent"
-        )
-        for kind, coarse in row["coarse"].items():
-            lines.append(
-                f"        {kind}: {coarse['count']} coarse nadirs, {coarse['nadir_deg']:.1f} deg an axis"
-                f" ({coarse['sigma_deg']:.1f}), with the Sun an attitude of {coarse['attitude_deg']:.1f} deg"
-                f" rms, NEES {coarse['nees']:.2f}"
-            )
-    return Summary("\n".join(lines) + "\n", facts)
+        facts[variant] = _row(mine)
+    return summary(facts)
 
 
 def _pair(values: tuple[float, float] | None) -> str:

@@ -10,7 +10,6 @@ collocation keeps the horizon.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ import numpy as np
 
 from knightcube.errors import PlanningError
 from knightcube.gnc.guidance.one_axis.plant import Q2_LIMIT
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.collocation_oracle import solve
 from tests.support.step_problems import KNIGHTCUBE, Problem
 
@@ -93,21 +92,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "cpu_s_median": float(np.median(times)),
         "cpu_s_most": max(times),
     }
-    lines = [
-        f"{len(results)} slews between |q2| of 0.60 and {Q2_LIMIT}: "
-        + ", ".join(f"{name} {count}" for name, count in counts.items())
-        + f"; refused {refused}",
-        f"cost over the collocation's at most {max(ratios, default=math.nan):.5f}; processor time "
-        f"{1e3 * facts['cpu_s_median']:.0f} ms (median), {1e3 * max(times):.0f} ms (most)",
-    ]
-    for number, (result, name) in enumerate(zip(results, verdicts, strict=True)):
-        if name in ("failed", "late", "dear"):
-            ends = f"{result['start']:+.4f} to {result['end']:+.4f} in {result['asked']:.2f} s"
-            lines.append(
-                f"  {number}: {name}: {ends}, thread {result['stiffness']:.2e}: {result['horizon']} s, "
-                f"{result['energy']} J, optimum {result['optimum']:.4f} J"
-            )
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 PLANNER_EDGE = Campaign(

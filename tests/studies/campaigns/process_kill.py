@@ -31,9 +31,8 @@ from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import LiveFlight
 from tests.studies.bench.executive import Load, full_load, members
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.faults_kill import watch_coils
-from tests.studies.campaigns.kill_board import Board
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
+from tests.studies.campaigns.faults_kill import Board, watch_coils
 from tests.support.process_watch import answering, below, command
 
 LIMIT_S = 0.35
@@ -172,15 +171,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "orphans": sum(result["orphans"] for result in results),
         "left": [path for result in results for path in result["left"]],
     }
-    parts = ", ".join(f"{role} {reported[role]} of {number}" for role, number in sorted(acts.items()))
-    text = (
-        f"{acts.total() + len(results)} acts in {len(results)} flights; reported: {parts}\n"
-        f"flight itself killed or stopped {len(results)} times, {len(driven)} with current: coils at zero "
-        f"within {worst:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
-        f"all processes gone within {facts['longest_gone_after_s']:.1f} s, orphans {facts['orphans']}, "
-        f"files left {len(facts['left'])}\n"
-    )
-    return Summary(text, facts)
+    return summary(facts)
 
 
 PROCESS_KILL = Campaign(

@@ -23,7 +23,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.scenes import turn_of
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.row_exposure import row_scene
 from tests.support.scenes import FIELD
 
@@ -99,13 +99,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         if here:
             rows.append({"change": f"to {high} %", **_row(here)})
     rows.append({"change": "all", **_row(results)})
-    lines = ["change    frames  answers  right  beyond 6 sigma   NEES  worst error %"]
-    for row in rows:
-        lines.append(
-            f"{row['change']:8}  {row['frames']:6d}  {row['answers']:7d}  {row['right']:5d}"
-            f"  {row['beyond_sigmas']:14d}  {row['nees'] or 0.0:5.2f}  {100.0 * row['worst']:13.3f}"
-        )
-    return Summary("\n".join(lines) + "\n", {"rows": rows})
+    return summary({"rows": rows})
 
 
 def _row(results: Sequence[Result]) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from tests.studies.campaigns.acquisition import ACQUISITION
 from tests.studies.campaigns.campaign import Campaign
 from tests.studies.campaigns.coil_faults import COIL_FAULTS
-from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
 from tests.studies.campaigns.detumble import DETUMBLE
@@ -33,7 +32,6 @@ from tests.studies.campaigns.rate_change import RATE_CHANGE
 from tests.studies.campaigns.resting import RESTING
 from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
-from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.safe_sun import SAFE_SUN
 from tests.studies.campaigns.soak import SOAK
@@ -56,13 +54,10 @@ CAMPAIGNS: dict[str, Campaign] = {
         STREAKED,
         RATE_CHANGE,
         ROLLING_SHUTTER,
-        RSO_SLEW,
-        RSO_TRACK,
         RSO_ORBITS,
         FIRST_ORBITS,
         OBJECT_PASSES,
         OBJECT_FLIGHTS,
-        CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,
         FALSE_HORIZONS,

@@ -32,7 +32,7 @@ from knightcube.vision.startracker.detection import DetectionSettings
 from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected
 from tests.support.scenes import FIELD, catalogue
@@ -143,12 +143,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         for row, trail in rows
     ]
     total = _figures(judged)
-    lines = [
-        f"{'imperfection':20} {'trail':>5} {'attitudes':>9} {'NEES':>7} {'worst sigma':>11}  error, claim px"
-    ]
-    lines += [_line(row) for row in [*table, {"row": "all", "trail": -1.0, **total}]]
-    lines.append(f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond']} of {total['attitudes']}")
-    return Summary("\n".join(lines) + "\n", {"rows": table, "all": total})
+    return summary({"rows": table, "all": total})
 
 
 def _judged(results: Sequence[Result]) -> list[Result]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.controllers import CONTROLLERS
 from tests.studies.campaigns.step_robust import draw, fly_world
 
@@ -24,7 +24,6 @@ FIGURES = (
     ("settling_s", "settling, s"),
     ("overshoot_percent", "overshoot, %"),
 )
-_ROW = "{:12}{:>8}{:>6}{:>12}" + "{:>30}" * len(FIGURES)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -43,8 +42,6 @@ def run(case: Case) -> Result:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return median and 95th percentile of each figure by controller."""
     facts: dict[str, Any] = {}
-    head = (f"{label}: median, 95 %" for _, label in FIGURES)
-    lines = [_ROW.format("", "worlds", "lost", "R I^2, mW", *head)]
     for name in COMPARED:
         mine = [result for result in results if result["controller"] == name]
         if not mine:
@@ -54,16 +51,12 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             "lost": sum(result["lost"] for result in mine),
             "heat_w": float(np.mean([result["heat_w"] for result in mine])),
         }
-        cells = []
         for key, _label in FIGURES:
             values = np.array([result[key] for result in mine])
             levels = [float(np.quantile(values, level, method="lower")) for level in (0.5, 0.95)]
             found[key] = [level if math.isfinite(level) else None for level in levels]
-            cells.append(f"{levels[0]:.3f}, {levels[1]:.3f}")
         facts[name] = found
-        heat = f"{1e3 * found['heat_w']:.2f}"
-        lines.append(_ROW.format(name, found["worlds"], found["lost"], heat, *cells))
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 ROBUST_CONTROLLERS = Campaign(

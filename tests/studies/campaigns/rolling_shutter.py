@@ -21,7 +21,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.knightcube.vision.streaks.scenes import turn_of
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.row_exposure import RowScene, row_scene
 from tests.support.scenes import FIELD, noise_floor
 from tests.support.streak_bound import rate_bound
@@ -96,14 +96,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
     """Return a row with a prior and one without."""
     del out
     facts = {name: _row([one[name] for one in results]) for name in (PRIOR, ALONE)}
-    lines = ["         frames  answers  beyond 6 sigma   NEES  error over bound: rms  median   worst error %"]
-    for name, row in facts.items():
-        lines.append(
-            f"{name:8} {row['frames']:6d}  {row['answers']:7d}  {row['beyond_sigmas']:14d}"
-            f"  {row['nees']:5.2f}  {row['over_bound']:21.2f}  {row['median_over_bound']:6.2f}"
-            f"  {100.0 * row['worst']:13.3f}"
-        )
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _row(judged: Sequence[Result]) -> dict[str, Any]:

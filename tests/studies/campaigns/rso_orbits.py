@@ -23,7 +23,7 @@ from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 from knightcube.vision.objects.detect import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.objects import source_tracks
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.rso import (
     EXPOSURE,
     MATCH_PX,
@@ -34,7 +34,6 @@ from tests.studies.campaigns.rso import (
     match,
     number,
 )
-from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames
 from tests.support.opportunities import (
     Opportunity,
     Scenario,
@@ -199,7 +198,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         "seconds_median": float(np.median(seconds)) if seconds else None,
         "seconds_largest": max(seconds, default=None),
     }
-    return Summary("\n".join(_lines(facts)) + "\n", facts, _pictures(results, rows, out))
+    return summary(facts)
 
 
 def weakest(rows: Sequence[dict[str, Any]]) -> float | None:
@@ -235,25 +234,6 @@ def _lines(facts: dict[str, Any]) -> list[str]:
         f"processor time of a frame: median {number(facts['seconds_median'], 2)} s, "
         f"largest {number(facts['seconds_largest'], 2)} s",
     ]
-
-
-def _pictures(results: Sequence[Result], rows: Sequence[dict[str, Any]], out: Path) -> tuple[Path, ...]:
-    """Draw detection over magnitude, and the first run's first eight opportunities, exposed again."""
-    first = next((r for r in results if r["magnitude"] == TABLE_MAGNITUDE and r["frames"]), None)
-    if first is None:
-        return ()
-    camera = StarCameraModel(field_of_view=FIELD)
-    seed = tuple(first["seed"])
-    scenario, times = flown(seed, first["run"])
-    shown = []
-    for index, at in enumerate(times[:8]):
-        pixels = expose(scenario, at, TABLE_MAGNITUDE, np.random.default_rng((*seed, index)))
-        report, _ = look(pixels, camera, RATE)
-        shown.append((f"{at.start:.0f} s", pixels, report, np.array([at.first, at.last])))
-    return (
-        draw_frames(shown, out / "rso-orbits_frames.png"),
-        draw_detection_rate({"rso-orbits": rows}, out / "rso-orbits_detection.png"),
-    )
 
 
 RSO_ORBITS = Campaign(

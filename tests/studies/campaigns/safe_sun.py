@@ -24,7 +24,7 @@ from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from sim_hal.settings import Disturbances, TipOff
 from sim_hal.worlds.orbit import sun_position
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.detumble import SAMPLES_NS, SCHEDULE, hash_of
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
 
@@ -149,25 +149,13 @@ def _rms(values: FloatArray) -> float | None:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return how the axis was held, by craft and share."""
     facts: dict[str, Any] = {}
-    heads = ("runs", "held", "missed", "median", "95 %", "worst", "dark", "found", "again", "deg/s")
-    lines = [f"{'craft':12}{'share':>6}" + "".join(f"{head:>9}" for head in heads)]
     for craft in CRAFT:
         for share in SHARES:
             mine = [result for result in results if (result["craft"], result["share"]) == (craft, share)]
             if not mine:
                 continue
-            found = facts[f"{craft}/{share}"] = _figures(mine)
-            counts = "".join(f"{value:9d}" for value in list(found.values())[:3])
-            cells = [
-                f"{'-' if value is None else format(value, '.1f'):>9}" for value in list(found.values())[3:]
-            ]
-            lines.append(f"{craft:12}{share:6.1f}" + counts + "".join(cells))
-    lines += [
-        f"deg rms off the Sun in sunlight (held: {NEAR:g} at most), and in eclipse the median;",
-        f"s at most until first within {NEAR:g} deg, and from an eclipse's end on; fastest;",
-        "missed: how often the flight ended before either",
-    ]
-    return Summary("\n".join(lines) + "\n", facts)
+            facts[f"{craft}/{share}"] = _figures(mine)
+    return summary(facts)
 
 
 def _figures(mine: Sequence[Result]) -> dict[str, Any]:

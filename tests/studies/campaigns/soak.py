@@ -24,7 +24,7 @@ from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
 from ground.telemetry import Run
 from sim_hal.settings import FaultEntry
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.faults import faults
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
@@ -168,16 +168,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     wrong = {str(flight): broken(result) for flight, result in enumerate(results) if broken(result)}
     faults_met = sum(result["faults"] for result in results)
     hours = sum(result["seconds"] for result in results) / HOUR_S
-    text = (
-        f"{hours:.2f} h of flight, {faults_met} faults\n"
-        f"memory slope        {worst['memory_slope'] / 2**20:8.2f} MiB/h, at most "
-        f"{MEMORY_BYTES_PER_HOUR / 2**20:g}\n"
-        f"flight log          {worst['log_bytes'] / 2**20:8.2f} MiB, at most {BUDGET_BYTES / 2**20:g}\n"
-        f"largest current     {1e3 * worst['largest_current_a']:8.1f} mA\n"
-        f"final pointing      {worst['pointing_deg']:8.3f} deg, at most {POINTING_DEG:g}\n"
-        f"limits broken       {wrong or 'none'}\n"
-    )
-    return Summary(text, {"hours": hours, "faults": faults_met, **worst, "broken": wrong})
+    return summary({"hours": hours, "faults": faults_met, **worst, "broken": wrong})
 
 
 SOAK = Campaign(

@@ -33,7 +33,7 @@ from pathlib import Path
 from flight.app.accepted_config import FlownConfig, sum_file
 from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 CALLS = ("open", "openat", "read", "getdents64", "fsync", "rename", "bind", "ioctl")
 ERRORS = ("EIO", "ENOSPC", "ENOENT", "EACCES")
@@ -225,17 +225,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     at_once = sum(not fault["waited"] and not fault["restarts"] for fault in flew)
     waited = sum(fault["waited"] and not fault["restarts"] for fault in flew)
     grounded = [fault for fault in faults if not fault["flies"]]
-    by_call = Counter(fault["fault"].partition(" ")[0] for fault in faults)
     begun, of = sum(fault["begun"] for fault in faults), results[0]["of"]
-    lines = [
-        f"starts with one call that fails: {len(faults)} of {of['points']} points",
-        f"  {begun} of {of['begun']} after the configuration was opened",
-        f"  of {', '.join(f'{call} {count}' for call, count in sorted(by_call.items()))}",
-        f"flew at once {at_once}, waited and flew {waited}, ended and were started again "
-        f"{len(flew) - at_once - waited}",
-        f"never flew: {len(grounded)}",
-    ]
-    lines += [f"  {fault['fault']}: status {fault['status']}: {fault['said']}" for fault in grounded]
     facts = {
         "starts": len(faults),
         "begun": begun,
@@ -244,9 +234,10 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         "waited": waited,
         "started_again": len(flew) - at_once - waited,
         "grounded": len(grounded),
+        "never_flew": [f"{fault['fault']}: status {fault['status']}: {fault['said']}" for fault in grounded],
         "longest_s": max((fault["took_s"] for fault in flew), default=0.0),
     }
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 START = Campaign(

@@ -28,7 +28,7 @@ from ground.report.steps import STEADY_STATE_S
 from ground.telemetry import Run
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import Rigged, demo_config, demo_world, event_names, fly
 
 STEPS = (Step(at=0.0, q2=-0.3), Step(at=65.0, q2=-0.2))
@@ -176,49 +176,17 @@ def _worst(*values: float | None) -> float:
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
     """Return worst and 95th percentile of each figure, and the worlds of the worst runs."""
     facts: dict[str, Any] = {"runs": len(results), "lost": sum(result["lost"] for result in results)}
-    lines = [
-        f"{facts['runs']} worlds, {facts['lost']} lost (further than {LOST_DEG:g} deg from the target)",
-        f"{'':24}{'median':>10}{'95 %':>10}{'worst':>10}{'asked at 95 %':>16}",
-    ]
-    for key, label, asked in FIGURES:
+    for key, _, _ in FIGURES:
         values = np.array([result[key] for result in results])
         median, high, worst = (
             float(np.quantile(values, level, method="lower")) for level in (0.5, 0.95, 1.0)
         )
         facts[key] = {"median": _finite(median), "p95": _finite(high), "worst": _finite(worst)}
-        wanted = f"{asked:16g}" if asked is not None else f"{'-':>16}"
-        lines.append(f"{label:24}{median:10.3f}{high:10.3f}{worst:10.3f}{wanted}")
-    lines.append("the three worlds of the longest settling and of the largest steady state:")
-    for key in ("settling_s", "steady_state_deg"):
-        for result in sorted(results, key=lambda r: -r[key])[:3]:
-            world = result["world"]
-            listed = " ".join(f"{name} {world[name]:.2f}" for name in _LISTED)
-            lines.append(f"  {key} {result[key]:.3f}: {listed} delay {world['delay_cycles']}")
-    picture = _draw(results, folder / "step_robust.png")
-    return Summary("\n".join(lines) + "\n", facts, (picture,))
-
-
-_LISTED = ("inertia", "field", "resistance", "stiffness", "noise")
+    return summary(facts)
 
 
 def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _draw(results: Sequence[Result], path: Path) -> Path:
-    """Draw how the figures are distributed."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
-
-    figure = Figure(figsize=(9.0, 3.4), layout="constrained")
-    for axes, (key, label, asked) in zip(figure.subplots(1, 2), FIGURES[:2], strict=True):
-        values = np.sort([result[key] for result in results if math.isfinite(result[key])])
-        axes.plot(values, 100.0 * np.arange(1, len(values) + 1) / len(results), color="#0072B2")
-        axes.axhline(95.0, color="0.6", linewidth=0.8)
-        axes.axvline(asked, color="#D55E00", linewidth=0.8)
-        axes.set_xlabel(label)
-        axes.set_ylabel("runs below, %")
-    figure.savefig(path, dpi=110)
-    return path
 
 
 STEP_ROBUST = Campaign(

@@ -159,10 +159,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
             cells.append({"theta": theta, "percent": percent, "frames": len(here), **_cell(here)})
     overall = _overall(results)
     lines = [*_cell_lines(cells), "", *_overall_lines(overall), "", *_thesis_lines(results)]
-    pictures = _pictures(cells, out)
-    return Summary(
-        "\n".join(lines) + "\n", {"cells": cells, "overall": overall, "exposure_s": EXPOSURE}, pictures
-    )
+    return Summary("\n".join(lines) + "\n", {"cells": cells, "overall": overall, "exposure_s": EXPOSURE})
 
 
 def _cell(results: Sequence[Result]) -> dict[str, Any]:
@@ -292,49 +289,6 @@ def _percent(value: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
-
-
-def _pictures(cells: Sequence[dict[str, Any]], out: Path) -> tuple[Path, ...]:
-    """Draw rate and attitude errors over theta and turn for the five estimators, Figures 3.7-3.10."""
-    from matplotlib.colors import LogNorm  # noqa: PLC0415 - only here, an extra
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    paths = []
-    for key, title, scale, span in (
-        ("magnitude", "rms error of the rate's magnitude, %", 100.0, (0.003, 5.0)),
-        ("across_px", "mean error of the attitude at an end, across the boresight, px", 1.0, (0.005, 2.0)),
-    ):
-        figure = Figure(figsize=(15.0, 4.2), layout="constrained")
-        panels = figure.subplots(1, len(ESTIMATORS), sharey=True)
-        for axes, name in zip(panels, ESTIMATORS, strict=True):
-            grid = np.array(
-                [
-                    [
-                        np.nan if (v := _find(cells, theta, percent)[name][key]) is None else scale * v
-                        for percent in PERCENTS
-                    ]
-                    for theta in THETAS_DEG
-                ]
-            )
-            shown = axes.imshow(grid, norm=LogNorm(*span), cmap="viridis", origin="lower", aspect="auto")
-            for (row, column), value in np.ndenumerate(grid):
-                if np.isfinite(value):
-                    axes.text(
-                        column, row, f"{value:.2g}", ha="center", va="center", fontsize=7, color="white"
-                    )
-            axes.set_title(name, fontsize=10)
-            axes.set_xticks(range(len(PERCENTS)), [str(p) for p in PERCENTS])
-            axes.set_yticks(range(len(THETAS_DEG)), [str(t) for t in THETAS_DEG])
-            axes.set_xlabel("turn, % of the field")
-        panels[0].set_ylabel("theta, deg")
-        figure.colorbar(shown, ax=panels, label=title)
-        paths.append(out / f"streaks_{key.removesuffix('_px')}.png")
-        figure.savefig(paths[-1], dpi=100, facecolor="white")
-    return tuple(paths)
-
-
-def _find(cells: Sequence[dict[str, Any]], theta: int, percent: int) -> dict[str, Any]:
-    return next(c for c in cells if c["theta"] == theta and c["percent"] == percent)
 
 
 STREAKS = Campaign(

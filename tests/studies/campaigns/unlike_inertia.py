@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.flights import fly
 from tests.support.unlike_body import coil_judgement, configured, with_other_body, without_cameras
 
@@ -61,12 +61,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     cells: dict[str, list[Result]] = defaultdict(list)
     for result in results:
         cells[f"{result['name']} {result['fault'] or 'healthy'}"].append(result)
-    lines = [f"{'craft and fault':28}{'flights':>8}{'named':>7}{'s, median / worst':>20}{'isolated':>10}"]
-    for name, own in cells.items():
-        delays = [one["named_s"] for one in own if one["named_s"] is not None]
-        times = f"{np.median(delays):.0f} / {max(delays):.0f}" if delays else "-"
-        isolated = sum(one["isolated_s"] is not None for one in own)
-        lines.append(f"{name:28}{len(own):8}{len(delays):7}{times:>20}{isolated:10}")
     wrong = [one for one in results if one["healthy_isolated"]]
     suspected = [one for one in results if one["healthy_suspected"]]
     facts = {
@@ -74,10 +68,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "with_healthy_isolated": len(wrong),
         "with_healthy_suspected": len(suspected),
     }
-    lines.append(
-        f"{len(results)} flights: a healthy coil isolated in {len(wrong)}, suspected in {len(suspected)}"
-    )
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 UNLIKE_INERTIA = Campaign(

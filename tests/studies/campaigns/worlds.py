@@ -18,7 +18,7 @@ import numpy as np
 
 from sim_hal.worlds.basilisk.world import BasiliskWorld
 from tests.studies.campaigns import detumble, free_flight, orbit_pointing
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 
 WORLDS = ("free_body", "basilisk")
 WITHIN = 0.2
@@ -69,7 +69,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
                 facts[f"{kind}/{figure}"] = found
     facts["within"] = all(found["within"] for found in facts.values() if isinstance(found, dict))
     lines.append(f"{facts['lost']} lost")
-    return Summary("\n".join(lines) + "\n", facts)
+    return summary(facts)
 
 
 def _compared(results: Sequence[Result], figure: str, lines: list[str]) -> dict[str, Any]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tests.studies.campaigns import consistency
@@ -59,10 +57,3 @@ def test_variances_that_are_claimed_too_large_are_found_out() -> None:
     facts = consistency.scene_facts(fly("testbed", 4, claimed=4.0))
     assert facts["nees_mean"] < 0.9
     assert facts["nis"]["gyro"]["mean"] < 0.5
-
-
-def test_the_summary_shows_both_scenes(flown: dict[str, list[Result]], tmp_path: Path) -> None:
-    summary = consistency.summarise([*flown["testbed"], *flown["free"]], tmp_path)
-    assert set(summary.facts) == {"testbed", "free"}
-    assert "NIS gyro" in summary.text
-    assert np.isfinite(summary.facts["free"]["nees_final"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.arrays import FloatArray
-from tests.studies.campaigns.detumble_bound import least_time
+from tests.studies.campaigns.detumble import least_time
 
 STEP, REACH, STRENGTH = 5.0, 0.1, 4e-5
 STILL = np.tile([0.0, 0.0, STRENGTH], (400, 1))

@@ -106,8 +106,6 @@ def test_the_summary_counts_draws_and_names_the_frames_to_look_at(
     assert (summary.facts["refused"], summary.facts["wrong"], summary.facts["answers"]) == (1, 1, _FRAMES - 1)
     assert [one["reason"] for one in summary.facts["failures"]] == ["no motion", "axis 30 deg off"]
     assert "axis 30 deg off" in summary.text
-    assert all(path.stat().st_size > 10_000 for path in summary.pictures)
-    assert len(summary.pictures) == 1
 
 
 @pytest.mark.slow

@@ -13,8 +13,7 @@ from flight.loop.state import COPIES, StateStore, StoredState, begin_boot
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.campaigns import faults_kill
 from tests.studies.campaigns.campaign import fly_here
-from tests.studies.campaigns.faults_kill import KILLS, cases, summarise
-from tests.studies.campaigns.kill_board import Board
+from tests.studies.campaigns.faults_kill import KILLS, Board, cases, summarise
 
 
 def test_boards_come_to_the_kills_that_are_asked() -> None:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from tests.studies.campaigns.campaign import Case
-from tests.studies.campaigns.object_authority import least_deviation
-from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, run
+from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, least_deviation, run
 
 
 @pytest.mark.parametrize("lean", [0.0, np.radians(30.0)])

@@ -1,0 +1,47 @@
+"""A socket that answers commands as a flight does."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import weakref
+from pathlib import Path
+
+from flight.link.commands import LONGEST
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import Packer
+
+
+def answer(obeyed: bool) -> bytes:
+    """Return a flight's answer to a command."""
+    fields = dict.fromkeys((field.name for field in COMMAND.fields), 0)
+    texts = {field.name: "as commanded" for field in COMMAND.fields if field.kind.startswith("S")}
+    return Packer().pack(COMMAND, 5, {**fields, **texts, "obeyed": int(obeyed), "mode": int(Mode.HOLD)})
+
+
+class Listener:
+    """A flight's command socket that answers every command with the same reply."""
+
+    def __init__(self, path: Path) -> None:
+        self._reply = [answer(True)]
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._line.bind(str(path))
+        threading.Thread(target=_listen, args=(self._line, self._reply), daemon=True).start()
+        weakref.finalize(self, self._line.shutdown, socket.SHUT_RDWR)
+
+    def will_say(self, reply: bytes) -> None:
+        """Use this reply from now on."""
+        self._reply[0] = reply
+
+
+def _listen(line: socket.socket, reply: list[bytes]) -> None:
+    """Answer until the line is shut."""
+    while True:
+        _, sender = line.recvfrom(LONGEST)
+        if not sender:
+            line.close()
+            return
+        with contextlib.suppress(OSError):  # who asked has gone again
+            line.sendto(reply[0], sender)
