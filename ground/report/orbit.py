@@ -174,8 +174,8 @@ def dipole_errors(run: Run) -> dict[str, float]:
     for name, inside in (("sunlight", lit > SUNLIT), ("shadow", lit < 1.0 - SUNLIT)):
         last = np.flatnonzero(inside)[-JUDGED:]
         if len(last):
-            size = max(float(np.linalg.norm(true[last])), MIN_DIPOLE)
-            found[name] = float(np.linalg.norm(error[last])) / size
+            size = max(float(np.sqrt(np.sum(true[last] ** 2))), MIN_DIPOLE)
+            found[name] = float(np.sqrt(np.sum(error[last] ** 2))) / size
     return found
 
 
