@@ -108,6 +108,7 @@ def refly(monkeypatch: pytest.MonkeyPatch, seed: int, number: int, seconds: floa
     return orbit_faults.refly(seed, number)
 
 
+@pytest.mark.timeout(400)
 def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
