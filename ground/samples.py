@@ -1,11 +1,12 @@
-"""Pictures to try the commands on, rendered by the simulator, each with its truth.
+"""Sample pictures for the other commands, rendered by the simulator, each with its truth.
 
-They are made on demand: noise of 12 bits does not compress, so a few pictures would be megabytes in the
-repository, and none would follow the simulator when it changes. The same seed gives the same pictures.
+They are rendered on demand, because noise of 12 bits does not compress, and because stored pictures would not
+follow changes of the simulator. The same seed gives the same pictures.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from ground.truth import sky_truth
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.catalogue import load
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
+from knightcube.errors import UsageError
 from knightcube.vision.camera.images import write_picture
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.startracker.sky_map import Pointing
@@ -29,14 +30,14 @@ PIXELS, FIELD_DEG = 768, 15.0
 YEAR = 2026.5
 STILL_S, TURNING_S = 0.5, 0.4
 RATE = (0.035, -0.02, 0.015)
-"""rad/s, camera axes: streaks of 47 px."""
+"""Rate of the camera in its own axes (rad/s), which makes streaks of 47 px."""
 ORION = Pointing(math.radians(83.8), math.radians(-1.2), math.radians(20.0))
 EARTH_PIXELS, EARTH_FIELD_DEG, ALTITUDE_KM = 512, 67.0, 515.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sample:
-    """A picture, its truth ready for JSON, and the words of the command to try on it; `{}` is its file."""
+class SamplePicture:
+    """A picture, its truth for JSON, and the command to try with `{}` for its file."""
 
     name: str
     pixels: Image
@@ -44,8 +45,10 @@ class Sample:
     words: str
 
 
-def write_samples(folder: Path, seed: int, progress: Callable[[str], None]) -> list[tuple[Path, Sample]]:
-    """Render every sample into a folder that exists; return the files. Raises UsageError."""
+def write_samples(
+    folder: Path, seed: int, progress: Callable[[str], None]
+) -> list[tuple[Path, SamplePicture]]:
+    """Render all samples into an existing folder and return the files. Raises UsageError."""
     written = []
     for number, (name, make) in enumerate(_MAKERS.items()):
         progress(name)
@@ -55,19 +58,19 @@ def write_samples(folder: Path, seed: int, progress: Callable[[str], None]) -> l
     return written
 
 
-def _stars(name: str, generator: np.random.Generator) -> Sample:
-    """Show Orion, the camera still."""
+def _stars(name: str, generator: np.random.Generator) -> SamplePicture:
+    """Render Orion with a camera at rest."""
     return _sky(name, generator, ORION.quaternion(), np.zeros(3), STILL_S)
 
 
-def _night(name: str, generator: np.random.Generator) -> Sample:
-    """Show stars anywhere, for a calibration."""
+def _night(name: str, generator: np.random.Generator) -> SamplePicture:
+    """Render stars at a random attitude, for a calibration."""
     attitude = generator.standard_normal(4)
     return _sky(name, generator, attitude / np.linalg.norm(attitude), np.zeros(3), STILL_S)
 
 
-def _streaks(name: str, generator: np.random.Generator) -> Sample:
-    """Show Orion while the camera turns, and a satellite that moves among the stars."""
+def _streaks(name: str, generator: np.random.Generator) -> SamplePicture:
+    """Render Orion with a rotating camera, and a satellite that moves among the stars."""
     satellite = _satellite(ORION.quaternion())
     sample = _sky(name, generator, ORION.quaternion(), np.array(RATE), TURNING_S, [satellite])
     prior = " ".join(f"{component:g}" for component in RATE)
@@ -75,8 +78,8 @@ def _streaks(name: str, generator: np.random.Generator) -> Sample:
     return replace(sample, words=words)
 
 
-def _limb(name: str, generator: np.random.Generator) -> Sample:
-    """Show the Earth's limb by day from a low orbit, the boresight 8 deg below it."""
+def _limb(name: str, generator: np.random.Generator) -> SamplePicture:
+    """Render the Earth's limb by day from a low orbit, with the boresight 8 deg below it."""
     lens = Pinhole.from_field_of_view(EARTH_PIXELS, EARTH_PIXELS, math.radians(EARTH_FIELD_DEG))
     model = earth_camera.EarthCameraModel(
         lens=lens, rows=EARTH_PIXELS, columns=EARTH_PIXELS, response="linear", seed=1
@@ -94,10 +97,10 @@ def _limb(name: str, generator: np.random.Generator) -> Sample:
     pixels = earth_camera.render(model, scene, generator)
     truth = {"nadir_camera": earth_camera.nadir(scene).tolist(), "altitude_km": ALTITUDE_KM}
     words = f"horizon {{}} --fov {EARTH_FIELD_DEG:g} --altitude {ALTITUDE_KM:g}"
-    return Sample(name, pixels, truth, words)
+    return SamplePicture(name, pixels, truth, words)
 
 
-_MAKERS: dict[str, Callable[[str, np.random.Generator], Sample]] = {
+_MAKERS: dict[str, Callable[[str, np.random.Generator], SamplePicture]] = {
     "stars": _stars,
     "streaks": _streaks,
     "limb": _limb,
@@ -116,8 +119,8 @@ def _sky(
     rate: FloatArray,
     exposure: float,
     extra: list[star_camera.SourceTrack] | None = None,
-) -> Sample:
-    """Return the sky as exposed about `attitude` (4,) at its middle, turning at `rate` (3,)."""
+) -> SamplePicture:
+    """Return the sky with `attitude` (4,) at mid-exposure and a rate (3,), rad/s."""
     times = np.linspace(0.0, exposure, 41)
     turns = from_rotation_vector((times[:, None] - 0.5 * exposure) * rate)
     stars, model = load(), _camera()
@@ -131,12 +134,41 @@ def _sky(
         extra or [],
     )
     truth = sky_truth(rate, exposure, attitude, model.pinhole.focal_length)
-    return Sample(name, pixels, truth, f"solve {{}} --fov {FIELD_DEG:g}")
+    return SamplePicture(name, pixels, truth, f"solve {{}} --fov {FIELD_DEG:g}")
 
 
 def _satellite(attitude: FloatArray) -> star_camera.SourceTrack:
-    """Return something of magnitude 3 that moves by 25 mrad/s among the stars, near the picture's middle."""
+    """Return an object of magnitude 3 near the image centre that moves by 25 mrad/s among the stars."""
     seen = np.array([[0.03, 0.02, 1.0], [0.03, 0.03, 1.0]])
     directions = seen @ attitude_matrix(attitude)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return star_camera.SourceTrack(np.array([0.0, TURNING_S]), directions, 3.0)
+
+
+def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:
+    """Return the truth of a frame as plain numbers for a JSON file.
+
+    Args:
+        rate: rate (3,) in camera axes, rad/s.
+        exposure: exposure time, s.
+        attitude: attitude (4,) from ICRS to camera at mid-exposure.
+        focal_length: focal length, px.
+    """
+    pointing = Pointing.of(attitude)
+    return {
+        "rate_rad_s": [float(component) for component in rate],
+        "exposure_s": exposure,
+        "attitude": [float(component) for component in attitude],
+        "right_ascension_deg": math.degrees(pointing.right_ascension),
+        "declination_deg": math.degrees(pointing.declination),
+        "roll_deg": math.degrees(pointing.roll),
+        "streak_px": float(np.hypot(rate[0], rate[1])) * exposure * focal_length,
+    }
+
+
+def write_truth(path: Path, truth: dict[str, Any]) -> None:
+    """Write a truth as JSON. Raises UsageError."""
+    try:
+        path.write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,4 +1,4 @@
-"""`flight camera`: take frames from the configured camera, nothing else being opened, and look at them."""
+"""`flight camera`: take frames from the camera of a configuration, without opening its other devices."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import argparse
 import json
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from flight.app.accepted_config import requested_config
+from flight.app.devices import linux_camera, simulated_camera
+from flight.app.run import RunRequest
 from flight.schema.devices import Camera, camera_model
-from flight.schema.document import config_path
+from flight.schema.document import ConfigError, config_path
 from ground.commands.options import finite
-from ground.truth import sky_truth, write_truth
+from hal.buses.clock import SystemClock
 from hal.interfaces.devices import Frame, FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
@@ -23,23 +28,22 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.errors import UsageError
 from knightcube.vision.camera.images import write_picture
 
-if TYPE_CHECKING:
-    from ground.lone_camera import LoneCamera
-
-_LOOK_NS = 5_000_000
+_POLL_NS = 5_000_000
 _PATIENCE_NS = 10_000_000_000
-_MOST_TURN = 0.5  # rad: beyond it streaks would leave any field
-_MOST_EXPOSURES = 8
-"""That may pass until a frame comes: a free-running camera takes the next whole one, once it has settled."""
+_MAX_ROTATION = 0.5
+"""Largest rotation in one exposure (rad), beyond which streaks leave any field of view."""
+_MAX_EXPOSURES = 8
+"""Exposure times to wait for a frame, because a free-running camera delivers the next complete one."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Take frames from the camera of a configuration, real or simulated, one trigger each. Print the "
-        "number of each, its delay after the end of the exposure, and its counts. --out writes the counts "
-        "as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened. A simulated "
-        "camera may turn: --rate makes streaks, and the truth of each picture is written beside it as JSON."
+        "Take frames from the camera of a configuration, real or simulated, one per trigger. Print the "
+        "number of each frame, its delay after the end of the exposure, and its counts. --out writes the "
+        "counts as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened. A "
+        "simulated camera can be rotated: --rate makes streaks, and the truth of each picture is written "
+        "beside it as JSON."
     )
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.description = textwrap.fill(parser.description, 100)
@@ -50,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "  python -m flight rate turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01\n"
     )
     parser.add_argument(
-        "--config", type=config_path, required=True, metavar="CONFIG", help="file, or a carried name"
+        "--config", type=config_path, required=True, metavar="CONFIG", help="file or installed name"
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="write the frame; several as name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
@@ -60,16 +64,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=finite,
         nargs=3,
         metavar=("X", "Y", "Z"),
-        help="turn a simulated camera, rad/s in its axes: boresight +z, x right, y down",
+        help="rotate a simulated camera, rad/s in its axes: boresight +z, x right, y down",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Take the frames; exit status 1 when the camera is frozen."""
-    from ground.lone_camera import opened_camera  # noqa: PLC0415 - no other command needs devices
-
+    """Take, print and write the frames; exit status 1 if the camera is frozen."""
     if options.count < 1:
         raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")
     if options.exposure is not None and not 0.0 < options.exposure <= 10.0:
@@ -80,9 +82,9 @@ def run(options: argparse.Namespace) -> int:
     rate = None if options.rate is None else np.array(options.rate)
     with opened_camera(options.config, rate) as lone:
         exposure = options.exposure or lone.section.exposure
-        if rate is not None and np.linalg.norm(rate) * exposure > _MOST_TURN:
+        if rate is not None and np.linalg.norm(rate) * exposure > _MAX_ROTATION:
             raise UsageError(
-                f"--rate: {np.linalg.norm(rate) * exposure:.3g} rad in the exposure: at most 0.5"
+                f"--rate: {np.linalg.norm(rate) * exposure:.3g} rad in the exposure: give at most 0.5 rad"
             )
         for frame in _frames(lone.clock, lone.frames, round(exposure * 1e9), options.count):
             facts.append(_facts(frame, lone.section))
@@ -91,6 +93,8 @@ def run(options: argparse.Namespace) -> int:
             if options.out is not None:
                 path = _keep(options.out, frame, options.count)
                 if rate is not None:
+                    from ground.samples import write_truth  # noqa: PLC0415 - loads the simulator
+
                     write_truth(path.with_suffix(".json"), _truth(frame, lone, rate))
     numbers = [fact["sequence"] for fact in facts]
     frozen = numbers != sorted(set(numbers))
@@ -102,14 +106,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _frames(clock: Clock, source: FrameSource, exposure_ns: int, count: int) -> Iterator[Frame]:
-    """Yield frames, each after a trigger of its own. Raises DeviceError."""
+    """Yield frames, each after its own trigger. Raises DeviceError."""
     for _ in range(count):
         source.trigger(exposure_ns)
-        deadline_ns = clock.now_ns() + _MOST_EXPOSURES * exposure_ns + _PATIENCE_NS
+        deadline_ns = clock.now_ns() + _MAX_EXPOSURES * exposure_ns + _PATIENCE_NS
         while (frame := source.poll()) is None:
             if clock.now_ns() > deadline_ns:
                 raise NotResponding("camera", "no frame came after the trigger")
-            clock.sleep_until_ns(clock.now_ns() + _LOOK_NS)
+            clock.sleep_until_ns(clock.now_ns() + _POLL_NS)
         yield frame
 
 
@@ -135,20 +139,54 @@ def _line(fact: dict[str, Any]) -> str:
     return (
         f"frame {fact['sequence']}: {fact['columns']} x {fact['rows']}, exposed {fact['exposure_s']:.4f} s, "
         f"{fact['latency_s'] * 1e3:.1f} ms after its end, age {fact['age_s']:.3f} s, "
-        f"counts {fact['minimum']} / {fact['median']:.0f} / {fact['maximum']} (least, median, most), "
+        f"counts {fact['minimum']} / {fact['median']:.0f} / {fact['maximum']} (minimum, median, maximum), "
         f"saturated {fact['saturated']:.2%}\n"
     )
 
 
 def _keep(out: Path, frame: Frame, count: int) -> Path:
-    """Write a frame; return where."""
+    """Write a frame and return its path."""
     path = out if count == 1 else out.with_name(f"{out.stem}-{frame.sequence}{out.suffix}")
     write_picture(path, frame.pixels)
     return path
 
 
-def _truth(frame: Frame, lone: LoneCamera, rate: FloatArray) -> dict[str, Any]:
-    assert lone.attitude is not None, "only a simulated camera turns"
+def _truth(frame: Frame, lone: OpenCamera, rate: FloatArray) -> dict[str, Any]:
+    from ground.samples import sky_truth  # noqa: PLC0415 - loads the simulator
+
+    assert lone.attitude is not None, "only a simulated camera rotates"
     middle_ns = frame.exposure_start_ns + frame.exposure_ns // 2
     focal_length = camera_model(lone.section).focal_length
     return sky_truth(rate, frame.exposure_ns * 1e-9, lone.attitude(middle_ns), focal_length)
+
+
+@dataclass(frozen=True, slots=True)
+class OpenCamera:
+    """An open camera, its clock and section, and the attitude (4,) by time, ns, of a simulated one."""
+
+    clock: Clock
+    frames: FrameSource
+    section: Camera
+    attitude: Callable[[int], FloatArray] | None = None
+
+
+@contextmanager
+def opened_camera(config_path: Path, rate: FloatArray | None = None) -> Iterator[OpenCamera]:
+    """Open only the camera of a configuration, simulated if it has a section `simulation`.
+
+    A simulated camera rotates at `rate` (3,), rad/s, in camera axes. Raises ConfigError without a camera in
+    the configuration, UsageError for a real camera with a rate, DeviceError.
+    """
+    text, config = requested_config(RunRequest(config_path, Path()))
+    if config.camera is None:
+        raise ConfigError(str(config_path), "`camera` is missing: give a configuration with a camera")
+    if config.simulation is not None:
+        turning = np.zeros(3) if rate is None else rate
+        posed = simulated_camera(config_path, text, config, turning)
+        yield OpenCamera(posed.clock, posed.frames, config.camera, posed.attitude)
+        return
+    if rate is not None:
+        raise UsageError("--rate: this configuration has a real camera, only a simulated one can be rotated")
+    with ExitStack() as stack:
+        clock = SystemClock()
+        yield OpenCamera(clock, linux_camera(config.camera, clock, stack), config.camera)

@@ -1,4 +1,4 @@
-"""`flight horizon`: the Earth's limb in a picture, and the way down from it."""
+"""`flight horizon`: the direction to nadir from the Earth's limb in a picture."""
 
 from __future__ import annotations
 
@@ -6,18 +6,38 @@ import argparse
 import json
 import math
 import sys
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
-from ground.commands import paper_horizon
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
-from ground.pictures.horizon import draw_horizon
-from knightcube.astro.arrays import Image
+from ground.commands.options import (
+    add_field,
+    add_output,
+    add_picture,
+    check_size,
+    finite,
+    positive,
+    read_picture,
+)
+from ground.pictures import draw_circle, draw_horizon
+from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
-from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.reference.horizon import (
+    LINES,
+    GraphicMethodError,
+    LevelCamera,
+    NoHorizonError,
+    ScannedHorizon,
+    circle_nadir,
+    graphic_nadir,
+    propagated_nadir,
+    scan_horizon,
+)
+from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
 from knightcube.vision.camera.lens import CameraModel, Pinhole
 from knightcube.vision.horizon.nadir import HorizonSolution, NadirMeasurement, find_nadir
 from knightcube.vision.horizon.settings import (
@@ -32,10 +52,10 @@ from knightcube.vision.horizon.settings import (
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Find the Earth's limb in a picture and the direction to the Earth's centre, in camera axes: z along "
-        "the boresight, x to the right, y down. PNG, TIFF, JPEG or FITS, colour too. Without --altitude the "
-        "altitude is fitted as well, within --altitudes. The Earth is taken as a sphere; the "
-        "uncertainty includes the error of that."
+        "Find the Earth's limb in a picture and the direction to the Earth's centre in camera axes: z along "
+        "the boresight, x to the right, y down. The picture is a PNG, TIFF, JPEG or FITS file, grey or "
+        "colour. Without --altitude the altitude is fitted too, within --altitudes. The Earth is modelled "
+        "as a sphere; the uncertainty includes the error of this model."
     )
     parser.epilog = (
         "example: python -m flight horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
@@ -43,7 +63,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_picture(parser)
     add_field(parser, required=True)
     height = parser.add_mutually_exclusive_group()
-    height.add_argument("--altitude", type=positive, metavar="KM", help="above the mean Earth")
+    height.add_argument(
+        "--altitude", type=positive, metavar="KM", help="altitude above the mean Earth radius"
+    )
     low, high = (1e-3 * bound for bound in HorizonSettings().altitudes)
     height.add_argument(
         "--altitudes",
@@ -51,36 +73,36 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs=2,
         metavar=("LEAST", "MOST"),
         default=(low, high),
-        help=f"km, between which an unknown altitude lies (default {low:g} {high:g})",
+        help=f"limits of an unknown altitude, km (default {low:g} {high:g})",
     )
     parser.add_argument(
         "--log-response",
         type=positive,
         nargs=2,
         metavar=("PEDESTAL", "COUNTS"),
-        help="of a logarithmic detector: dark counts, and counts per decade of light",
+        help="response of a logarithmic detector: dark counts, and counts per decade of light",
     )
-    paper_horizon.add_arguments(parser)
+    _add_paper_options(parser)
     add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Find the horizon, print, draw; exit status 1 when none is found."""
-    paper_horizon.check(options)
+    """Find the horizon, print and draw it; exit status 1 without a horizon."""
+    _check_method(options)
     pixels = read_picture(options)
     camera = _camera(options, pixels)
     altitude = None if options.altitude is None else 1e3 * options.altitude
     if altitude is not None and altitude < LEAST_ALTITUDE:
         least = f"{1e-3 * LEAST_ALTITUDE:g} km"
-        raise UsageError(f"--altitude {options.altitude:g}: the limb is seen as one from {least} up")
+        raise UsageError(f"--altitude {options.altitude:g}: the method needs at least {least}")
     if options.method != "default":
-        return paper_horizon.run_paper(options, pixels, camera)
+        return _run_paper(options, pixels, camera)
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
     least, most = (1e3 * bound for bound in options.altitudes)
     settings = HorizonSettings(edges=EdgeSettings(response=response), altitudes=(least, most))
     solution = find_nadir(pixels, camera, HorizonKnowledge(altitude=altitude), settings)
     if options.json:
-        sys.stdout.write(json.dumps(facts(solution, altitude is None), allow_nan=False) + "\n")
+        sys.stdout.write(json.dumps(_facts(solution, altitude is None), allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(solution, altitude is None))
     if options.overlay is not None:
@@ -105,8 +127,8 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
     return model
 
 
-def facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
-    """Return all that is known of a solution, for `--json`."""
+def _facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
+    """Return the values of a solution, for `--json`."""
     values: dict[str, Any] = {
         "status": solution.status.value,
         "reason": solution.reason or None,
@@ -144,13 +166,13 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
     for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
         values = _nadir_facts(nadir, altitude_fitted)
         x, y, z = nadir.direction
-        # Across and along the arc from the boresight to nadir the uncertainty differs.
+        # The uncertainty differs across and along the arc from the boresight to nadir.
         sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
             f"from boresight:   {values['from_boresight_deg']:.3f} deg, "
             f"towards {values['towards_deg']:.3f} deg from right to down",
-            f"1 sigma:          {sigmas[1]:.3f} deg at worst, {sigmas[0]:.3f} deg at best",
+            f"1 sigma:          {sigmas[1]:.3f} deg and {sigmas[0]:.3f} deg along the principal axes",
             f"limb:             {nadir.used} edges, residual {nadir.residual:.2f} px rms",
         ]
         if altitude_fitted:
@@ -158,3 +180,161 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
                 f"altitude:         {1e-3 * nadir.altitude:.0f} +- {1e-3 * nadir.altitude_sigma:.0f} km"
             )
     return "\n".join(lines) + "\n"
+
+
+METHODS = ("circle", "graphic", "vector")
+
+
+def _add_paper_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the methods of Meller et al."""
+    paper = parser.add_argument_group("methods of Meller et al.")
+    paper.add_argument(
+        "--method",
+        choices=("default", *METHODS),
+        default="default",
+        help="circle: a circle through the edges of one picture; graphic: the circles of two level cameras "
+        "(--second, --turned); vector: the nadir of an earlier picture (--second), rotated with the horizon",
+    )
+    paper.add_argument(
+        "--second",
+        type=Path,
+        metavar="IMAGE",
+        help="graphic: picture of the other camera; vector: the earlier picture",
+    )
+    paper.add_argument(
+        "--turned",
+        type=finite,
+        metavar="DEG",
+        help="graphic: angle of the second camera to the right of the first",
+    )
+    paper.add_argument(
+        "--nadir",
+        type=finite,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="vector: nadir of the earlier picture in camera axes (default from its circle)",
+    )
+    paper.add_argument(
+        "--lines", type=int, metavar="N", help=f"number of scanned lines, 3 to 512 (default {LINES})"
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PaperNadir:
+    """Nadir (3,) in camera axes, and the circle in the first picture."""
+
+    nadir: FloatArray
+    seen: ScannedHorizon
+
+
+def _check_method(options: argparse.Namespace) -> None:
+    """Raise UsageError for options that do not belong to the chosen method."""
+    for name, method in (("second", "graphic or vector"), ("turned", "graphic"), ("nadir", "vector")):
+        if getattr(options, name) is not None and options.method not in method.split(" or "):
+            raise UsageError(f"--{name}: only with --method {method}")
+    if options.method == "default":
+        if options.lines is not None:
+            raise UsageError(f"--lines: only with --method {', '.join(METHODS)}")
+        return
+    if options.lines is not None and not 3 <= options.lines <= 512:
+        raise UsageError(f"--lines {options.lines}: give 3 to 512")
+    if options.log_response is not None:
+        raise UsageError(f"--log-response: --method {options.method} uses the counts directly")
+    if options.method != "circle" and options.second is None:
+        raise UsageError(f"--method {options.method}: give the other picture with --second")
+    if options.method == "graphic" and options.turned is None:
+        raise UsageError("--method graphic: give the angle of the second camera to the right with --turned")
+    if options.altitude is None and (options.method != "vector" or options.nadir is None):
+        raise UsageError(f"--method {options.method}: it needs --altitude")
+    if options.nadir is not None and not np.linalg.norm(options.nadir) > 0.0:
+        raise UsageError("--nadir 0 0 0: give a direction")
+
+
+def _run_paper(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> int:
+    """Find nadir with a method of Meller et al., print and draw it; exit status 1 without a horizon."""
+    found, reason = None, ""
+    try:
+        found = _found(options, pixels, camera)
+    except (NoHorizonError, GraphicMethodError) as error:
+        reason = str(error)
+    if options.json:
+        sys.stdout.write(json.dumps(_paper_facts(options.method, found, reason), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_paper_text(options.method, found, reason))
+    if options.overlay is not None:
+        picture = grey_stretch(pixels)
+        drawn = picture if found is None else draw_circle(picture, found.seen, camera)
+        write_picture(options.overlay, drawn)
+        if not options.json:
+            sys.stdout.write(f"picture:          {options.overlay}\n")
+    return 0 if found is not None else 1
+
+
+def _found(options: argparse.Namespace, pixels: Image, camera: CameraModel) -> _PaperNadir:
+    lines = LINES if options.lines is None else options.lines
+    altitude = math.nan if options.altitude is None else 1e3 * options.altitude
+    seen = scan_horizon(pixels, camera, lines)
+    if options.method == "circle":
+        return _PaperNadir(circle_nadir(seen.circle, camera, altitude), seen)
+    other = read_image(options.second)
+    check_size(options.second, other)
+    if other.shape != pixels.shape:
+        raise UsageError(
+            f"{options.second}: {other.shape[1]} x {other.shape[0]} pixels, but {options.image} has"
+            f" {pixels.shape[1]} x {pixels.shape[0]}"
+        )
+    second = scan_horizon(other, camera, lines)
+    if options.method == "graphic":
+        return _PaperNadir(_graphic(options.turned, camera, seen, second, altitude), seen)
+    if options.nadir is None:
+        before = circle_nadir(second.circle, camera, altitude)
+    else:
+        before = np.array(options.nadir) / np.linalg.norm(options.nadir)
+    return _PaperNadir(propagated_nadir(before, second.middle, seen.middle), seen)
+
+
+def _graphic(
+    turned: float, camera: CameraModel, first: ScannedHorizon, second: ScannedHorizon, altitude: float
+) -> FloatArray:
+    """Return nadir (3,) in the axes of the first camera, whose boresight is body x and whose y is body z."""
+    angle, axis = math.radians(turned), camera.ideal.centre
+    cameras = (
+        LevelCamera(np.array([0.0, 1.0]), axis),
+        LevelCamera(np.array([-math.sin(angle), math.cos(angle)]), axis),
+    )
+    x, y, z = graphic_nadir(cameras, (first.circle, second.circle), altitude)
+    return np.array([y, z, x])
+
+
+def _paper_facts(method: str, found: _PaperNadir | None, reason: str) -> dict[str, Any]:
+    if found is None:
+        return {"status": "no-horizon", "reason": reason, "method": method}
+    x, y, z = found.nadir.tolist()
+    return {
+        "status": "found",
+        "reason": None,
+        "method": method,
+        "nadir_camera": [x, y, z],
+        "from_boresight_deg": math.degrees(math.acos(min(1.0, max(-1.0, z)))),
+        "towards_deg": math.degrees(math.atan2(y, x)),
+        "circle_centre_px": found.seen.circle.centre.tolist(),
+        "circle_radius_px": found.seen.circle.radius,
+        "limb_points_px": found.seen.points.tolist(),
+    }
+
+
+def _paper_text(method: str, found: _PaperNadir | None, reason: str) -> str:
+    if found is None:
+        return f"status:           no-horizon\nreason:           {reason}\n"
+    values, circle = _paper_facts(method, found, reason), found.seen.circle
+    x, y, z = found.nadir
+    return (
+        "status:           found\n"
+        f"edges:            {len(found.seen.points)} found\n"
+        f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}\n"
+        f"from boresight:   {values['from_boresight_deg']:.3f} deg, "
+        f"towards {values['towards_deg']:.3f} deg from right to down\n"
+        f"circle:           centre {circle.centre[0]:.1f}, {circle.centre[1]:.1f} px,"
+        f" radius {circle.radius:.1f} px\n"
+        f"1 sigma:          not available with the method {method}\n"
+    )

@@ -14,7 +14,7 @@ import numpy as np
 from flight.schema import reader as configuration
 from flight.schema.devices import Camera, camera_model, likelihood_settings
 from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
-from ground.pictures.overlay import draw_marks
+from ground.pictures import draw_marks
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.errors import UsageError
 from knightcube.reference.corner_streaks.rate import estimate_rate

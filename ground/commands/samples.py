@@ -1,36 +1,43 @@
-"""`flight samples`: pictures to try the other commands on, with their truth."""
+"""`flight samples`: pictures to try the other commands on; `flight index`: the sky index of a camera."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from flight.app.cli import PROGRAM
 from flight.app.cli.run import seed_number
-from ground.truth import write_truth
+from flight.schema import reader as configuration
+from flight.schema.devices import camera_model
+from ground.commands.options import add_field
 from knightcube.errors import UsageError
+from knightcube.vision.star_tracker import field_of_view
+from knightcube.vision.startracker.index.build import DEFAULT, IndexSettings, build
+from knightcube.vision.startracker.index.sky_index import save
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of this command to the parser."""
+def configure_samples(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight samples` to the parser."""
     parser.description = (
         "Render sample pictures: a field of stars, streaks with a satellite among them, the Earth's limb, "
-        "and a few night skies for a calibration. truth.json beside them holds what each shows; the "
+        "and a few night skies for a calibration. The file truth.json has the true values of each; the "
         "commands to try are printed."
     )
     parser.epilog = "example: python -m flight samples --out samples"
     parser.add_argument("--out", type=Path, default=Path("samples"), metavar="DIR", help="default: samples")
     parser.add_argument("--seed", type=seed_number, default=1, metavar="N", help="of the noise (default 1)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(command=run)
+    parser.set_defaults(command=run_samples)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Render, write, print the commands to try."""
-    from ground.samples import FIELD_DEG, write_samples  # noqa: PLC0415 - the simulator is slow to load
+def run_samples(options: argparse.Namespace) -> int:
+    """Render and write the pictures, and print the commands to try."""
+    from ground.samples import FIELD_DEG, write_samples, write_truth  # noqa: PLC0415 - slow to load
 
     out: Path = options.out
     try:
@@ -61,3 +68,53 @@ def _progress(name: str) -> None:
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[Krendering {name} ...")
         sys.stderr.flush()
+
+
+def configure_index(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight index` to the parser."""
+    parser.description = (
+        "Make the sky index of one camera: triangles that fit into its field of view, of stars down to its "
+        "faintest, with merged pairs that its pixels do not resolve. The configuration's "
+        "camera.star_tracker.index, or --index of `flight solve`, names the file."
+    )
+    parser.epilog = "example: python -m flight index --camera flight.yaml --faintest 6.5 --out mission.index"
+    add_field(parser, required=True)
+    parser.add_argument(
+        "--faintest",
+        type=float,
+        default=DEFAULT.faintest,
+        metavar="V",
+        help="magnitude of the faintest star that the camera detects (default %(default)s)",
+    )
+    parser.add_argument(
+        "--epoch", type=float, default=DEFAULT.epoch, metavar="YEAR", help="Julian year (default %(default)s)"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="file of the index")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=run_index)
+
+
+def run_index(options: argparse.Namespace) -> int:
+    """Build and write the index."""
+    if not all(math.isfinite(value) for value in (options.faintest, options.epoch)):
+        raise UsageError("--faintest and --epoch: give finite numbers")
+    sky = build(replace(_settings(options), faintest=options.faintest, epoch=options.epoch))
+    try:
+        save(sky, options.out)
+    except OSError as error:
+        raise UsageError(f"--out {options.out}: cannot be written: {error.strerror or error}") from error
+    stars, triangles = len(sky.stars), len(sky.triangles)
+    if options.json:
+        sys.stdout.write(
+            json.dumps({"index": str(options.out), "stars": stars, "triangles": triangles}) + "\n"
+        )
+    else:
+        sys.stdout.write(f"{options.out}: {stars} stars, {triangles} triangles\n")
+    return 0
+
+
+def _settings(options: argparse.Namespace) -> IndexSettings:
+    if options.camera is None:
+        return IndexSettings.of_field(math.radians(options.fov))
+    camera = camera_model(configuration.load_camera(options.camera))
+    return IndexSettings.of_field(field_of_view(camera), 1.0 / camera.focal_length)

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ import numpy as np
 
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model, likelihood_settings
-from ground.commands.date import date
 from ground.commands.options import (
     add_field,
     add_output,
@@ -25,10 +25,8 @@ from ground.commands.options import (
     read_picture,
     write_new,
 )
-from ground.pictures.sky_picture import draw_solution
-from ground.sky.bodies import bodies_in
-from ground.sky.facts import sky_facts, sky_text
-from ground.sky.world_coordinates import header_text
+from ground.pictures import draw_solution
+from ground.sky import bodies_in, header_text, sky_facts, sky_text
 from knightcube.astro.arrays import Image
 from knightcube.astro.attitude.solvers import SOLVERS
 from knightcube.astro.catalogue import PROPER_NAMES
@@ -72,7 +70,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--date",
-        type=date,
+        type=_date,
         metavar="UTC",
         help="when, such as 2026-11-21: proper motion, aberration, planets",
     )
@@ -105,6 +103,15 @@ def _add_methods(parser: argparse.ArgumentParser) -> None:
         help="of points: psf fits the point spread (default), window is the centre of mass, the others weigh "
         "its pixels otherwise",
     )
+
+
+def _date(text: str) -> datetime:
+    """Return the time of an argument, UTC if it has no time zone. Raises ArgumentTypeError."""
+    try:
+        instant = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a date such as 2026-11-21T20:15:00") from error
+    return instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant
 
 
 def run(options: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
-from ground.export.tracking_data import write_tracking_data
+from ground.messages import write_tracking_data
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity

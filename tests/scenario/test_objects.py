@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ground.export.tracking_data import write_tracking_data
+from ground.messages import write_tracking_data
 from ground.report.orbit import objects
 from ground.report.orbit_figures import objects_figure
 from ground.report.panels import RunSignals

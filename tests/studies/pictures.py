@@ -19,8 +19,7 @@ from flight.bodies.testbed.control import plant_of
 from flight.schema import reader as configuration
 from flight.schema.devices import camera_model
 from flight.schema.testbed import as_testbed
-from ground.pictures.horizon import draw_horizon
-from ground.pictures.sky_picture import draw_solution
+from ground.pictures import draw_horizon, draw_solution
 from ground.report import draw, draw_path
 from ground.telemetry import read_run
 from knightcube.astro import catalogue

@@ -125,7 +125,7 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
     words = ("--fov", "67", "--altitude", "600", "--method", "circle")
     done = command("horizon", pictures[0] / "first.png", *words, "--overlay", drawn)
     assert done.returncode == 0, done.stderr
-    assert "1 sigma:          the method circle gives none" in done.stdout
+    assert "1 sigma:          not available with the method circle" in done.stdout
     image = np.asarray(pillow.open(drawn)).astype(int)
     assert np.count_nonzero(np.all(np.abs(image - [230, 159, 0]) < 2, axis=2)) > 400
     dark = command("horizon", folder / "sky.png", *words, "--json")
@@ -138,7 +138,7 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
     [
         (["--fov", "170"], "1 to 150 degrees"),
         (["--fov", "67", "--altitude", "-3"], "not a positive number"),
-        (["--fov", "67", "--altitude", "5"], "--altitude 5: the limb is seen as one from 50 km up"),
+        (["--fov", "67", "--altitude", "5"], "--altitude 5: the method needs at least 50 km"),
         (["--fov", "67", "--altitudes", "900", "300"], "altitudes of 900 to 300 km"),
         (["--fov", "67", "--altitude", "600", "--altitudes", "300", "900"], "not allowed with"),
         ([], "--fov --camera"),
@@ -148,14 +148,14 @@ def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
         (["--fov", "67", "--method", "vector", "--altitude", "600"], "give the other picture with --second"),
         (
             ["--fov", "67", "--method", "graphic", "--altitude", "600", "--second", "limb.png"],
-            "say with --turned how far to the right",
+            "to the right with --turned",
         ),
         (["--fov", "67", "--turned", "60"], "--turned: only with --method graphic"),
         (["--fov", "67", "--lines", "9"], "--lines: only with --method circle, graphic, vector"),
         (["--fov", "67", "--method", "circle", "--altitude", "600", "--lines", "2"], "--lines 2: give 3 to"),
         (
             ["--fov", "67", "--method", "circle", "--altitude", "600", "--log-response", "8", "41"],
-            "works on the counts themselves",
+            "uses the counts directly",
         ),
     ],
 )

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from flight.link.telemetry.packets import LAYOUTS
-from ground.commands import orbit as command
-from ground.orbits.from_run import orbits_of
+from ground.commands import runs as command
+from ground.messages import orbits_of
 from knightcube.errors import UsageError
 from tests.support import short_arcs as passes
 
@@ -54,8 +54,8 @@ def tracked(seconds: float) -> tuple[Tracked, np.ndarray]:
 def spoken(run: Tracked, words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(command, "read_run", lambda _: run)
     parser = argparse.ArgumentParser()
-    command.configure(parser)
-    return command.run(parser.parse_args(["runs/tracked", *words]))
+    command.configure_orbit(parser)
+    return command.run_orbit(parser.parse_args(["runs/tracked", *words]))
 
 
 def test_the_orbit_is_the_true_one_in_each_form(
@@ -97,7 +97,7 @@ def test_what_lacks_is_said() -> None:
     run["track"]["place"] = np.nan
     (found,) = orbits_of(run)  # type: ignore[arg-type]
     assert found.orbit is None
-    assert found.reason.startswith("0 sightings with the craft's own place")
+    assert found.reason.startswith("0 sightings with the satellite's position")
     empty = Tracked(track=run["track"][:0], run=run["run"])
     with pytest.raises(UsageError, match="no object was tracked"):
         orbits_of(empty)  # type: ignore[arg-type]

@@ -105,7 +105,7 @@ def test_frames_of_a_turning_camera_have_their_truth_beside_them(config: Path, t
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["--rate", "3", "0", "0"], "--rate: 3 rad in the exposure: at most 0.5"),
+        (["--rate", "3", "0", "0"], "--rate: 3 rad in the exposure: give at most 0.5"),
         (["--rate", "nan", "0", "0"], "nan is not a finite number"),
         (["--rate", "1", "0"], "expected 3 arguments"),
     ],

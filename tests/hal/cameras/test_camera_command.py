@@ -36,7 +36,7 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
     clock = ManualClock()
     kernel = kernel_in(tmp_path, clock, monkeypatch)
     kernel.sizes = {"GREY": (64, 64), "Y10": (64, 64)}
-    monkeypatch.setattr("ground.lone_camera.SystemClock", lambda: clock)
+    monkeypatch.setattr("ground.commands.camera.SystemClock", lambda: clock)
     return kernel
 
 
@@ -97,7 +97,7 @@ def test_frames_of_a_simulated_camera_are_taken_alike(
         (["--count", "0"], "--count 0"),
         (["--exposure", "nan"], "--exposure nan: give seconds"),
         (["--out", "frame.fits"], "ends in .png"),
-        ([], "`camera` is none"),
+        ([], "`camera` is missing"),
     ],
 )
 def test_a_mistake_is_one_line_and_status_2(

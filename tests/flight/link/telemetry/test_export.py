@@ -71,7 +71,7 @@ def test_texts_with_commas_quotes_and_accents_survive(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="no csv can be written there"):
+    with pytest.raises(UsageError, match="csv cannot be written"):
         export(run, tmp_path / "file")
 
 
@@ -146,11 +146,11 @@ def test_without_pyarrow_the_cure_is_reported(tmp_path: Path, monkeypatch: pytes
 def test_no_format_is_written_where_nothing_can_be(tmp_path: Path, form: str) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match=f"no {form} can be written there"):
+    with pytest.raises(UsageError, match=f"{form} cannot be written"):
         export(run, tmp_path / "file" / "x", form)
     (tmp_path / "folder.sqlite").mkdir()
     if form == "sqlite":
-        with pytest.raises(UsageError, match="no sqlite can be written there"):
+        with pytest.raises(UsageError, match="sqlite cannot be written"):
             export(run, tmp_path / "folder.sqlite", form)
 
 

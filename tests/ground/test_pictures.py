@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import binary_dilation
 
-from ground.pictures.overlay import draw_marks
-from ground.pictures.sky_picture import draw_solution
+from ground.pictures import draw_marks, draw_solution
 from knightcube.vision.frame_job import solve_frame
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings

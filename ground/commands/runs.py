@@ -1,0 +1,191 @@
+"""Commands that evaluate a run: `flight report`, `flight export` and `flight orbit`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from flight.link.telemetry.log import find_runs
+from ground import report as reporting
+from ground.export import FORMATS, export
+from ground.messages import ObjectOrbit, orbits_of, write_orbit_messages, write_tracking_data
+from ground.report.comparison import compare, format_archive, format_comparison, summarise_archive
+from ground.telemetry import read_run
+from knightcube.errors import UsageError
+
+
+def configure_report(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight report` to the parser."""
+    parser.description = (
+        "Print the performance of a run and the limits of the thesis (Table 5.3), and draw its figures. The "
+        "run is judged on the truth of the simulation if it has one, otherwise on the estimate. With a "
+        "second run the two are compared: configuration, figures and events, with the differences; "
+        "--figures draws both."
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or of an archive of runs")
+    parser.add_argument("other", type=Path, nargs="?", metavar="OTHER", help="a second run for a comparison")
+    parser.add_argument("--json", action="store_true", help="print one JSON object, and draw nothing")
+    parser.add_argument(
+        "--figures", type=Path, metavar="DIR", help="folder of the figures (default RUN/figures)"
+    )
+    parser.add_argument("--no-figures", action="store_true", help="draw nothing")
+    parser.set_defaults(command=run_report)
+
+
+def run_report(options: argparse.Namespace) -> int:
+    """Print the report and draw the figures."""
+    if options.other is not None:
+        return _compare(options)
+    if find_runs(options.run):
+        archive = summarise_archive(options.run)
+        text = json.dumps(archive, allow_nan=False) + "\n" if options.json else format_archive(archive)
+        sys.stdout.write(text)
+        return 0
+    run = read_run(options.run)
+    summary = reporting.summarise(run)
+    if options.json:
+        sys.stdout.write(json.dumps(summary, allow_nan=False) + "\n")
+        if options.figures is None:
+            return 0
+    else:
+        sys.stdout.write(reporting.format_report(summary))
+    if options.no_figures:
+        return 0
+    try:
+        paths = reporting.draw(run, options.figures or options.run / "figures")
+    except UsageError as error:
+        # The numbers have been printed: missing figures are not a failure of the report.
+        sys.stderr.write(f"flight: {error}\n")
+        return 0 if options.figures is None else 2
+    if not options.json:
+        sys.stdout.write("\npictures:\n" + "".join(f"  {path}\n" for path in paths))
+    return 0
+
+
+def _compare(options: argparse.Namespace) -> int:
+    """Print two runs side by side, and draw them if a folder is given."""
+    runs = [read_run(folder) for folder in (options.run, options.other)]
+    compared = compare(*(reporting.summarise(run) for run in runs))
+    text = json.dumps(compared, allow_nan=False) + "\n" if options.json else format_comparison(compared)
+    sys.stdout.write(text)
+    if options.figures is not None and not options.no_figures:
+        path = reporting.draw_both(runs[0], runs[1], options.figures)
+        if not options.json:
+            sys.stdout.write(f"\npicture:\n  {path}\n")
+    return 0
+
+
+def configure_export(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight export` to the parser."""
+    parser.description = (
+        "Write one CSV or Parquet file (extra `parquet`) per packet type, or one SQLite file with a table "
+        "per packet type; fields and units are in docs/telemetry.md."
+    )
+    parser.epilog = "example: python -m flight export runs/demo --format sqlite"
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("--format", choices=FORMATS, default="csv", help="default: csv")
+    places = ", ".join(f"RUN/{place}" for place in FORMATS.values())
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="PLACE",
+        help=f"folder of the files, or the SQLite file (default {places})",
+    )
+    parser.add_argument(
+        "--tdm",
+        type=Path,
+        metavar="FILE",
+        help="write only the tracks of objects, as a CCSDS Tracking Data Message",
+    )
+    parser.add_argument("--json", action="store_true", help="print the files as one JSON object")
+    parser.set_defaults(command=run_export)
+
+
+def run_export(options: argparse.Namespace) -> int:
+    """Write the files and print their paths."""
+    if options.tdm is not None:
+        paths = write_tracking_data(read_run(options.run), options.tdm)
+    else:
+        place = options.out or options.run / FORMATS[options.format]
+        paths = export(read_run(options.run), place, options.format)
+    if options.json:
+        sys.stdout.write(json.dumps({"files": [str(path) for path in paths]}) + "\n")
+    else:
+        sys.stdout.write("".join(f"{path}\n" for path in paths))
+    return 0
+
+
+_POSITION, _VELOCITY = slice(0, 3), slice(3, 6)
+
+
+def configure_orbit(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flight orbit` to the parser."""
+    parser.description = (
+        "Determine a first orbit of each object that a flight tracked, from directions alone, with its "
+        "covariance; if the arc is too short, print why. Exit status 0 if every object has an orbit, 1 if "
+        "one has none."
+    )
+    parser.epilog = "example: python -m flight orbit runs/object --opm orbits"
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument(
+        "--opm", type=Path, metavar="FOLDER", help="write each orbit as a CCSDS Orbit Parameter Message"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=run_orbit)
+
+
+def run_orbit(options: argparse.Namespace) -> int:
+    """Determine the orbits, print and write them."""
+    found = orbits_of(read_run(options.run))
+    paths = [] if options.opm is None else write_orbit_messages(found, options.opm)
+    if options.json:
+        facts = {"objects": [_orbit_facts(item) for item in found], "files": [str(path) for path in paths]}
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write("".join(map(_orbit_text, found)) + "".join(f"{path}\n" for path in paths))
+    return 0 if all(item.orbit is not None for item in found) else 1
+
+
+def _orbit_facts(item: ObjectOrbit) -> dict[str, object]:
+    facts: dict[str, object] = {"object": item.number, "sightings": item.sightings, "span_s": item.span}
+    orbit = item.orbit
+    if orbit is None:
+        return facts | {"orbit": None, "reason": item.reason}
+    return facts | {
+        "orbit": {
+            "utc": item.date.isoformat(),
+            "position_m": orbit.state[:3].tolist(),
+            "velocity_m_s": orbit.state[3:].tolist(),
+            "covariance": orbit.covariance.tolist(),
+            "distance_m": orbit.distance,
+            "distance_95_m": list(orbit.interval),
+            "lasts": orbit.lasts,
+            "chi_square": orbit.chi_square,
+            "degrees": orbit.degrees,
+        }
+    }
+
+
+def _orbit_text(item: ObjectOrbit) -> str:
+    head = f"object {item.number}: {item.sightings} sightings in {item.span:.0f} s\n"
+    orbit = item.orbit
+    if orbit is None:
+        return f"{head}  no orbit: {item.reason}\n"
+    low, high = (1e-3 * end for end in orbit.interval)
+    x, y, z = 1e-3 * orbit.state[:3]
+    u, v, w = 1e-3 * orbit.state[3:]
+    place, speed = (float(np.sqrt(np.trace(orbit.covariance[part, part]))) for part in (_POSITION, _VELOCITY))
+    lasting = "" if orbit.lasts else "  this orbit meets the ground; within its errors it may not\n"
+    return (
+        f"{head}"
+        f"  at {item.date:%Y-%m-%dT%H:%M:%S.%f} UTC, ICRS\n"
+        f"  position  {x:12.3f} {y:12.3f} {z:12.3f} km   +- {1e-3 * place:.3g} km\n"
+        f"  velocity  {u:12.6f} {v:12.6f} {w:12.6f} km/s +- {1e-3 * speed:.3g} km/s\n"
+        f"  distance  {1e-3 * orbit.distance:.1f} km, {low:.1f} to {high:.1f} with 95 %\n"
+        f"{lasting}"
+        f"  chi-square {orbit.chi_square:.0f} with {orbit.degrees} degrees of freedom\n"
+    )

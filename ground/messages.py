@@ -1,0 +1,239 @@
+"""Tracked objects as CCSDS messages.
+
+Tracking Data Messages (503.0-B-2) and Orbit Parameter Messages (502.0-B-3) are in keyword = value notation.
+First orbits are determined from the sightings and from the satellite's own positions in the `track` packets.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from flight.link.telemetry.packets import PacketArray
+from ground.telemetry import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import terrestrial_time
+from knightcube.astro.earth.sun import DAY, earth_velocity
+from knightcube.errors import UsageError
+from knightcube.gnc.first_orbit import (
+    MINIMUM_SIGHTINGS,
+    ArcError,
+    Bearings,
+    FirstOrbit,
+    first_orbit,
+    smoothed,
+)
+
+_ARCSECONDS = math.degrees(3600.0)
+ORIGINATOR = "KNIGHTCUBE"
+_NO_OBJECT = "no object was tracked; `camera: {objects: {}}` in the configuration enables the tracking"
+_SECOND_NS = 1_000_000_000
+
+
+def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> list[Path]:
+    """Write the measured tracks of a run to `path` and return it in a list.
+
+    There is one segment per object, with right ascension and declination measured in each frame, in ICRS at
+    mid-exposure. The camera's aberration is removed, the light time is not. Standard deviations are in
+    comments, because the message has no keyword for them. MAG is the mean of the last sightings. `now` is the
+    date of the message. Raises UsageError if no object was tracked or `path` cannot be written.
+    """
+    tracks = run["track"]
+    measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
+    if not len(measured) or not len(run["run"]):
+        raise UsageError(
+            f"{run.folder}: no object was tracked; `camera: {{objects: {{}}}}` enables the tracking"
+        )
+    start_ns = int(run["run"]["utc_ns"][-1])
+    lines = [
+        "CCSDS_TDM_VERS = 2.0",
+        f"CREATION_DATE = {ccsds_date(round((now or datetime.now(UTC)).timestamp() * 1e9))}",
+        f"ORIGINATOR = {ORIGINATOR}",
+    ]
+    for number in sorted(set(measured["number"].tolist())):
+        lines += _segment(number, measured[measured["number"] == number], start_ns)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    except OSError as error:
+        raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
+    return [path]
+
+
+def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
+    """Return the lines of one object's segment."""
+    dates = [ccsds_date(start_ns + int(time)) for time in track["middle_ns"]]
+    sigma = track["measured_sigma"] * _ARCSECONDS
+    lines = [
+        "",
+        "META_START",
+        f"COMMENT Standard deviation of each angle on the sky {np.median(sigma):.2f} arcsec in the median,",
+        f"COMMENT {sigma.min():.2f} to {sigma.max():.2f} arcsec, the attitude's included.",
+        *_of_magnitudes(track["magnitude_sigma"]),
+        "COMMENT Stellar aberration of the camera removed, light time not.",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {dates[0]}",
+        f"STOP_TIME = {dates[-1]}",
+        f"PARTICIPANT_1 = {ORIGINATOR}",
+        f"PARTICIPANT_2 = OBJECT-{number}",
+        "MODE = SEQUENTIAL",
+        "PATH = 2,1",
+        "TIMETAG_REF = RECEIVE",
+        "ANGLE_TYPE = RADEC",
+        "REFERENCE_FRAME = ICRF",
+        "META_STOP",
+        "",
+        "DATA_START",
+    ]
+    for date, (x, y, z), magnitude in zip(dates, track["measured"], track["magnitude"], strict=True):
+        right_ascension = math.degrees(math.atan2(y, x)) % 360.0
+        declination = math.degrees(math.atan2(z, math.hypot(x, y)))
+        lines += [f"ANGLE_1 = {date} {right_ascension:.8f}", f"ANGLE_2 = {date} {declination:.8f}"]
+        if math.isfinite(magnitude):
+            lines.append(f"MAG = {date} {magnitude:.3f}")
+    return [*lines, "DATA_STOP"]
+
+
+def _of_magnitudes(sigma: FloatArray) -> list[str]:
+    """Return the comment on the standard deviations (n,) of MAG, or no line if none is known."""
+    known = sigma[np.isfinite(sigma)]
+    if not len(known):
+        return []
+    return [
+        f"COMMENT Standard deviation of MAG {np.median(known):.3f} in the median, {known.max():.3f} at most:",
+        "COMMENT the scatter of the sightings; what colours of the stars shift all by is not in it.",
+    ]
+
+
+def ccsds_date(utc_ns: int) -> str:
+    """Return a time in ns since 1970 in CCSDS format, with microseconds."""
+    seconds, rest = divmod(utc_ns, _SECOND_NS)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}"
+
+
+_UNIX_EPOCH = 2_440_587.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectOrbit:
+    """First orbit of a tracked object.
+
+    Attributes:
+        number: number of the object in the flight.
+        sightings: number of sightings.
+        span: time between the first and the last sighting, s.
+        utc_ns: epoch of the orbit, ns since 1970; None without an orbit.
+        orbit: the orbit, or None if the sightings do not determine one.
+        reason: reason why there is no orbit; empty with one.
+    """
+
+    number: int
+    sightings: int
+    span: float
+    utc_ns: int | None
+    orbit: FirstOrbit | None
+    reason: str
+
+    @property
+    def date(self) -> datetime:
+        """Epoch of the orbit."""
+        assert self.utc_ns is not None
+        return datetime.fromtimestamp(self.utc_ns * 1e-9, UTC)
+
+
+def orbits_of(run: Run) -> list[ObjectOrbit]:
+    """Return the orbit of each tracked object. Raises UsageError for a run without objects."""
+    tracks, labels = run["track"], run["run"]
+    if not len(tracks) or not len(labels):
+        raise UsageError(
+            f"{run.folder}: no object was tracked; `camera: {{objects: {{}}}}` enables the tracking"
+        )
+    start_ns = int(labels["utc_ns"][-1])
+    return [_orbit(number, tracks, start_ns) for number in sorted(set(tracks["number"].tolist()))]
+
+
+def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
+    track = tracks[tracks["number"] == number]
+    seen = track[np.isfinite(track["measured"]).all(axis=1)]
+    times = seen["middle_ns"] * 1e-9
+    span = float(times[-1] - times[0]) if len(times) else 0.0
+    found = ObjectOrbit(number, len(seen), span, None, None, "")
+    placed = seen[np.isfinite(seen["place"]).all(axis=1)]
+    if len(placed) < MINIMUM_SIGHTINGS:
+        reason = (
+            f"{len(placed)} sightings with the satellite's position: {MINIMUM_SIGHTINGS} or more are needed"
+        )
+        return replace(found, reason=reason)
+    times = placed["middle_ns"] * 1e-9
+    middle = len(times) // 2
+    measured = np.hstack([placed["place"], placed["velocity"]])
+    observer, own = smoothed(times, measured, placed["place_sigma"], middle)
+    utc_ns = start_ns + int(placed["middle_ns"][middle])
+    date = float(terrestrial_time(_UNIX_EPOCH + utc_ns * 1e-9 / DAY))
+    bearings = Bearings(times, placed["measured"], placed["measured_sigma"], observer, earth_velocity(date))
+    try:
+        orbit = first_orbit(bearings)
+    except ArcError as error:
+        return replace(found, reason=str(error))
+    # An error of the satellite's own orbit shifts the object's orbit by the same amount.
+    return replace(found, utc_ns=utc_ns, orbit=replace(orbit, covariance=orbit.covariance + own))
+
+
+_AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+
+
+def write_orbit_messages(found: list[ObjectOrbit], folder: Path, now: datetime | None = None) -> list[Path]:
+    """Write one message per orbit into a folder and return the files.
+
+    `now` is the date of the messages. Raises UsageError if the folder cannot be written.
+    """
+    paths = []
+    for item in found:
+        if item.orbit is None:
+            continue
+        path = folder / f"object-{item.number}.opm"
+        lines = _message(item, now or datetime.now(UTC))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            path.write_text("\n".join(lines) + "\n", encoding="ascii")
+        except OSError as error:
+            raise UsageError(f"{path}: the message cannot be written: {error.strerror or error}") from error
+        paths.append(path)
+    return paths
+
+
+def _message(item: ObjectOrbit, now: datetime) -> list[str]:
+    orbit = item.orbit
+    assert orbit is not None
+    assert item.utc_ns is not None
+    low, high = (1e-3 * end for end in orbit.interval)
+    units = ["km"] * 3 + ["km/s"] * 3
+    state = [
+        f"{axis} = {1e-3 * value:.9f} [{unit}]"
+        for axis, value, unit in zip(_AXES, orbit.state, units, strict=True)
+    ]
+    covariance = []
+    for row, first in enumerate(_AXES):
+        for column, second in enumerate(_AXES[: row + 1]):
+            unit = ("km**2", "km**2/s", "km**2/s**2")[(row > 2) + (column > 2)]
+            covariance.append(f"C{first}_{second} = {1e-6 * orbit.covariance[row, column]:.9e} [{unit}]")
+    return [
+        "CCSDS_OPM_VERS = 3.0",
+        f"COMMENT First orbit by angles only: {item.sightings} sightings in {item.span:.0f} s.",
+        f"COMMENT Distance {1e-3 * orbit.distance:.1f} km at the epoch, {low:.1f} to {high:.1f} km by 95 %.",
+        f"CREATION_DATE = {ccsds_date(round(now.timestamp() * 1e9))}",
+        f"ORIGINATOR = {ORIGINATOR}",
+        f"OBJECT_NAME = OBJECT-{item.number}",
+        "OBJECT_ID = UNKNOWN",
+        "CENTER_NAME = EARTH",
+        "REF_FRAME = ICRF",
+        "TIME_SYSTEM = UTC",
+        f"EPOCH = {ccsds_date(item.utc_ns)}",
+        *state,
+        "COV_REF_FRAME = ICRF",
+        *covariance,
+    ]

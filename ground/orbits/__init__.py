@@ -1,1 +1,0 @@
-"""First orbits of the objects that a flight tracked."""

@@ -1,1 +1,0 @@
-"""Drawings upon pictures of the sky and of the horizon."""

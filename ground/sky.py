@@ -1,0 +1,207 @@
+"""Contents of a solved picture: coordinates of its centre and axis, Sun, Moon and planets, and a FITS header.
+
+The positions of the bodies are those seen from the Earth's centre, by the series of ERFA: plan94 (Simon et
+al.
+1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98 (Meeus 1998: 10") and epv00 for the
+Earth. They need no file of ephemerides. An observer on the ground sees the Moon up to 1 deg elsewhere.
+
+The FITS header has a tangent plane with polynomials for the distortion (TAN-SIP; Calabretta & Greisen 2002,
+section 5.1.3; Shupe et al. 2005). FITS counts pixels from 1, and rows in the order of the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import erfa
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
+from knightcube.vision.startracker.sky_map import SkyMap
+
+_ORDER = 5
+"""Order of the polynomials, odd because a radial distortion has no even terms."""
+_GRID = 25
+"""Points per axis at which the distortion is fitted."""
+_CARD, _BLOCK = 80, 2880
+
+Card = tuple[str, str | int | float | bool]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TangentPlane:
+    """Tangent plane at a direction of the sky (3,), with east and north (3,)."""
+
+    middle: FloatArray
+    east: FloatArray
+    north: FloatArray
+
+    @classmethod
+    def at(cls, middle: FloatArray) -> _TangentPlane:
+        east = np.array([-middle[1], middle[0], 0.0])
+        east /= np.linalg.norm(east)
+        return cls(middle, east, np.cross(middle, east))
+
+    def degrees(self, directions: FloatArray) -> FloatArray:
+        """Return xi, eta (n, 2) of directions (n, 3)."""
+        along = directions @ self.middle
+        return np.degrees(directions @ np.stack([self.east, self.north], axis=1) / along[:, None])
+
+
+def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
+    """Return the values of the FITS header by key: A and B from pixels to the sky, AP and BP inverse."""
+    camera = sky.camera
+    centre = np.array(camera.centre)
+    middle = sky.directions(centre[None])[0]
+    plane = _TangentPlane.at(middle)
+    step = np.array([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]])
+    right, left, down, up = plane.degrees(sky.directions(centre + step))
+    cd = np.stack([right - left, down - up], axis=1)
+    x, y = np.meshgrid(np.linspace(0, camera.columns - 1, _GRID), np.linspace(0, camera.rows - 1, _GRID))
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    directions = sky.directions(points)
+    seen = np.isfinite(directions).all(axis=1) & (directions @ middle > 0.0)
+    off = points[seen] - centre
+    straight = plane.degrees(directions[seen]) @ np.linalg.inv(cd).T
+    header: dict[str, str | int | float | bool] = {
+        "WCSAXES": 2,
+        "CTYPE1": "RA---TAN-SIP",
+        "CTYPE2": "DEC--TAN-SIP",
+        "CUNIT1": "deg",
+        "CUNIT2": "deg",
+        "RADESYS": "ICRS",
+        "CRVAL1": float(np.degrees(np.arctan2(middle[1], middle[0])) % 360.0),
+        "CRVAL2": float(np.degrees(np.arcsin(np.clip(middle[2], -1.0, 1.0)))),
+        "CRPIX1": float(centre[0] + 1.0),
+        "CRPIX2": float(centre[1] + 1.0),
+        "CD1_1": float(cd[0, 0]),
+        "CD1_2": float(cd[0, 1]),
+        "CD2_1": float(cd[1, 0]),
+        "CD2_2": float(cd[1, 1]),
+        "IMAGEW": camera.columns,
+        "IMAGEH": camera.rows,
+    }
+    header |= _polynomials(("A", "B"), off, straight - off, least=2)
+    return header | _polynomials(("AP", "BP"), straight, off - straight, least=1)
+
+
+def _polynomials(
+    names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
+) -> dict[str, str | int | float | bool]:
+    """Return the coefficients of `shift` (n, 2) as polynomials of `places` (n, 2), px, from order `least`."""
+    powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i) if least <= i + j]
+    size = float(np.abs(places).max())
+    x, y = (places / size).T
+    terms = np.stack([x**i * y**j for i, j in powers], axis=1)
+    found: dict[str, str | int | float | bool] = {}
+    for name, values in zip(names, np.linalg.lstsq(terms, shift, rcond=None)[0].T, strict=True):
+        found[f"{name}_ORDER"] = _ORDER
+        for (i, j), value in zip(powers, values, strict=True):
+            found[f"{name}_{i}_{j}"] = float(value / size ** (i + j))
+    return found
+
+
+def header_text(sky: SkyMap) -> str:
+    """Return the text of a FITS file that consists of a header only."""
+    cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *world_coordinates(sky).items()]
+    text = "".join(_card(key, value) for key, value in cards) + "END".ljust(_CARD)
+    return text.ljust(-(-len(text) // _BLOCK) * _BLOCK)
+
+
+def _card(key: str, value: str | int | float | bool) -> str:
+    if isinstance(value, bool):
+        shown = f"{'T' if value else 'F':>20s}"
+    elif isinstance(value, str):
+        shown = f"'{value:8s}'"
+    else:
+        shown = f"{value:>20d}" if isinstance(value, int) else f"{value:>20.13E}"
+    return f"{key:8s}= {shown}".ljust(_CARD)
+
+
+PLANETS = {"Mercury": 1, "Venus": 2, "Mars": 4, "Jupiter": 5, "Saturn": 6, "Uranus": 7, "Neptune": 8}
+_LIGHT_DAY_PER_UNIT = ASTRONOMICAL_UNIT / 299_792_458.0 / DAY
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SkyBody:
+    """A body in a picture: its direction (3,), ICRS without aberration, and its position (2,), px."""
+
+    name: str
+    direction: FloatArray
+    point: FloatArray
+
+
+def bodies_in(sky: SkyMap, julian_date: float) -> list[SkyBody]:
+    """Return the bodies in a picture at a Julian date TT."""
+    names, directions = zip(*directions_of_bodies(julian_date).items(), strict=True)
+    places = sky.pixels(np.array(directions))
+    inside = np.isfinite(places).all(axis=1) & sky.camera.contains(places)
+    return [SkyBody(names[k], directions[k], places[k]) for k in np.flatnonzero(inside)]
+
+
+def directions_of_bodies(julian_date: float) -> dict[str, FloatArray]:
+    """Return the unit vectors (3,), ICRS, from the Earth's centre to each body, corrected for light time."""
+    earth = earth_from_sun(julian_date)[0] / ASTRONOMICAL_UNIT
+    found = {
+        "Sun": -earth,
+        "Moon": np.asarray(erfa.moon98(julian_date, 0.0)["p"], dtype=float),
+    }
+    for name, number in PLANETS.items():
+        away = np.zeros(3)
+        for _ in range(3):
+            then = julian_date - _LIGHT_DAY_PER_UNIT * float(np.linalg.norm(away))
+            away = np.asarray(erfa.plan94(then, 0.0, number)["p"], dtype=float) - earth
+        found[name] = away
+    return {name: away / np.linalg.norm(away) for name, away in found.items()}
+
+
+_SAME_PX = 0.1
+"""Distance (px) above which axis and centre of the picture are stated separately."""
+
+
+def sky_facts(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> dict[str, Any]:
+    """Return the directions of image centre and axis, the bodies and the world coordinates, for `--json`."""
+    if sky is None:
+        return {}
+    camera = sky.camera
+    middle = 0.5 * (camera.columns - 1), 0.5 * (camera.rows - 1)
+    return {
+        "image_centre": _place_facts(sky, middle),
+        "axis": _place_facts(sky, camera.centre),
+        "bodies": [
+            {"name": body.name, **_coordinates(body.direction), "point_px": body.point.tolist()}
+            for body in bodies
+        ],
+        "wcs": world_coordinates(sky),
+    }
+
+
+def _place_facts(sky: SkyMap, point: tuple[float, float]) -> dict[str, Any]:
+    return {**_coordinates(sky.directions(np.array([point]))[0]), "point_px": list(point)}
+
+
+def _coordinates(direction: FloatArray) -> dict[str, float]:
+    right_ascension = math.degrees(math.atan2(direction[1], direction[0])) % 360.0
+    declination = math.degrees(math.atan2(direction[2], math.hypot(direction[0], direction[1])))
+    return {"right_ascension_deg": right_ascension, "declination_deg": declination}
+
+
+def sky_text(sky: SkyMap | None, bodies: Sequence[SkyBody]) -> str:
+    """Return axis, image centre and bodies as lines of text; empty without a solution."""
+    if sky is None:
+        return ""
+    values, lines = sky_facts(sky, bodies), []
+    if math.dist(values["axis"]["point_px"], values["image_centre"]["point_px"]) > _SAME_PX:
+        # Right ascension and declination above are those of the axis.
+        centre, (x, y) = values["image_centre"], values["axis"]["point_px"]
+        lines.append(f"axis:             at pixel {x:.1f}, {y:.1f}")
+        place = f"{centre['right_ascension_deg']:.4f} {centre['declination_deg']:+.4f} deg"
+        lines.append(f"image centre:     {place}")
+    for body in bodies:
+        x, y = body.point
+        lines.append(f"in the picture:   {body.name} at pixel {x:.1f}, {y:.1f}")
+    return "".join(line + "\n" for line in lines)

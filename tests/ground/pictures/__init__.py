@@ -1,1 +1,0 @@
-"""Drawings upon pictures."""
