@@ -179,7 +179,9 @@ def _orbit_text(item: ObjectOrbit) -> str:
     x, y, z = 1e-3 * orbit.state[:3]
     u, v, w = 1e-3 * orbit.state[3:]
     place, speed = (float(np.sqrt(np.trace(orbit.covariance[part, part]))) for part in (_POSITION, _VELOCITY))
-    lasting = "" if orbit.lasts else "  this orbit meets the ground; within its errors it may not\n"
+    lasting = (
+        "" if orbit.lasts else "  unbound or through the Earth, but not all orbits within the errors are\n"
+    )
     return (
         f"{head}"
         f"  at {item.date:%Y-%m-%dT%H:%M:%S.%f} UTC, ICRS\n"
