@@ -105,13 +105,16 @@ def test_a_picture_too_small_to_show_anything_is_refused(
 
 
 @pytest.mark.parametrize("method", ["likelihood", "harris"])
-@pytest.mark.parametrize(("value", "status"), [(0, "black"), (255, "saturated")])
+@pytest.mark.parametrize(
+    ("value", "status", "reason"),
+    [(0, "black", "all pixels of the frame are equal"), (255, "saturated", "the frame is overexposed")],
+)
 def test_a_frame_of_one_value_is_black_or_saturated_and_has_no_length(
-    value: int, status: str, method: str, tmp_path: Path
+    value: int, status: str, reason: str, method: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "flat.png"
     Image.fromarray(np.full((64, 64), value, np.uint8)).save(path)
     done = command("rate", path, "--fov", "20", "--exposure", "0.2", "--method", method)
     assert done.returncode == 1
-    assert done.stdout.startswith(f"status:        {status}\nwhy:           the frame is ")
+    assert done.stdout.startswith(f"status:        {status}\nwhy:           {reason}\n")
     assert done.stdout.endswith("\nstreaks:       0 found, 0 used\n")
