@@ -24,7 +24,7 @@ def test_every_bench_is_listed_with_one_line_and_none_is_imported(capsys: pytest
         assert f"  {name}" in listed
         assert line in listed
         assert line
-    assert {"streaks", "endpoints", "likelihood", "plan"} <= bench.benches().keys()
+    assert {"executive", "starid", "likelihood", "plan"} <= bench.benches().keys()
     assert not {name for name in set(sys.modules) - before if name.startswith("tests.studies.bench.")}
 
 

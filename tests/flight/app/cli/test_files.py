@@ -58,7 +58,7 @@ def test_files_come_down_and_go_up_by_the_command(
     ("words", "reason"),
     [
         (["get", "log/none"], "no such file"),
-        (["get", "../keys"], "no name"),
+        (["get", "../keys"], "not an allowed name"),
         (["delete", LOG], "no received file"),
         (["cancel", "1", "7"], "no transfer 7"),
     ],
