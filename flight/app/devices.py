@@ -6,26 +6,19 @@ simulated flight: on board none of it is imported.
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import os
+from contextlib import ExitStack, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flight.app.run import RunRequest
-from flight.schema.sections import Config
-from hal.interfaces.wires import Rig
-from knightcube.astro.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from sim_hal.rig import PosedCamera, SimulationRequest
-import os
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass
-
 import numpy as np
 
+from flight.app.run import RunRequest
 from flight.loop.state import state_folder
 from flight.schema.devices import AravisDevice, Camera, V4l2Device, WideCamera
 from flight.schema.document import ConfigError
+from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
 from hal.buses.serial_port import PySerialPort
@@ -48,8 +41,12 @@ from hal.interfaces.devices import (
 )
 from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.guardian import CoilReach
-from hal.interfaces.wires import SECOND_NS, Clock, Wires
+from hal.interfaces.wires import SECOND_NS, Clock, Rig, Wires
+from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import NED_TO_TESTBED, attitude_map, attitude_matrix
+
+if TYPE_CHECKING:
+    from sim_hal.rig import PosedCamera, SimulationRequest
 
 
 def fault_catalogue() -> tuple[str, str]:
