@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from knightcube.astro.almanac import sun_direction as sun_direction
     from knightcube.astro.almanac import sunlit_fraction as sunlit_fraction
     from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant as SingleAxisPlant
-    from knightcube.gnc.guidance.planners import plan_slew as plan_slew
-    from knightcube.gnc.guidance.planners import plan_step as plan_step
+    from knightcube.gnc.guidance.one_axis.vmc import plan_step as plan_step
     from knightcube.gnc.guidance.three_axes.pointing_target import Goal as Goal
     from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget as PointingTarget
+    from knightcube.gnc.guidance.three_axes.slew_plan import plan_slew as plan_slew
     from knightcube.vision.camera.lens import Lens as Lens
     from knightcube.vision.camera.lens import Pinhole as Pinhole
     from knightcube.vision.horizon.nadir import find_nadir as find_nadir
@@ -61,8 +61,8 @@ _MODULE_OF = {
     "magnetic_field": "knightcube.astro.almanac",
     "magnetic_field_on_ground": "knightcube.astro.almanac",
     "orbit_state": "knightcube.astro.almanac",
-    "plan_slew": "knightcube.gnc.guidance.planners",
-    "plan_step": "knightcube.gnc.guidance.planners",
+    "plan_slew": "knightcube.gnc.guidance.three_axes.slew_plan",
+    "plan_step": "knightcube.gnc.guidance.one_axis.vmc",
     "propagate_elements": "knightcube.astro.almanac",
     "propagate_orbit": "knightcube.astro.almanac",
     "sun_direction": "knightcube.astro.almanac",

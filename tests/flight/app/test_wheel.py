@@ -128,7 +128,7 @@ except ImportError as error:
 """
     reason, extra, application = _type(home, tmp_path, "python", "-c", script).splitlines()
     assert "star" in reason
-    assert "pip install 'knightcube[" in extra
+    assert "pip install 'knightcube[vmc]'" in extra
     assert application == "No module named 'flight'"
 
 

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
+from typing import Literal
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from knightcube.gnc.guidance.one_axis.plant import (
     PolynomialPath,
     SingleAxisPlant,
     lgl_rule,
+    q2_of,
     q2_rate_of,
 )
 from knightcube.gnc.guidance.one_axis.vmc_program import (
@@ -488,4 +490,58 @@ def run(job: PlanJob) -> StepPlan:
         time_cost=job.time_cost,
         last=job.last,
         cost=job.cost,
+    )
+
+
+def plan_step(
+    plant: SingleAxisPlant,
+    *,
+    start_angle: float,
+    end_angle: float,
+    horizon: float,
+    start_rate: float = 0.0,
+    end_rate: float = 0.0,
+    time_cost: float | None = None,
+    minimise: Literal["heat", "supply"] = "heat",
+    nodes: int = NODES,
+    max_stretch: float = MAX_STRETCH,
+) -> StepPlan:
+    """Return the minimum-energy path of a body about one axis that one torque coil rotates.
+
+    The path is optimised by virtual motion camouflage (Sease 2013, 5.8-5.15) with NLopt's SLSQP, under the
+    current limit of the plant and |angle| <= 1.496 rad at every time, beyond which the coil has almost no
+    torque. If no path over the horizon keeps the limits, the horizon is stretched to the shortest feasible
+    one and the status of the plan is "stretched". A plan takes about 2 ms.
+
+    `plan.path.motion(times)` gives angle, rate and acceleration at times (n,), s after the start, and
+    `plant.currents` the coil current for them.
+
+    Args:
+        plant: inertia, torque constant, coil and thread.
+        start_angle: angle at the start, rad, measured from the direction of the largest torque.
+        end_angle: angle at the end, rad.
+        horizon: duration, s; with `time_cost` the initial guess of the duration.
+        start_rate: body rate at the start, rad/s.
+        end_rate: body rate at the end, rad/s.
+        time_cost: W; the duration is optimised too, for minimum energy plus `time_cost` times the duration.
+            None keeps the horizon.
+        minimise: "heat" for the integral of R I^2, "supply" for that of V |I|, the energy taken from a
+            chopped supply.
+        nodes: number of nodes of the path, 8 to 40.
+        max_stretch: largest ratio of the duration to `horizon`.
+
+    Raises:
+        PlanningError: if an argument is not finite or out of range, or if no path is found.
+    """
+    return plan(
+        plant,
+        q2_of(start_angle),
+        start_rate,
+        q2_of(end_angle),
+        end_rate,
+        horizon,
+        nodes=nodes,
+        max_stretch=max_stretch,
+        time_cost=time_cost,
+        cost=PathCost(minimise),
     )

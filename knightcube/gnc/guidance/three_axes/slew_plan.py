@@ -15,14 +15,19 @@ slews are therefore planned from several start times, and the best one is planne
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta
 from enum import StrEnum
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.ephemeris import Ephemeris
+from knightcube.astro.earth.ephemeris import Ephemeris, predict
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.sun import julian_date
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.errors import PlanningError, UsageError
 from knightcube.gnc.guidance.three_axes.attitude_law import (
@@ -53,6 +58,8 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 from knightcube.gnc.guidance.three_axes.slew_program import Iterate, SlewProgram, Trajectory
 from knightcube.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, SlewSearch, SolvedPath
 
+STRETCH = 3.0
+"""Longest slew of `plan_slew` without `longest`, as a multiple of `duration`."""
 _STEPS = 4
 """Runge-Kutta steps per interval, an even number."""
 _ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
@@ -401,3 +408,82 @@ def _motion(law: Attitudes, ephemeris: Ephemeris, time: float) -> tuple[FloatArr
     """Return the attitude (4,) and the rate (3,) rad/s, body axes, of a law at a time, s."""
     found = references(law, ephemeris, np.array([time]))
     return found.quaternion[0], found.rate[0]
+
+
+def plan_slew(
+    *,
+    inertia: ArrayLike,
+    dipole_limit: ArrayLike,
+    heat: ArrayLike,
+    elements: tuple[str, str],
+    time: datetime,
+    start: PointingTarget,
+    goal: PointingTarget,
+    duration: float,
+    longest: float | None = None,
+    window: float = 0.0,
+    time_cost: float | None = None,
+    pointing_axis: ArrayLike = (0.0, 0.0, 1.0),
+    across_axis: ArrayLike = (1.0, 0.0, 0.0),
+    camera_axis: ArrayLike | None = None,
+    cones: Mapping[Literal["sun", "earth", "moon"], float] | None = None,
+    nodes: int = NODES,
+) -> OrderedSlew:
+    """Return the best slew of a satellite in orbit with torque coils alone, from one target to another.
+
+    Coils make no torque along the magnetic field, so path and dipoles are planned together, by collocation
+    with an interior point method, from several initial guesses. The model contains the rotating field, the
+    gravity gradient and the gyroscopic torque. The orbit is predicted by SGP4. A plan takes about a second.
+
+    In the result, `plan.path` has attitude, rate and dipole at its `times`, s after the start of the slew;
+    `plan.energy` is the heat of the coils, J. `begin` is the start of the slew, s after `time`.
+
+    Args:
+        inertia: (3, 3) kg m^2, body axes.
+        dipole_limit: (3,) A m^2 of the coils, along the body axes.
+        heat: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
+        elements: the two lines of the orbit's element set.
+        time: start of the slew, or of the window; UTC without a time zone.
+        start: target that is held until the slew begins; a free roll is taken as zero.
+        goal: target at the end; with a free roll only its direction counts.
+        duration: duration of the slew, s.
+        longest: s to which the slew may be stretched if no slew over `duration` is found; None for three
+            times `duration`.
+        window: s within which the slew begins, at the time of least energy.
+        time_cost: W; the duration is optimised too, for minimum energy plus `time_cost` times the duration;
+            infinity gives the shortest slew. None keeps the duration.
+        pointing_axis: (3,) unit vector, body axis that points to the targets.
+        across_axis: (3,) unit vector normal to it, from which a roll is measured.
+        camera_axis: (3,) unit vector, body axis that keeps the exclusion cones; None for `pointing_axis`.
+        cones: half angles (rad) of the exclusion cones; of the Earth beyond its limb.
+        nodes: number of collocation intervals, 8 to 96.
+
+    Raises:
+        UsageError: for elements, targets, cones or a window that are out of range.
+        PlanningError: if a value is out of range, or if no slew is found; the message gives the reason.
+    """
+    unknown = set(cones or {}) - {"sun", "earth", "moon"}
+    if unknown:
+        raise UsageError(f"unknown exclusion cone {unknown.pop()!r}: give sun, earth or moon")
+    if Goal.OBJECT in (start.goal, goal.goal):
+        raise UsageError("an object is found in flight: no slew can be planned to it")
+    pointing = np.array(pointing_axis, dtype=float)
+    satellite = SlewCraft(
+        np.array(inertia, dtype=float), np.array(dipole_limit, dtype=float), np.array(heat, dtype=float)
+    )
+    order = SlewOrder(
+        satellite,
+        BodyAxes(pointing, np.array(across_axis, dtype=float)),
+        pointing if camera_axis is None else np.array(camera_axis, dtype=float),
+        start,
+        goal,
+        duration,
+        STRETCH * duration if longest is None else longest,
+        window,
+        time_cost,
+        {str(name): angle for name, angle in (cones or {}).items()},
+        nodes,
+    )
+    state = TwoLineElements(*elements).at(julian_date(time - timedelta(seconds=LEAD)))
+    made = plan_order(order, predict(state, window + order.longest + 3.0 * LEAD), LEAD)
+    return replace(made, begin=made.begin - LEAD)
