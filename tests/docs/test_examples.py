@@ -129,6 +129,9 @@ def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> 
     assert float(found[1]) == pytest.approx(math.degrees(1e-5 * theta / (1.05e-3 * 0.6**2)), abs=0.1)
 
 
+NUMBER = re.compile(r"[+-]?\d+\.?\d*")
+
+
 @pytest.mark.parametrize(
     ("page", "script"),
     [
@@ -139,6 +142,26 @@ def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> 
     ],
 )
 def test_an_example_of_the_library_prints_what_its_page_shows(page: str, script: str) -> None:
+    """The words are equal, and the numbers to two units of their last digit: processors round differently."""
     printed = run([str(EXAMPLES / f"{script}.py")], ROOT).stdout.rstrip()
-    shown = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
-    assert f"```\n{printed}\n```" in shown
+    text = (ROOT / "docs" / "library" / f"{page}.md").read_text(encoding="utf-8")
+    shown = text.partition("It prints:\n\n```\n")[2].partition("\n```")[0]
+    assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", shown).split()
+    for found, stated in zip(NUMBER.findall(printed), NUMBER.findall(shown), strict=True):
+        unit = 10.0 ** -len(stated.partition(".")[2])
+        assert abs(float(found) - float(stated)) < 2.5 * unit, (found, stated)
+
+
+def test_the_examples_find_what_they_have_drawn() -> None:
+    """Each script prints its result beside the value that it has put into the image."""
+    streaks = run([str(EXAMPLES / "streak_rate.py")], ROOT).stdout
+    rate, true = (np.array(text.split(), dtype=float) for text in re.findall(r"\[([^\]]+)\]", streaks)[:2])
+    sigma = np.array(re.findall(r"1 sigma +\[([^\]]+)\]", streaks)[0].split(), dtype=float)
+    assert np.all(np.abs(rate - true) < 4.0 * sigma)
+    assert np.all(sigma < 0.02 * np.linalg.norm(true))
+    assert streaks.count("object ") == 1
+    lens = run([str(EXAMPLES / "lens.py")], ROOT).stdout
+    focal_length, error = map(float, re.findall(r"focal length +([\d.]+) \+- ([\d.]+) px", lens)[0])
+    assert abs(focal_length - 2250.0) < max(4.0 * error, 0.05)
+    k1, error = map(float, re.findall(r"k1 +(\S+) \+- (\S+)", lens)[0])
+    assert abs(k1 + 0.41) < 4.0 * error + 1e-4
