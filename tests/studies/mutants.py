@@ -140,6 +140,7 @@ def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mu
         path.relative_to(root).as_posix() for package in PACKAGES for path in (root / package).rglob("*.py")
     )
     places: dict[tuple[str, int], list[Mutant]] = {}
+    whole: list[Mutant] = []
     for name in only or PACKAGES:
         wanted, _, line = name.partition(":")
         wanted = wanted.rstrip("/")
@@ -152,11 +153,12 @@ def draw(root: Path, count: int, seed: int, only: Sequence[str] = ()) -> list[Mu
         if not found and only:
             raise MutantsError(f"--only {name}: there is no product code that can be changed")
         if line:
-            return [mutant for mutants in found.values() for mutant in mutants]
-        places |= found
+            whole += [mutant for mutants in found.values() for mutant in mutants]
+        else:
+            places |= found
     chance = random.Random(seed)
     drawn = chance.sample(sorted(places), min(count, len(places)))
-    return [chance.choice(places[place]) for place in drawn]
+    return whole + [chance.choice(places[place]) for place in drawn]
 
 
 def mutants_of(source: str, path: str) -> list[Mutant]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
-from flight.loop.imaging import RepeatedRows, is_strange, middle_ns
+from flight.link import events
+from flight.link.telemetry.definitions import STARS
+from flight.loop.imaging import FrameReport, RepeatedRows, is_strange, middle_ns
 from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import Image
 from knightcube.vision.camera.lens import Pinhole
@@ -76,3 +81,35 @@ def test_mid_exposure_is_half_an_exposure_after_its_start(
     start_ns: int, exposure_ns: int, middle: int
 ) -> None:
     assert middle_ns(Frame(1, start_ns, exposure_ns, start_ns, exposed())) == middle
+
+
+@pytest.mark.parametrize(
+    ("status", "accepted", "reported"),
+    [
+        (SolveStatus.NO_MATCH, None, [events.CAMERA_STRANGE]),
+        (SolveStatus.AMBIGUOUS, None, []),
+        (SolveStatus.SOLVED, False, [events.STARS_REFUSED]),
+        (SolveStatus.SOLVED, True, []),
+    ],
+)
+def test_strange_stars_and_a_refused_attitude_are_reported_and_every_solution_is_recorded(
+    status: SolveStatus, accepted: bool | None, reported: list[Any]
+) -> None:
+    said: list[Any] = []
+    kept: list[tuple[Any, dict[str, Any]]] = []
+    recorder = SimpleNamespace(
+        epoch_ns=5, record=lambda packet, _now, **values: kept.append((packet, values))
+    )
+    log = SimpleNamespace(report=lambda kind, _now, _text: said.append(kind))
+    services = cast(Any, SimpleNamespace(recorder=recorder, events=log))
+    solution = FrameSolution(
+        status, "", FrameKind.POINTS, Pinhole(320, 240, 400.0), points=np.zeros((14, 2)), star=np.full(14, -1)
+    )
+    frame = Frame(7, 100, 10, 100, exposed())
+    FrameReport(cast(Any, None), cast(Any, None), services).stars(frame, solution, None, 200, accepted)
+    assert said == reported
+    ((packet, values),) = kept
+    assert packet is STARS
+    assert (values["sequence"], values["middle_ns"], values["found"]) == (7, 100, 14)
+    assert values["accepted"] == int(accepted is True)
+    assert np.isnan(values["quaternion"]).all()

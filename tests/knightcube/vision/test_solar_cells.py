@@ -10,6 +10,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.errors import UsageError
+from knightcube.vision import solar_cells
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus, SolarStringModel, coarse_sun
 from knightcube.vision.sun import cameras_by_sun
@@ -86,6 +87,20 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     sides = currents[[1, 2, 4, 5]]
     assert np.ptp(sides) < 2e-3
     assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]
+
+
+def test_an_unknown_nadir_gives_the_mean_and_the_covariance_of_all_directions_and_albedos() -> None:
+    """Readings of strings under an Earth of random direction and albedo, 200,000 draws."""
+    generator = np.random.default_rng(11)
+    directions = generator.standard_normal((200_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    albedo = STRINGS.albedo + STRINGS.albedo_sigma * generator.standard_normal((200_000, 1))
+    readings = 0.5 * albedo * (1.0 + directions @ STRINGS.normals.T)
+    readings += STRINGS.sigma * generator.standard_normal(readings.shape)
+    mean, covariance = solar_cells._earthlight(STRINGS, None)
+    assert mean == pytest.approx(readings.mean(axis=0), abs=1e-3)
+    assert covariance == pytest.approx(np.cov(readings.T), abs=2e-4)
+    assert np.diag(covariance) == pytest.approx(readings.var(axis=0), rel=0.02)
 
 
 def test_in_eclipse_the_strings_say_dark() -> None:
