@@ -1,4 +1,4 @@
-"""Where a satellite is, and what it measures there: magnetic field, Sun, and the Earth's shadow."""
+"""Position of a satellite, and the magnetic field, the Sun and the Earth's shadow at that position."""
 
 from __future__ import annotations
 
