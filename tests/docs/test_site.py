@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
+import knightcube
 from tests.docs.blocks import ROOT
 from tests.docs.built_site import problems_of
 
@@ -41,3 +43,11 @@ def test_links_to_follow_are_no_problem(tmp_path: Path) -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_the_reference_of_the_public_interface_lists_every_exported_name() -> None:
+    page = (ROOT / "docs" / "reference" / "knightcube.md").read_text(encoding="utf-8")
+    listed = {name for names in re.findall(r"members: \[(.+)\]", page) for name in names.split(", ")}
+    assert set(knightcube.__all__) <= listed
+    for module, names in re.findall(r"^::: (\S+)\n.*\n.*members: \[(.+)\]", page, re.MULTILINE):
+        assert all(hasattr(import_module(module), name) for name in names.split(", "))
