@@ -41,6 +41,76 @@ def test_the_table_that_flies_is_sound() -> None:
     check(FACTS, modes_moved_by)
 
 
+DRIVEN = "detumble hold slew testbed-demo sun point"
+PERSISTENCE = {
+    "boot-waits": (1, 1, "boot"),
+    "task-failing": (1, None, ""),
+    "blind": (1, 1, DRIVEN),
+    "tumbling": (8, 1, "hold slew testbed-demo acquire sun point"),
+    "hold-impossible": (1, 1, "hold testbed-demo"),
+    "slew-late": (1, 1, "slew"),
+    "holding": (1, 1, "slew testbed-demo"),
+    "coil-x-broken": (1, None, ""),
+    "coil-y-broken": (1, None, ""),
+    "coil-z-broken": (1, None, ""),
+    "cpu-high": (3, 3, ""),
+    "memory-grows": (3, 3, ""),
+    "memory-high": (3, 1, ""),
+    "disk-low": (2, 2, ""),
+    "hot": (2, 2, ""),
+    "too-hot": (2, None, ""),
+    "sun-unclear": (3, 3, ""),
+    "clock-off": (2, 1, ""),
+    "wide-false": (3, 1, ""),
+} | {f"{stream}-poor": (4, 8, "") for stream in ("imu", "field", "coils", "power", "camera", "gps")}
+"""Updates until a fact counts and until it ends, None for a latching fact, and the modes that watch it.
+
+Every other fact counts and ends at once, and is watched in all modes.
+"""
+
+EVENTS_OF = {
+    "imu-silent": ("imu-silent", "imu-recovered"),
+    "imu-unusable": ("imu-unusable", "imu-recovered"),
+    "imu-line-lost": ("imu-line-lost", "imu-recovered"),
+    "control-lost": ("control-lost", "control-regained"),
+    "coil-fault": ("coil-fault", "coil-recovered"),
+    "commands-doubted": ("commands-doubted", "commands-trusted"),
+    "power-fault": ("power-fault", "power-recovered"),
+    "camera-lost": ("camera-lost", "camera-recovered"),
+    "camera-late": ("camera-late", "camera-recovered"),
+    "log-fault": ("log-fault", "log-recovered"),
+    "service-failing": ("service-failing", "service-recovered"),
+    "gps-lost": ("gps-lost", "gps-recovered"),
+    "strings-lost": ("strings-lost", "strings-recovered"),
+    "sun-unclear": ("sun-unclear", "sun-clear"),
+    "field-refused": ("field-refused", "field-trusted"),
+    "wide-lost": ("wide-lost", "wide-recovered"),
+    "wide-false": ("wide-false", "wide-trusted"),
+    **{f"coil-{axis}-broken": ("coil-broken", None) for axis in "xyz"},
+    **{name: (name, "resource-normal") for name in ("cpu-high", "memory-grows", "disk-low", "hot")},
+    **{
+        f"{stream}-poor": ("stream-poor", "stream-good")
+        for stream in ("imu", "field", "coils", "power", "camera", "gps")
+    },
+}
+"""Events at the begin and end of a fact; other facts begin with the event of their name and end silently."""
+
+
+@pytest.mark.parametrize("fact", FACTS, ids=lambda fact: str(fact.name))
+def test_a_fact_has_the_persistence_modes_and_events_of_the_design(fact: facts.Fact) -> None:
+    after, mended_after, modes = PERSISTENCE.get(fact.name, (1, 1, ""))
+    assert fact.after == after
+    assert fact.latching is (mended_after is None)
+    assert fact.mended_after == (mended_after or 1)
+    assert {mode.label for mode in fact.modes} == set(modes.split() or [mode.label for mode in Mode])
+    ends = None if fact.ends is None else fact.ends.name
+    assert (fact.begins.name, ends) == EVENTS_OF.get(fact.name, (fact.name, None))
+
+
+def test_the_tables_of_the_design_name_facts() -> None:
+    assert {*PERSISTENCE, *EVENTS_OF} <= {fact.name for fact in FACTS}
+
+
 def test_a_fact_counts_after_its_number_of_statements_in_a_row_and_not_before() -> None:
     record = EventRecord()
     record.facts.enter(Mode.HOLD)
@@ -201,3 +271,60 @@ def test_silence_that_another_alarm_reports_is_not_reported_twice_and_any_other_
 def test_the_streams_of_a_configuration_are_those_of_its_devices() -> None:
     assert [row.name for row in streams_of(demo_config(10.0))] == ["imu", "field", "coils", "power", "camera"]
     assert "camera" not in [row.name for row in streams_of(demo_config(10.0, camera=False))]
+
+
+def test_the_streams_have_the_rates_limits_and_ranges_of_their_devices() -> None:
+    config = demo_config(10.0)
+    rows = {row.name: row for row in streams_of(config)}
+    assert rows["imu"].rate_hz == config.inertial_unit.rate_hz
+    assert (rows["coils"].rate_hz, rows["coils"].max_age) == (40.0, config.coils.stale_after)
+    low, high = config.field_range()
+    assert (rows["field"].low, rows["field"].high) == (low, high)
+    largest = sum(config.coils.supply_voltage / ohm for ohm in config.coils.resistance)
+    power = rows["power"]
+    assert (power.rate_hz, power.max_age) == (1.0, 3.0)
+    assert (power.low, power.high) == pytest.approx((-0.15 * largest, 1.5 * largest))
+    assert all(row.has_silence_alarm for row in rows.values())
+
+
+def test_the_window_has_two_seconds_or_five_periods() -> None:
+    """The rate is unknown until the window is full."""
+    for rate_hz, window in ((40.0, 2.0), (2.5, 2.0), (0.1, 50.0)):
+        watch = StreamWatch(replace(ROW, rate_hz=rate_hz), 0)
+        assert math.isnan(watch.rate(round(window * 1e9) - 1))
+        assert watch.rate(round(window * 1e9)) == 0.0
+
+
+def test_a_stream_is_slow_below_80_percent_of_its_rate() -> None:
+    for count, state in ((64, StreamState.GOOD), (63, StreamState.SLOW)):  # of 80 in two seconds
+        watch = StreamWatch(ROW, 0)
+        for k in range(count):
+            watch.note(2_000_000_002 + k * 1_999_999_999 // (count - 1), 0.5)
+        now = 4_000_000_001
+        assert watch.rate(now) == count / 2.0
+        assert watch.state(now) is state
+
+
+def test_the_values_at_the_ends_of_the_range_are_valid() -> None:
+    for value, state in ((0.0, StreamState.GOOD), (1.0, StreamState.GOOD), (1.0001, StreamState.INVALID)):
+        watch, now = fed(3.0, value=value)
+        assert watch.state(now) is state
+
+
+def test_the_throttle_writes_one_event_of_a_kind_in_its_time_with_the_number_held_back() -> None:
+    written: list[tuple[str, int, int, str]] = []
+    log = EventLog(lambda kind, time_ns, held, text: written.append((kind.name, time_ns, held, text)), 100)
+    for time_ns in (0, 1, 99, 100, 150):
+        log.report(events.CYCLE_SLIP, time_ns, "slip")
+    log.report(events.BLIND, 150, "blind")
+    assert written == [
+        ("cycle-slip", 0, 0, "slip"),
+        ("cycle-slip", 100, 2, "slip"),
+        ("blind", 150, 0, "blind"),
+    ]
+    assert log.count == 6
+    assert log.counts == {events.CYCLE_SLIP: 5, events.BLIND: 1}
+    log.flush(200)
+    assert written[3:] == [("cycle-slip", 200, 0, "the last one held back by the throttle")]
+    log.flush(300)
+    assert len(written) == 4
