@@ -29,7 +29,7 @@ FLEW_S = 600.0
 COILS_S, RETRY_S = 30.0, 1.0
 """Between two zeros of the coils: while they are acknowledged, and while they are not."""
 
-# flight/link/commands.py and telemetry/definitions.py; the tests compare them.
+# flight/link/commands.py and flight/link/telemetry/definitions.py; the tests compare them.
 COMMANDS = {
     **{0x1A01: "ping", 0x1A02: "safe", 0x1A03: "mode", 0x1A04: "slew", 0x1A05: "clear", 0x1A06: "point"},
     **{0x1A10: "load-parameters", 0x1A11: "dump-parameters"},

@@ -1,8 +1,7 @@
 """Contents of a solved picture: coordinates of its centre and axis, Sun, Moon and planets, and a FITS header.
 
 The positions of the bodies are those seen from the Earth's centre, by the series of ERFA: plan94 (Simon et
-al.
-1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98 (Meeus 1998: 10") and epv00 for the
+al. 1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98 (Meeus 1998: 10") and epv00 for the
 Earth. They need no file of ephemerides. An observer on the ground sees the Moon up to 1 deg elsewhere.
 
 The FITS header has a tangent plane with polynomials for the distortion (TAN-SIP; Calabretta & Greisen 2002,

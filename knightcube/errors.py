@@ -1,10 +1,10 @@
-"""The exceptions of the flight application; each carries its facts as attributes."""
+"""The exceptions of the library and the flight application; each carries its facts as attributes."""
 
 from __future__ import annotations
 
 
 class FlightError(Exception):
-    """The base of all errors of the flight application."""
+    """The base of all errors of the library and the flight application."""
 
 
 class UsageError(FlightError):

@@ -3,7 +3,7 @@
 A method yields batches of candidates: observed stars and the guide stars that they may be. Each candidate
 gives an attitude. The brightest observed stars are transformed to the sky by it, and those that fall near
 guide stars are counted. The candidates with the highest counts are verified against the whole field by
-`knightcube.vision.startracker.identification.verification`, which rejects false candidates of any method. A
+`knightcube.vision.startracker.verification`, which rejects false candidates of any method. A
 field of uncertain scale is searched at several scales (`ScaledField`).
 
 - Angle matching (3.2.1; Gottlieb in Wertz 1978, 7.7): the triangles of the brightest observed stars are taken

@@ -2,8 +2,8 @@
 
 Detumbling follows the momentum plan in the measured field, or in the field expected ahead. SAFE turns to the
 Sun by solar cells, gyro and measured field, without orbit, attitude or clock. Pointing follows the pointing
-law along its path; far off its path the body is held still instead
-(`knightcube.gnc.control.astray`).
+law along its path; far off its path the body's rotation is damped first (`PathRecovery` and `damping_dipole`
+of `knightcube.gnc.control.pointing_law`).
 
 While pointing, the coils pause at the beginning of each window, so that the magnetometer is read without
 their field; then one dipole, computed at the pause's end, is held. The dipole is increased to make up for the

@@ -8,8 +8,7 @@ OLAE (Sease 4.11-4.15, corrected). If the axis is nearly normal to the boresight
 infinity, and slope and length of the chord replace centre and angle. The projection of a pinhole changes
 slopes and lengths across a wide field by far more than their errors. Each indicator is therefore compared
 with a star at the same position, in units of the expected error of an endpoint. The strict rule of 2.5 sigma
-lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an object (`python -m
-tests.studies.bench.rso_spread`).
+lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an object.
 
 A deviating streak is not yet an object: two stars whose streaks overlap, or a segment of a faint star's
 streak, deviate as well (Table 4.4: "overlapping streak"). `Judge` therefore tests whether stars explain the

@@ -29,8 +29,8 @@ class EndpointSettings:
         intensity_half_width: px, N of 3.15.
         centre_of: image of which the centre of intensity is computed: the cornerness, or the frame as in the
             thesis.
-        endpoint_bias: px, outward shift along the streak that compensates the detector, for a given camera:
-            `python -m tests.studies.bench.endpoint_bias`.
+        endpoint_bias: px, outward shift along the streak that compensates the detector, measured for a point
+            spread of 1 px.
         endpoint_floor: px, error of an endpoint of a bright streak.
         endpoint_noise: px, error of an endpoint per ratio of noise to counts per px of length.
         border: px, distance from the frame's border within which streaks are rejected.
@@ -64,7 +64,7 @@ class ObjectSettings:
 
     Attributes:
         bounds: standard deviations of centre, displacement and residual below which an indicator never fires
-            (`python -m tests.studies.bench.rso_spread`).
+            (the measured spread without an object).
         strict: standard deviations within the image that must be exceeded too, 2.5 in the thesis.
         psf_sigma: point spread of the camera, px.
         gain: electrons per count.

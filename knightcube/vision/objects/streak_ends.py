@@ -7,7 +7,7 @@ equations are those of the thesis as corrected in the errata (3.5, 3.15, 3.17-3.
 columns), points are (x, y) px.
 
 The Gaussian kernels shift the peaks along the streak by a constant that depends on the point spread.
-`extend` compensates it; `python -m tests.studies.bench.endpoint_bias` measures it.
+`extend` compensates it.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""The result of the star tracker for one frame, and how its attitude relates to mid-exposure.
+"""The steps from the stars of a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
+
+Points are measured by `detection`; for streaks, the positions of their stars at mid-exposure serve as points.
+Identification searches near a prior attitude first, if there is one, then in the whole sky. The result is the
+attitude at mid-exposure.
 
 At a constant rate the middle of a streak is the position of the star at mid-exposure. An acceleration a
 shifts the mean of a point's light by a T^2 / 24 and the middle of the two ends of a streak by a T^2 / 8. A
 fit that includes the acceleration is shifted only by terms beyond the square of time. White angular
 acceleration of density q adds the variance q T^3 over 320, 48 and 4743 respectively (the integrals of its
 second integral over the same weights).
-
-The steps from stars in a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
-
-Points are measured by `detection`; for streaks, the positions of their stars at mid-exposure serve as points.
-Identification searches near a prior attitude first, if there is one, then in the whole sky. The result is the
-attitude at mid-exposure.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Verification of a candidate attitude against the whole field, and the significance of the match.
+"""Verification of a candidate attitude against the whole field, and tracking with a prior attitude.
 
 The guide stars predicted in the field are compared with the observed stars; coincident stars refine attitude
 and scale, repeatedly, until the set of matched stars no longer changes. The significance is an upper bound of
@@ -7,9 +7,7 @@ well or better. If it is far below one, it also bounds the probability of a fals
 depend on how a candidate was found. It is raised for every choice that the matching makes among gates,
 brightness limits and tests (Bonferroni).
 
-Tracking: identifies the stars of a frame with a prior attitude.
-
-A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
+`track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
 an observed and a predicted star close enough to be the same, the largest set with one shift refines the
 attitude, and the whole field verifies it as in lost in space, with the uncertainty of the prior instead
 of the whole sky as the searched part.

@@ -1,4 +1,4 @@
-"""The light of streaks and spots on the pixels, and its spot_derivatives with respect to all parameters.
+"""The light of streaks and spots on the pixels, and its derivatives with respect to all parameters.
 
 A long streak is fitted on strips: lines of pixels across its path, columns if the path runs more along rows
 than across them, rows otherwise. Ten lines form a block, over which the sensitivity to the motion is linear.

@@ -4,7 +4,7 @@ Two craft, each in a Sun-synchronous and an ISS-like orbit, by one law: `magneto
 alone, `attitude` also a gyro with its bias, a coarse attitude and the orbit. The coils pause a tenth of each
 two seconds, as the magnetometer needs, and before they act at all. Coils are commanded each quarter of a
 second, and as often as the body turns by 0.3 rad. Beside each time stands a bound from below
-(`detumble_bound`), without a bound of the rate.
+(`least_time`), without a bound of the rate.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Cells `filter`: the loop's filter (`FreeFilter`, with the noises of the configur
 to nadir in a world whose gyro walks as the filter believes. Stars each 10 s teach it the gyro's bias, for
 LEARNED s at least; from the begin of a shadow on it has gyro and magnetometer alone. Orbits without a shadow
 of SHORTEST s are drawn again. Cells `storm`, half as many: the same in a field that is off its model by STORM
-more. Cells `loop`, a tenth as many: the whole loop (`eclipse_loop`), whose emulated gyro keeps its bias.
+more. Cells `loop`, a tenth as many: the whole loop (`fly_loop`), whose emulated gyro keeps its bias.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Each craft follows passes of 0.05 to 0.6 deg/s and magnitudes 2 to 6 (`object_chase`); every other flight does
 not see the object for ten seconds. From the frame on in which a track is followed the object is to stay
 within the field. Whether a body at rest there could have kept it, with the authority that issue 16 states,
-and no more roll than the rate at which it is braked, is judged by a linear programme (`object_authority`).
+and no more roll than the rate at which it is braked, is judged by a linear programme (`least_deviation`).
 """
 
 from __future__ import annotations

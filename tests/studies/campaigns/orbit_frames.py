@@ -4,7 +4,7 @@ The satellite and the sensors of the campaign `orbit-attitude` (`orbit_world`: o
 an eclipse), but Sun and nadir come out of frames of all the suite's cameras, rendered by
 `sim_hal.earth_camera` with the Fuga 15d, air unknown. Each instant: the strings of six faces give a coarse
 Sun, which chooses the cameras to read for the Sun and stands in where none has it; nadir is one fit through
-all cameras (`several_cameras`), read in the order of the limb they should see; where no limb is in view, the
+all cameras (`nadir_of_cameras`), read in the order of the limb they should see; where no limb is in view, the
 light of all cameras gives a coarse nadir, and with the Sun a coarse attitude, told apart. Gyros at 2 Hz and
 the field at 1 Hz go to the filter throughout; frames, whose rendering takes most of a run, once a minute.
 

@@ -3,10 +3,10 @@
     found = detect(pixels, DetectionSettings()).stars()
     found.points, found.covariance, found.flux        # brightest first
 
-`sky` measures the background and its noise. `survey` finds the connected areas above the noise and decides
-whether the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits stars
-to their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches
-a frame, or the surroundings of predicted positions, for stars.
+`survey` measures the background and its noise, finds the connected areas above the noise and decides whether
+the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits stars to
+their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches a
+frame, or the surroundings of predicted positions, for stars.
 """
 
 from knightcube.vision.startracker.detection.detect import (

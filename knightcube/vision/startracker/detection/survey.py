@@ -1,14 +1,12 @@
-"""The sky background of a frame, its noise, and the pixels of the smoothed frame above it.
+"""The survey of a frame: its sky background, the areas above the noise, and whether they are streaks.
+
+`survey` smooths the frame, finds the pixels above the noise and joins them into areas. The shapes of the
+brightest areas distinguish a frame of points from a frame of streaks.
 
 The smoothing kernel is [1 2 1] along rows and columns, nearly the matched filter for a star of sigma 0.7 to
 1.5 px. The noise of the smoothed frame is measured in the smoothed frame: demosaicing and JPEG correlate
 pixels, and a threshold derived from single pixels would pass thousands of peaks. The frame is processed in
 bands of rows that fit into the processor cache; no second image of its size is allocated.
-
-The first pass over a frame: its sky, the connected areas above the noise, and whether they are streaks.
-
-`survey` smooths the frame, finds the pixels above the noise (`sky`) and joins them into areas. The shapes of
-the brightest areas tell a frame of points from a frame of streaks.
 """
 
 from __future__ import annotations
