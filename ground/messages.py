@@ -17,7 +17,7 @@ from flight.link.telemetry.packets import PacketArray
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.orientation import terrestrial_time
-from knightcube.astro.earth.sun import DAY, earth_velocity
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
 from knightcube.errors import UsageError
 from knightcube.gnc.first_orbit import (
     MINIMUM_SIGHTINGS,
@@ -115,9 +115,6 @@ def ccsds_date(utc_ns: int) -> str:
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}"
 
 
-_UNIX_EPOCH = 2_440_587.5
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectOrbit:
     """First orbit of a tracked object.
@@ -173,7 +170,7 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
     measured = np.hstack([placed["place"], placed["velocity"]])
     observer, own = smoothed(times, measured, placed["place_sigma"], middle)
     utc_ns = start_ns + int(placed["middle_ns"][middle])
-    date = float(terrestrial_time(_UNIX_EPOCH + utc_ns * 1e-9 / DAY))
+    date = float(terrestrial_time(UNIX_EPOCH + utc_ns * 1e-9 / DAY))
     bearings = Bearings(times, placed["measured"], placed["measured_sigma"], observer, earth_velocity(date))
     try:
         orbit = first_orbit(bearings)

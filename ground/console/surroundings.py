@@ -17,12 +17,11 @@ from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.earth.geomagnetism import GeomagneticError, field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
-from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, sunlit_share
 from knightcube.errors import FlightError
 from knightcube.vision.camera.images import facts_of
 
 Object = dict[str, Any]
-_UNIX_EPOCH = 2_440_587.5
 _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0
 """Step of the ground track, and its time before and after now, one revolution in low orbit (s)."""
 _MAX_SIDE = 640
@@ -106,7 +105,7 @@ UNKNOWN = FlightSurroundings(None, None)
 
 
 def _julian_date(utc_ns: int) -> float:
-    return _UNIX_EPOCH + utc_ns * 1e-9 / DAY
+    return UNIX_EPOCH + utc_ns * 1e-9 / DAY
 
 
 def _below(state: OrbitState) -> tuple[float, float, float]:

@@ -36,9 +36,9 @@ from knightcube.astro.earth.orientation import (
     geodetic,
     north_east_down,
 )
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.clock import NEVER, SerialEnd
-from sim_hal.worlds.world import UNIX_EPOCH, OrbitingWorld
+from sim_hal.worlds.world import OrbitingWorld
 
 NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
 _UNKNOWN = 0xFFFF_FFFF

@@ -34,12 +34,12 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
-from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, Shadow, earth_velocity, sunlit_share
+from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, UNIX_EPOCH, Shadow, earth_velocity, sunlit_share
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.settings import LineOfSight, ObjectState, SkyObject, Tumble
 from sim_hal.star_camera.image import SourceTrack
 from sim_hal.worlds.orbit import Orbit, propagate, sun_position
-from sim_hal.worlds.world import UNIX_EPOCH, OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
+from sim_hal.worlds.world import OrbitEnvironment, OrbitingWorld, World, orbiting, utc_date
 
 Expose = Callable[[int, FloatArray, FloatArray, Sequence[SourceTrack]], Future[Image]]
 """Renders a frame from its number, times (k,) s, camera attitudes (k, 4), and the tracks of objects."""

@@ -36,10 +36,10 @@ from hal.interfaces.errors import OutOfRange
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import ROTATION_RATE
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000, UNIX_EPOCH, sunlit_share
 from sim_hal.settings import Disturbances, OrbitSection
 from sim_hal.worlds import magnetic_field
-from sim_hal.worlds.world import UNIX_EPOCH, Floats, OrbitEnvironment
+from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12

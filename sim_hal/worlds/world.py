@@ -19,7 +19,7 @@ from flight.link.telemetry.packets import Packer
 from flight.schema.document import ConfigError
 from flight.schema.sections import Config
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.astro.quaternion import about_axis_y
 from sim_hal.clock import NEVER
 from sim_hal.settings import Simulation
@@ -136,8 +136,6 @@ def make_world(inputs: WorldInputs) -> World:
 
 Floats = tuple[float, float, float]
 
-UNIX_EPOCH = 2_440_587.5
-"""Julian date of 1970-01-01."""
 CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
 
 

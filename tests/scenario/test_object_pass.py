@@ -19,7 +19,7 @@ from flight.schema.orbit import as_orbit
 from ground.messages import write_tracking_data
 from ground.telemetry import Run
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
+from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, UNIX_EPOCH, earth_velocity
 from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry, Simulation
 from tests.support.flights import event_names, fly
@@ -30,7 +30,6 @@ DURATION, BLIND, GAP = 75.0, 48.0, 10.0
 """s: the flight, and when and how long the camera is off."""
 HALF_FIELD, PIXEL = 10.0, np.radians(20.0) / 512
 BORESIGHT = np.array([0.0, -1.0, 0.0])
-DAY, UNIX_EPOCH = 86_400.0, 2_440_587.5
 
 
 @pytest.fixture(scope="module")

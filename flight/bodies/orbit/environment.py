@@ -20,7 +20,7 @@ from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import GeomagneticError
 from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import terrestrial_time
-from knightcube.astro.earth.sun import DAY, earth_velocity
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
@@ -33,7 +33,6 @@ CONTRADICTED = 30
 """Number of contradicting fixes in a row after which the last accepted fix counts as wrong."""
 TIME_GATE_NS = SECOND_NS // 2
 """Largest step (ns) of the receiver's time relative to the clock; the craft flies 4 km in this time."""
-_UNIX_EPOCH = 2_440_587.5
 _SHORTEST = 1.0
 
 
@@ -61,13 +60,13 @@ class EstimatedEnvironment:
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
-        return _UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
+        return UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
 
     def fix(self, reading: GpsReading) -> bool:
         """Accept an epoch of the receiver; return whether it is used."""
         if not reading.valid:
             return False
-        date = _UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
+        date = UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
         offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
         try:
             fix = GpsFix(date, reading.position, reading.velocity, reading.sigma, reading.velocity_sigma)

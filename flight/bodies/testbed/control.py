@@ -40,7 +40,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import GeomagneticError, field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from knightcube.errors import UsageError
 from knightcube.gnc.control.detumble import Detumbler
@@ -554,7 +554,6 @@ class ThreadTracker:
 
 AHEAD = 20.0
 """Span (s) of one prediction, which takes a millisecond or two."""
-_UNIX_EPOCH = 2_440_587.5
 _ROUND = 6_000.0, 60.0
 """Span (s) of about one revolution, and step (s), of the search for the weakest field."""
 _ACROSS: FloatArray = np.array([1.0, 0.0, 1.0])
@@ -571,7 +570,7 @@ class CageField:
         except UsageError as error:
             raise ConfigError("cage.elements", f"are no two-line elements: {error}") from error
         self._scale = section.scale
-        self._date_zero = _UNIX_EPOCH + (clock.utc_ns() - clock.now_ns()) / (DAY * SECOND_NS)
+        self._date_zero = UNIX_EPOCH + (clock.utc_ns() - clock.now_ns()) / (DAY * SECOND_NS)
         self._near: Ephemeris | None = None
         self._local: FloatArray = np.zeros((0, 3))
         least = self._weakest(clock.now_ns())

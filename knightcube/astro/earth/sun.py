@@ -26,6 +26,8 @@ SUN_RADIUS = 695_700_000.0
 """Radius of the Sun, m (IAU 2015)."""
 J2000 = 2_451_545.0
 """Julian date of 2000 January 1.5 TT."""
+UNIX_EPOCH = 2_440_587.5
+"""Julian date of 1970 January 1.0."""
 DAY = 86_400.0
 """Length of a day, s."""
 

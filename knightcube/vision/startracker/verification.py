@@ -7,10 +7,10 @@ well or better. If it is far below one, it also bounds the probability of a fals
 depend on how a candidate was found. It is raised for every choice that the matching makes among gates,
 brightness limits and tests (Bonferroni).
 
-`track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
-an observed and a predicted star close enough to be the same, the largest set with one shift refines the
-attitude, and the whole field verifies it as in lost in space, with the uncertainty of the prior instead
-of the whole sky as the searched part.
+`track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error shifts all
+predicted stars by nearly the same vector. Of all pairs of an observed and a predicted star close enough to be
+the same, the largest set with one shift refines the attitude, and the whole field verifies it as in lost in
+space, with the uncertainty of the prior instead of the whole sky as the searched part.
 """
 
 from __future__ import annotations

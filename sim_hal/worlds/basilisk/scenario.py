@@ -33,12 +33,11 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.settings import Disturbances
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import DRAG_COEFFICIENT, TrueCraft
 from sim_hal.worlds.orbit import KeplerianElements, sun_position
-from sim_hal.worlds.world import UNIX_EPOCH
 
 MASS = 1.0
 """Mass (kg); it affects the decay of the orbit only."""

@@ -18,7 +18,7 @@ from flight.schema.document import ConfigError
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, UNIX_EPOCH
 from sim_hal.clock import NEVER
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.basilisk import STEP_NS
@@ -33,7 +33,6 @@ from sim_hal.worlds.free_body import (
 )
 from sim_hal.worlds.orbit import elements, julian_date, sun_position
 from sim_hal.worlds.world import (
-    UNIX_EPOCH,
     BodyMotion,
     Floats,
     OrbitEnvironment,

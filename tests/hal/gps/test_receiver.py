@@ -15,12 +15,11 @@ from hal.drivers.ublox import CFG_MSG, NAV_PVT, Pvt, UbloxReceiver, frame, readi
 from hal.interfaces.errors import NotResponding, OutOfRange
 from hal.interfaces.wires import SECOND_NS
 from knightcube.astro.earth.orbit_knowledge import GpsFix
-from knightcube.astro.earth.sun import DAY
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.serial_line import LineFaults, PtyLine
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.free_body import FreeBody
-from sim_hal.worlds.world import UNIX_EPOCH
 from tests.hal.gps.bench_line import EXACT, bench
 from tests.hal.gps.fixes import PVT
 

@@ -1,8 +1,8 @@
 """Campaign `nadir`: the way down from random frames of the Earth's limb, in daylight and with the terminator.
 
 Positions, attitudes, Suns and ground are random, altitudes uniform over 200..2,000 km
-(`tests.sim_hal.earth_camera.scenes`); the camera is the logarithmic Fuga 15d of 67 deg with distortion, noise and
-blemishes. The finder knows the position (GPS), the Sun's direction and the field's from models, and both
+(`tests.sim_hal.earth_camera.scenes`); the camera is the logarithmic Fuga 15d of 67 deg with distortion, noise
+and blemishes. The finder knows the position (GPS), the Sun's direction and the field's from models, and both
 coarsely in camera axes: solar strings to 5 deg an axis, magnetometer to 2 deg. Each view comes with air that
 the finder knows, its limb's height to 1 km, and with air that it does not: scale height and haze are drawn.
 

@@ -18,11 +18,11 @@ from knightcube.astro.earth.ephemeris import predict
 from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
+from knightcube.astro.earth.sun import DAY, UNIX_EPOCH
 from sim_hal.clock import SimClock
 from tests.support.flights import CONFIG
 
 UTC_NS = round(datetime.fromisoformat("2026-03-20T12:00:00Z").timestamp()) * SECOND_NS
-UNIX_EPOCH, DAY = 2_440_587.5, 86_400.0
 
 
 @pytest.fixture
