@@ -30,7 +30,6 @@ from knightcube.gnc.first_orbit import (
 
 _ARCSECONDS = math.degrees(3600.0)
 ORIGINATOR = "KNIGHTCUBE"
-_NO_OBJECT = "no object was tracked; `camera: {objects: {}}` in the configuration enables the tracking"
 _SECOND_NS = 1_000_000_000
 
 
@@ -45,9 +44,7 @@ def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> li
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
     if not len(measured) or not len(run["run"]):
-        raise UsageError(
-            f"{run.folder}: no object was tracked; `camera: {{objects: {{}}}}` enables the tracking"
-        )
+        raise _no_object(run)
     start_ns = int(run["run"]["utc_ns"][-1])
     lines = [
         "CCSDS_TDM_VERS = 2.0",
@@ -146,11 +143,15 @@ def orbits_of(run: Run) -> list[ObjectOrbit]:
     """Return the orbit of each tracked object. Raises UsageError for a run without objects."""
     tracks, labels = run["track"], run["run"]
     if not len(tracks) or not len(labels):
-        raise UsageError(
-            f"{run.folder}: no object was tracked; `camera: {{objects: {{}}}}` enables the tracking"
-        )
+        raise _no_object(run)
     start_ns = int(labels["utc_ns"][-1])
     return [_orbit(number, tracks, start_ns) for number in sorted(set(tracks["number"].tolist()))]
+
+
+def _no_object(run: Run) -> UsageError:
+    return UsageError(
+        f"{run.folder}: no object was tracked; `camera: {{objects: {{}}}}` enables the tracking"
+    )
 
 
 def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:

@@ -18,6 +18,9 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Protocol
 
+_BLOCK_LIMIT = 32
+"""Maximum number of bytes of a block."""
+
 
 class I2cPart(Protocol):
     """A part on the bus."""
@@ -247,14 +250,11 @@ def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
 
 
 def _check_length(length: int) -> None:
-    if not 1 <= length <= 32:
-        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to 32")
+    if not 1 <= length <= _BLOCK_LIMIT:
+        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {_BLOCK_LIMIT}")
 
 
 _BLOCK, _OLD_I2C_BLOCK = 5, 6
-BLOCK_MAX = 32
-DATA_LENGTH = BLOCK_MAX + 2
-"""Bytes of the union i2c_smbus_data."""
 
 FUNCTIONS = 0x00000001 | 0x00FF0000 | 0x02000000 | 0x0C000000
 """Plain I2C; SMBus quick, byte, byte data, word data, process call and block write; I2C blocks."""
@@ -289,8 +289,8 @@ def smbus(
 def _block(bus: EmulatedI2cBus, address: int, reading: bool, head: bytes, size: int, data: bytes) -> bytes:
     """Execute a block transfer; on the wire an SMBus block includes its length, an I2C block does not."""
     # With the old number of the transfer a program reads a block of full length.
-    length = BLOCK_MAX if size == _OLD_I2C_BLOCK and reading else data[0]
-    if not 1 <= length <= BLOCK_MAX:
+    length = _BLOCK_LIMIT if size == _OLD_I2C_BLOCK and reading else data[0]
+    if not 1 <= length <= _BLOCK_LIMIT:
         raise OSError(errno.EINVAL, f"a block of {length} bytes")
     if reading:
         (given,) = bus.transfer([Message(address, head), Message(address, count=length)])

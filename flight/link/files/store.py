@@ -16,7 +16,7 @@ from typing import Annotated, TypeVar
 import msgspec
 from msgspec import Meta
 
-from flight.link.files.units import HIGHEST_NUMBER, Transaction
+from flight.link.files.units import HIGHEST_NUMBER
 from flight.link.regular_files import locked, make_lasting, read_regular
 from knightcube.errors import FlightError, UsageError
 
@@ -181,11 +181,6 @@ class Store:
     def _write_numbers(self, last: int, endings: tuple[Ending, ...]) -> None:
         write_whole(self._folder / "numbers.json", msgspec.json.encode(_Numbers(last, endings)))
         self.last, self.endings = last, endings
-
-
-def transaction_of(ending: Ending | Incoming, destination: int) -> Transaction:
-    """Return the transaction of an incoming transfer."""
-    return Transaction(ending.source, ending.number, destination)
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -42,7 +42,6 @@ from flight.link.files.units import (
     pack,
     unpack,
 )
-from knightcube.errors import UsageError
 
 MODULAR, CRC32 = 0, 3
 TYPES = (MODULAR, CRC32)
@@ -720,14 +719,6 @@ class Entity:
             del self._in[key]
             self._store.remove(receiver.record)
             self.ended.append(_of_receiver(receiver))
-
-
-def open_entity(number: int, folder: Path, accept: Accept, most: int, now_ns: int) -> Entity:
-    """Return the entity of a folder. Raises UsageError if the folder cannot be written."""
-    try:
-        return Entity(number, Store(folder), accept, most, now_ns)
-    except FileError as error:
-        raise UsageError(str(error)) from error
 
 
 def _of_sender(sender: Sender) -> Progress:

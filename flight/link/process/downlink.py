@@ -179,8 +179,6 @@ def _at_once(path: str, flags: int) -> int:
 LIVE, PLAYBACK, FILES = 0, 1, 2
 """Virtual channels of live telemetry, playback and files."""
 
-LEAST_FRAME = TELEMETRY_HEADER.size + OVERHEAD_BYTES + CRC_BYTES + 64
-
 _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
