@@ -21,6 +21,7 @@ from typing import TypeVar
 
 from smbus2 import I2cFunc, SMBus
 
+from hal.buses.smbus_byte import I2C_TIMEOUT
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 
 
@@ -35,7 +36,6 @@ def lock_bus(descriptor: int) -> None:
 _Answer = TypeVar("_Answer")
 
 I2C_RETRIES = 0x0701
-I2C_TIMEOUT = 0x0702
 _TIMEOUT_UNIT_NS = 10_000_000
 _BLOCK_LIMIT = 32
 

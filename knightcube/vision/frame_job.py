@@ -33,7 +33,6 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.sky_map import ShortTrails
 from knightcube.vision.startracker.solve import (
     MOVED,
-    PRIOR_SIGMAS,
     AttitudePrior,
     FrameSolution,
     RatePrior,
@@ -43,6 +42,7 @@ from knightcube.vision.startracker.solve import (
     solve_near,
     solve_points,
 )
+from knightcube.vision.startracker.verification import PRIOR_SIGMAS
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
 

@@ -34,6 +34,7 @@ import numpy as np
 
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS
+from knightcube.vision.frame import MAD_TO_SIGMA
 
 MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0
 """Mean radius of the Earth (m), 6,371,008.8 (WGS 84)."""
@@ -203,8 +204,6 @@ _HUBER, _BEYOND = 1.5, 5.0
 """Residuals, in standard deviations, from which Huber's weights fall and beyond which they are zero."""
 _MOST_CORRELATED = 0.8
 """Largest assumed correlation between neighbouring residuals."""
-_TO_SIGMA = 1.4826
-"""Ratio of the standard deviation of a normal distribution to its median absolute value."""
 UNKNOWN = 1e9
 """Standard deviation (m) of an unknown height."""
 
@@ -324,7 +323,7 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, Bool
     """Return the weights (n,), rad^-2, of residuals (n,), and which edges have any weight (n,)."""
     scaled = np.abs(residuals) / sigma
     middle = len(scaled) // 2
-    spread = max(1.0, _TO_SIGMA * float(np.partition(scaled, middle)[middle]))
+    spread = max(1.0, MAD_TO_SIGMA * float(np.partition(scaled, middle)[middle]))
     scaled /= spread
     used = scaled <= _BEYOND
     huber = np.minimum(1.0, _HUBER / np.maximum(scaled, _HUBER))

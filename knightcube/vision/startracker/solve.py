@@ -35,7 +35,7 @@ from knightcube.vision.startracker.image_fit import Unknowns, attitude_by, fit_i
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
-from knightcube.vision.startracker.verification import expected_stars, track
+from knightcube.vision.startracker.verification import PRIOR_SIGMAS, expected_stars, track
 from knightcube.vision.streaks.geometry import Course
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, StreakStatus
@@ -199,7 +199,6 @@ _PLACELESS_PX = 5.0
 _NEAR = 25.9
 # Number of stars that tracking looks for, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
-PRIOR_SIGMAS = 4.0
 # Limits of the search radius (px); above the larger one, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 

@@ -358,8 +358,9 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
     )
 
 
+PRIOR_SIGMAS = 4.0
+"""Largest assumed error of a prior attitude, in standard deviations."""
 _BRIGHTEST = 16
-_PRIOR_SIGMAS = 4.0
 # More pairs are ambiguous, and comparing them takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
@@ -395,7 +396,7 @@ def track(
         if found is not None:
             matrix, scale = found.matrix, found.scale
     # Volume of the ball of rotations around the prior over that of all rotations, 8 pi^2 in this measure.
-    searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
+    searched = min((PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify(field, sky, matrix, scale, searched, settings)
 
 
@@ -403,7 +404,7 @@ def _same_shift(
     field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float, sigma: float
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
     """Return observed and guide stars (k,), (k,) of the largest set of pairs with one shift."""
-    reach = _PRIOR_SIGMAS * sigma
+    reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)
     wider = across + reach * (1.0 + across**2), down + reach * (1.0 + down**2)
     area = (wider[0] * wider[1]) / (across * down)
@@ -423,7 +424,7 @@ def _same_shift(
         return np.empty(0, dtype=np.int64), expected[:0]
     shifts = shift[one, two]
     apart = shifts[:, None, :] - shifts
-    tolerance = 4.0 * star_sigma + (_PRIOR_SIGMAS * sigma + stretch) * radius
+    tolerance = 4.0 * star_sigma + (PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
     # Pairs that share an observed or a guide star do not support each other.
     agree &= (one[:, None] != one) & (two[:, None] != two)

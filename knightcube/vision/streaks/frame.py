@@ -207,8 +207,8 @@ _UNEVEN_RESPONSE = 0.06
 _UNEVEN_SIGMAS = 8.0
 # Interquartile range of a normal distribution, in standard deviations.
 _QUARTILES = 1.35
-# Standard error of a median, relative to that of a mean.
-_MEDIAN = 1.25
+MEDIAN_ERROR = 1.25
+"""Standard error of a median of normal values, relative to that of their mean."""
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
@@ -225,7 +225,7 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     share = light / np.mean(light, axis=1, keepdims=True)
     low, middle, high = np.quantile(share, (0.25, 0.5, 0.75), axis=0)
     off = np.abs(middle - 1.0)
-    error = _MEDIAN * (high - low) / _QUARTILES / np.sqrt(count)
+    error = MEDIAN_ERROR * (high - low) / _QUARTILES / np.sqrt(count)
     if not np.any((off > _UNEVEN_RESPONSE) & (off > _UNEVEN_SIGMAS * error)) or np.any(middle <= 0.0):
         return None
     response = np.asarray(middle / middle.mean()).reshape(2, 2)

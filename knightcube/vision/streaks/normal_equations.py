@@ -23,7 +23,7 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.frame import Float32Array, ReducedFrame
+from knightcube.vision.streaks.frame import MEDIAN_ERROR, Float32Array, ReducedFrame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
     Shutter,
@@ -718,8 +718,6 @@ def stepped(
     return after, max(ends, abs(float(solution.shared[6])))
 
 
-# Standard error of a median, relative to that of a mean.
-_MEDIAN = 1.25
 # Information of a star, relative to the best one, below which it is ignored.
 _NOTHING = 1e-9
 # Information of a star on a direction, relative to its best direction, below which it is ignored.
@@ -816,7 +814,7 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
         # The uncertainty of the median keeps a star that is better known than all others.
-        error = _MEDIAN * np.sqrt(len(spread)) / np.sum(1.0 / spread)
+        error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 

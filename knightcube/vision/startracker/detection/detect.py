@@ -24,6 +24,7 @@ from knightcube.vision.startracker.detection.measurement import (
 from knightcube.vision.startracker.detection.psf_fit import StarTargets, StarWindows, cut, smoothed
 from knightcube.vision.startracker.detection.survey import (
     KERNEL_NORM,
+    TAIL_PART,
     Areas,
     DetectionSettings,
     FrameKind,
@@ -372,7 +373,6 @@ def _flags_of_areas(sky: SkyBackground, areas: Areas, peaks: Peaks) -> IntArray:
 # Width (px) of the rim around the search area from which the sky is measured.
 _RIM = 5
 _ROUNDING = 12.0**-0.5
-_TAIL_PART = 0.97725
 _SAME_STAR = 1.5
 
 
@@ -479,7 +479,7 @@ def _sky_of(windows: StarWindows, radius: float) -> tuple[FloatArray, FloatArray
 
 def _reach(values: FloatArray) -> float:
     """Return the 97.7th percentile of each row of `values` (n, k), as the median over the rows."""
-    place = int(_TAIL_PART * values.shape[1])
+    place = int(TAIL_PART * values.shape[1])
     return float(np.median(np.partition(values, place, axis=1)[:, place]))
 
 

@@ -39,7 +39,8 @@ LEAST_SIDE = 16
 _FLOATING_NOISE = 16.0
 _BAND = 32
 _SKY_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
-_TAIL_PART = 0.97725
+TAIL_PART = 0.97725
+"""Share of a normal distribution below two standard deviations."""
 # Ratio below which a correlation of pixels is attributed to chance and to the faintest stars.
 _CORRELATED = 1.05
 # Ratio of the lower tail of the noise to two standard deviations, below which it is clipped at zero counts.
@@ -259,7 +260,7 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
     blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
     values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
     last = values.shape[-1] - 1
-    high = min(last, int(_TAIL_PART * values.shape[-1]))
+    high = min(last, int(TAIL_PART * values.shape[-1]))
     ordered = np.partition(values, (last - high, high), axis=-1)
     tail = np.maximum(1.0, 0.5 * ordered[..., high])
     reach = ndimage.median_filter(-ordered[..., last - high], size=3, mode="nearest")
