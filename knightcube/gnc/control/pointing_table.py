@@ -404,29 +404,6 @@ def pointing_table(
     return PointingTable(path, wanted, motion.control[:count, :3], gain, torque_part, ahead.sizes)
 
 
-def table_along(
-    motion: AttitudeReferences,
-    field: FloatArray,
-    position: FloatArray,
-    inertia: FloatArray,
-    weights: PointingWeights,
-) -> PointingTable:
-    """Return the table that holds a given motion (n + 1,) without other torques than the motion's own.
-
-    `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
-    have less preview.
-    """
-    count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
-    state, dipole = step_costs(weights, dt)
-    linear = linearised(motion.until(count), inertia, field[:count], position[:count])
-    affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
-    nothing = np.zeros(affine.shape)
-    states = np.broadcast_to(state, (count, 6, 6))
-    cost = SweepCost(states, np.full((count, 3), dipole), nothing, nothing[:, :3])
-    gain, steady, _ = sweep(linear, affine, cost, CostToGo(state, nothing[0]))
-    return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
-
-
 def step_costs(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
     """Return the costs of a step of `dt` s: (6, 6) of rotation and rate, and of each axis of the dipole."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))

@@ -25,13 +25,14 @@ from knightcube.astro.quaternion import (
     to_rotation_vector,
 )
 from knightcube.gnc.control import pointing_job
-from knightcube.gnc.control.pointing_table import PointingTable, table_along
+from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences, references
 from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from knightcube.gnc.guidance.three_axes.slew_model import SlewPath
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, PointingFlight
+from tests.support.held_motion import table_along
 
 LEARN = 1_200.0
 """s."""

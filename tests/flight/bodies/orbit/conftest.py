@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.gnc.control.pointing_table import PointingTable, table_along
+from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.guidance.three_axes.attitude_law import references
 from tests.knightcube.gnc.control.pointing_cases import (
     INERTIA,
@@ -14,6 +14,7 @@ from tests.knightcube.gnc.control.pointing_cases import (
     STEP,
     WEIGHTS,
 )
+from tests.support.held_motion import table_along
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,33 @@
+"""The table of the pointing law along a given motion, without the planner's search for that motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.pointing_path import CostToGo, SweepCost, linearised, sweep
+from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights, step_costs
+from knightcube.gnc.guidance.three_axes.attitude_law import AttitudeReferences
+
+
+def table_along(
+    motion: AttitudeReferences,
+    field: FloatArray,
+    position: FloatArray,
+    inertia: FloatArray,
+    weights: PointingWeights,
+) -> PointingTable:
+    """Return the table that holds a given motion (n + 1,) without other torques than the motion's own.
+
+    `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
+    have less preview.
+    """
+    count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
+    state, dipole = step_costs(weights, dt)
+    linear = linearised(motion.until(count), inertia, field[:count], position[:count])
+    affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
+    nothing = np.zeros(affine.shape)
+    states = np.broadcast_to(state, (count, 6, 6))
+    cost = SweepCost(states, np.full((count, 3), dipole), nothing, nothing[:, :3])
+    gain, steady, _ = sweep(linear, affine, cost, CostToGo(state, nothing[0]))
+    return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
