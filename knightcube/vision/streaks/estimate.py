@@ -1,14 +1,14 @@
 """The motion over one exposure from all pixels of all its streaks, from the frame to the covariance.
 
-Bright regions give first guesses, the brightest stars first fits, and each fitted motion a matched filter for
-faint stars. The joint fit of the bright stars, with the faint ones accounted for, gives the result. It is
-checked whether the streaks are entire: a rotation that is too small divides streaks into pieces, and one that
-is too large joins several. The functions are pure and deterministic.
+Bright regions give first guesses of the motion, which are fitted to the brightest stars. Along each fitted
+motion, a matched filter detects faint stars. The joint fit of the bright stars, with the faint ones accounted
+for, gives the result. A final check requires entire streaks: a rotation that is too small divides streaks
+into pieces, and a rotation that is too large joins several streaks. The functions are pure and deterministic.
 
 With a rolling shutter, a star that moves down the frame, with the readout, is exposed longer than one that
-moves up: a motion and its time reversal draw streaks of different lengths. A prior decides between the two
-before the fit. Without one, both are fitted and the stars decide; if they do not agree, the result lies
-between the two motions and its covariance includes both.
+moves up: a motion and its time reversal draw streaks of different lengths. A prior rate decides between the
+two directions of time before the fit. Without a prior, both directions are fitted and the stars decide. If
+the stars do not agree, the result lies between the two motions, and its covariance includes both.
 """
 
 from __future__ import annotations
@@ -78,42 +78,48 @@ from knightcube.vision.streaks.uncertainty import (
     rotation_uncertainty,
 )
 
-# Relative difference of angles and of motions below which they are the same.
+# Relative difference of two rotation angles below which they count as the same angle.
 _SAME_ANGLE = 0.05
+# Relative difference of two rotation vectors below which they count as the same motion.
 _SAME_MOTION = 0.005
 # Number of the brightest stars in a first fit.
 _FIRST_STARS = 12
-# Maximum number of guesses that are fitted, of guesses with a changing rate, and of angles of the scan of the
-# whole frame.
+# Maximum number of first guesses that are fitted.
 _MOST_GUESSES = 5
+# Maximum number of first guesses with a changing rate.
 _MOST_GROWING = 2
+# Maximum number of rotation angles that are taken from the scan of the whole frame.
 _MOST_ANGLES = 2
 # Maximum number of rounds of the fit of stars at rest.
 _STILL_ROUNDS = 12
-# Minimum number of entire streaks for a guess by lengths without a scan, and the largest fraction of light in
-# regions that are longer than the guess.
+# Minimum number of entire streaks for a guess from streak lengths, without a scan.
 _WHOLE = 8
+# Maximum fraction of the light in regions longer than the guess, for a guess without a scan.
 _CONTRADICTED = 0.3
-# Requirements of a first fit that needs no comparison: number of stars, fraction of explained stars, fraction
-# of correct ends, and explained light in squared standard deviations.
+# Minimum number of stars of a first fit that is accepted without comparison with others.
 _MANY = 3
+# Minimum fraction of explained stars in a first fit that is accepted without comparison with others.
 _EXPLAINED = 0.4
+# Minimum fraction of correct streak ends in a first fit that is accepted without comparison.
 _IN_PLACE = 0.6
+# Minimum explained light (squared standard deviations) of a fit accepted without comparison.
 _EVIDENT = 3000.0
-# Largest median chi-square of a first fit that is kept.
+# Largest median chi-square per degree of freedom of a first fit that is kept.
 _WORST_FIRST = 12.0
-# Fraction of lit pixels of a crowded frame, in which the brightest regions are blends, and the explained
-# light up to which its whole area is scanned.
+# Fraction of lit pixels above which a frame counts as crowded: its brightest regions are blends.
 _CROWDED = 0.05
+# Explained light (squared standard deviations) below which a crowded frame is scanned completely.
 _BEYOND_CROWD = 100_000.0
-# Largest residual of an explained star, relative to its light, and the largest significance that counts.
+# Largest residual of an explained star, relative to its light.
 _MOST_RESIDUAL = 0.01
+# Largest significance (standard deviations) with which a star counts as explained light.
 _ENOUGH = 200.0
-# Weight of regions that are longer than a guess; they may be two streaks.
+# Weight of the light in regions longer than a guess.
+# It is below 1, because a long region may be two streaks.
 _CONTRADICTION = 0.6
-# Last step (standard deviations) of a settled first fit.
+# Last step (standard deviations) below which a first fit counts as settled.
 _CALM = 2.0
-# Fraction of correct ends of a wrong rotation, which may have one of the two ends of each streak.
+# Fraction of correct streak ends that a wrong rotation can reach, by fitting one end of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
@@ -143,7 +149,7 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     if rivals and not yielded:
-        # The regions do not show the angle, but the light of the whole frame may.
+        # The regions do not determine the rotation angle, but the light of the whole frame may.
         axis = max(rivals, key=lambda rival: rival[0])[1].scene.motion.rotation
         angles = _frame_angles(camera, axis)
         for explained, convincing, done in _rescanned(camera, axis, angles):
@@ -160,9 +166,9 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit by the light of the whole frame that explains more than `done`, None without one.
+    """Return a fit from a scan of the whole frame that explains more light than `done`.
 
-    None, too, if the frame is not crowded or `done` explains enough.
+    The result is None if no fit does, if the frame is not crowded, or if `done` explains enough light.
     """
     if regions.lit <= _CROWDED or explained >= _BEYOND_CROWD:
         return None
@@ -192,7 +198,7 @@ def _frame_angles(camera: FitProblem, rotation: FloatArray) -> list[float]:
 def _rescanned(
     camera: FitProblem, rotation: FloatArray, angles: list[float]
 ) -> Iterator[tuple[float, bool, StreakFit]]:
-    """Yield fits about the axis of `rotation` (3,) near `angles` (rad), as `_tried` returns them."""
+    """Yield the results of `_tried` for motions about the axis of `rotation` (3,) near `angles` (rad)."""
     settings, pinhole = camera.settings, camera.pinhole
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     frame = polar_grid(pinhole, CameraMotion.steady(rotation)).frame
@@ -223,7 +229,10 @@ def alike(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[MotionGuess]:
-    """Yield first guesses, likeliest first: by entire streaks if there are many, else by a scan."""
+    """Yield first guesses of the motion, likeliest first.
+
+    They follow from the lengths of entire streaks if there are many, otherwise from a scan.
+    """
     guess = find_axis(regions, camera.pinhole)
     if guess is None:
         return
@@ -242,9 +251,9 @@ def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> 
 
 
 def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakFit] | None:
-    """Return the light that a fitted guess explains, whether it needs no comparison, and the fit.
+    """Fit a guess, and return the light that it explains, whether it needs no comparison, and the fit.
 
-    The explained light is in squared standard deviations; None if the fit fails.
+    The explained light is in squared standard deviations. The result is None if the fit fails.
     """
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
@@ -257,13 +266,14 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # A rotation of the wrong size leaves much of a star's light at one end, or models absent light.
+    # A wrong rotation angle leaves much of a star's light unexplained at one end, or models light that is
+    # absent.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
     good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
-    # Fraction of correct ends, or of unbroken streaks if that is smaller; 1 if none can be judged.
+    # Smaller of the fractions of correct ends and of unbroken streaks; 1 if no streak can be judged.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -273,7 +283,7 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
 
 
 def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
-    """Return the fit of stars at rest: positions, light and the width of the point spread."""
+    """Return the fit of positions, light and point-spread width to stars of a camera at rest."""
     count = min(len(regions), camera.settings.most_stars)
     width = float(np.hypot(camera.sigma, 0.29))
     everyone = np.ones(count, dtype=np.bool_)
@@ -285,16 +295,17 @@ def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
 
 # Largest fraction of stars that look like pieces of longer streaks.
 _MOST_CHAINED = 0.45
-# Minimum fraction of correct ends: without doubt, and for a possible motion.
+# Minimum fractions of correct streak ends of a motion that is accepted, and of one that is doubtful.
 _TRUE_ENDS = (0.75, 0.6)
-# Largest fraction of stars with dark stretches: without doubt, and for a possible motion.
+# Largest fractions of stars with dark stretches for a motion that is accepted, and for a doubtful one.
 _BROKEN = (0.12, 0.35)
-# Number of stars with two correct ends that outweigh other doubts.
+# Number of stars with two correct ends from which a motion is accepted in spite of dark stretches.
 _CONFIRMING = 3
 # Minimum fraction of the light of streaks with both ends in the frame that agrees with the motion.
 _AGREEING_LIGHT = 0.5
-# Relative change of the rate from which trails are judged, and the largest fraction of stars with a trail.
+# Relative change of the rate above which trails beyond the ends of the streaks are tested.
 _UNEVEN = 0.4
+# Largest fraction of stars with a trail beyond an end.
 _MOST_TRAILING = 0.5
 
 
@@ -309,9 +320,10 @@ class StreakVerdict(Enum):
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
     """Return whether the trusted streaks have correct ends and are bright along their whole length.
 
-    In a crowded frame an apparent star may be several stars, so that a few dark streaks make a motion only
-    doubtful, unless enough streaks with two correct ends confirm it. A motion is doubtful, too, if no streak
-    has both ends in the frame, or if most streaks that have both disagree. Wrong ends reject it.
+    In a crowded frame an apparent star may be several stars. A few dark streaks therefore make a motion only
+    doubtful, unless enough streaks with two correct ends confirm it. A motion is also doubtful if no streak
+    has both ends in the frame, or if most streaks with both ends in the frame disagree with it. A motion with
+    too many wrong ends is rejected.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -344,23 +356,24 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
-    """Return whether most light of bright streaks with both ends in the frame is of untrusted stars."""
+    """Return whether untrusted stars have most of the light of bright streaks with both ends in the frame."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Fainter stars were not considered for trust.
+    # Stars fainter than all trusted stars were never tested against the majority.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
 
 
-# Distance (px) between streaks of the same star in fits of both directions of time.
+# Largest distance (px) between the streaks of one star in the fits of both directions of time.
 _SAME_STAR = 3.0
-# Minimum difference of chi-square for a direction: absolute, and relative to the stars' scatter; and the
-# largest difference of one star.
+# Minimum difference of chi-square between the two directions of time that decides between them.
 _LEAST_MARGIN = 50.0
+# Minimum difference of chi-square between the directions of time, relative to the stars' scatter.
 _LEAST_AGREEMENT = 3.0
+# Largest difference of chi-square that one star contributes to the choice of the direction.
 _MOST_DIFFERENCE = 50.0
 
 
@@ -373,7 +386,7 @@ class _Candidate:
         rotation: (3,) rad over the exposure.
         verdict: verdict on its streaks.
         middles: (n, 2) px, centres of the bright streaks; only with a rolling shutter.
-        excess: (n,) chi-square minus number of pixels of these streaks.
+        excess: (n,) chi-square minus number of pixels, of each bright streak; only with a rolling shutter.
     """
 
     result: MotionResult
@@ -395,7 +408,7 @@ def _rolling_result(
     prior_sigma: float,
     sigmas: float,
 ) -> MotionResult | None:
-    """Return the motion under a rolling shutter, None without one.
+    """Return the motion under a rolling shutter, None if no motion fits.
 
     Args:
         fit_along: returns the motion with a rotation along a vector (3,).
@@ -418,7 +431,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # The direction that failed may be the true one.
+        # The direction of time whose fit failed may be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -437,28 +450,31 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y, and of the light, among the shared parameters and those of a star.
+# Indices of rate, acceleration, x and y in the parameter vector of a star and the shared parameters.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
+# Index of the light in the parameter vector of a star and the shared parameters.
 _LIGHT = 9
-# Last step (standard deviations) from which a fit has not settled.
+# Last step (standard deviations) above which a fit counts as not converged.
 _UNSETTLED = 2.0
-# Minimum improvement of chi-square by a rotation that reverses.
+# Minimum improvement of chi-square from which a rotation counts as reversed within the exposure.
 _REVERSED = 30.0
-# Distance (px) and minimum ratio of light of double streaks, and the largest fraction of them. Vibration
-# doubles streaks, because the light gathers at the turning points.
+# Largest distance (px) between two streaks that count as one double streak.
+# Vibration doubles streaks, because the light gathers at the turning points.
 _DOUBLE = 8.0
+# Minimum ratio of the light of the fainter to the brighter part of a double streak.
 _DOUBLE_RATIO = 0.3
+# Largest fraction of double streaks in a frame that gives a rate.
 _MOST_DOUBLE = 0.4
-# Distance (px) below which two streaks are one.
+# Distance (px) below which two fitted streaks count as one.
 _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return `seen` with the stars of the fit, the ends of their streaks, and the covariances."""
+    """Return the result `seen` with the fitted stars, the ends of their streaks, and their covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
-    # A fit may move one star onto another; only the brighter one is kept.
+    # A fit may move one star onto another; only the brighter of the two is kept.
     stars, light = last.scene.stars[kept], last.scene.light[kept]
     near = np.linalg.norm(stars[:, None] - stars, axis=2) < _SAME
     kept = kept[~(near & (light > light[:, None])).any(axis=1)]
@@ -496,7 +512,7 @@ def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> Motio
 def with_rate(
     result: MotionResult, camera: FitProblem, last: StreakFit, verdict: StreakVerdict
 ) -> MotionResult:
-    """Return `result` with the rate, or with the reason why there is none."""
+    """Return `result` with the rate, or with the reason for a missing rate."""
     settings = camera.settings
     if result.used_count < settings.least_stars:
         why = f"{result.used_count} streaks agree, at least {settings.least_stars} are needed"
@@ -563,11 +579,13 @@ def _rejection(
 _MOST_MOTIONS = 2
 # Median length (px) of the regions below which a frame without a common motion shows stars at rest.
 _AT_REST = 4.0
-# Median length (px) of the brightest regions below which there are no streaks, and number of these regions.
+# Median length (px) of the brightest regions below which a frame counts as one without streaks.
 _SPOT = 2.2
+# Number of the brightest regions whose median length is compared with `_SPOT`.
 _BRIGHTEST = 12
-# Reasons for a missing rate, after a fit and without one.
+# Reason for a missing rate after a fit.
 _NO_CONSISTENT_MOTION = "no motion is consistent with the brightness and the ends of the streaks"
+# Reason for a missing rate without a fit.
 _NO_COMMON_MOTION = "the bright regions do not share one motion"
 
 
@@ -580,18 +598,18 @@ def estimate_rate(
     prior_sigma: float = 0.0,
     settings: LikelihoodSettings | None = None,
 ) -> MotionResult:
-    """Return the rate of a camera from the star streaks in one image, or the reason why there is none.
+    """Return the rate of a camera from the star streaks in one image, or the reason for a missing rate.
 
-    The result has the mean rate `rate` (3,) rad/s with respect to the stars, camera axes, its `covariance`
-    (3, 3), and `start_to_end`, the quaternion (4,) of the rotation over the exposure. One image does not show
-    the direction of time: without a prior, the status is `ambiguous` and the rate is known up to its sign. If
+    The result has the mean `rate` (3,), rad/s, with respect to the stars in camera axes, and its `covariance`
+    (3, 3). Its quaternion `start_to_end` (4,) is the rotation over the exposure. One image does not show the
+    direction of time: without a prior, the status is `ambiguous` and the rate is known up to its sign. If
     `rate` is None, `reason` says why.
 
     Args:
         image: (rows, columns) raw counts, of an unsigned integer type.
         camera: pinhole, or calibrated lens, whose distortion counts as an uncertainty of the pinhole.
         exposure: exposure time, s.
-        prior_rate: (3,) rad/s, approximate rate, camera axes; determines only the direction of rotation.
+        prior_rate: (3,) rad/s, approximate rate in camera axes. It determines only the direction of rotation.
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
@@ -628,11 +646,11 @@ def estimate_motion(
         previous_checksum: checksum of the previous frame; equal pixels indicate a frozen camera.
         prior_course: rotation during the exposure as navigation knows it; None if unknown.
 
-    Raises FlightError for an invalid frame, exposure or prior. The status and `reason` of the result tell why
-    a frame has no rate.
+    Raises FlightError for an invalid frame, exposure or prior. If a frame has no rate, the status and
+    `reason` of the result state why.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    # A frame may saturate below the described level, but never above it.
+    # A frame may saturate below the saturation level of the settings, but never above it.
     saturation = min(saturation_count(pixels), settings.saturation or np.inf)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
@@ -660,7 +678,7 @@ def estimate_motion(
         if found is not None:
             return binning.in_pixels(found)
     length = float(np.median(regions.length))
-    # In a crowded sky at rest the faint regions merge, but not the brightest.
+    # With a crowded sky and a camera at rest, faint regions merge, but the brightest regions do not.
     if length >= _AT_REST and not spots:
         seen = replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_COMMON_MOTION)
     else:
@@ -691,7 +709,7 @@ def _in_direction(
 
         return _rolling_result(fit_along, axis[0], prior_rate, prior_sigma, sigmas)
     if course is not None and camera.course is not None:
-        # The course is used unless the pixels contradict it.
+        # The motion known from navigation is used unless the pixels contradict it.
         found = _best_motion(camera, seen, regions, near)
         if found is not None and found.result.status is not StreakStatus.FAILED:
             result = found.result
@@ -706,7 +724,10 @@ def _in_direction(
 def _best_motion(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None
 ) -> _Candidate | None:
-    """Return the first motion that passes all tests, else the likeliest without a rate; None without any."""
+    """Return the first motion that passes all tests, otherwise the likeliest motion without a rate.
+
+    The result is None if no motion is found.
+    """
     rivals = islice(first_fits(camera, regions, near), _MOST_MOTIONS)
     first = next(rivals, None)
     if first is None:
@@ -714,8 +735,9 @@ def _best_motion(
     leading = _fitted(camera, seen, first)
     if leading.verdict is StreakVerdict.CONFIRMED:
         return leading
-    # A doubtful motion is accepted if the light of the whole frame gives the same angle. This test costs less
-    # than the fit of another motion. The axis is often right, even from pieces of streaks, but not the angle.
+    # A doubtful motion is accepted if the light of the whole frame gives the same angle.
+    # This test takes less time than the fit of another motion.
+    # Pieces of streaks often give the correct axis, but not the angle.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading
@@ -737,13 +759,16 @@ def _best_motion(
 
 
 def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
-    """Return whether `rotation` (3,) is by the likeliest of `angles`."""
+    """Return whether the angle of `rotation` (3,) equals the likeliest of `angles` (rad)."""
     size = float(np.linalg.norm(rotation))
     return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
 
 
 def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candidate:
-    """Return the motion of the joint fit that begins with `first`; a failed fit is rejected."""
+    """Return the motion of the joint fit that starts from `first`.
+
+    If the fit fails, the motion has the verdict REJECTED.
+    """
     last, faint = final_fit(camera, first)
     middles, excess = np.empty((0, 2)), np.empty(0)
     if last is None:
@@ -762,7 +787,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     if result.status is StreakStatus.FAILED:
         verdict = StreakVerdict.REJECTED
     if camera.shutter.delay_per_row:
-        # Residuals of the brightest streaks, without exclusion of pixels.
+        # The residuals of the brightest streaks are evaluated without clipping of pixels.
         whole = camera.evaluate(scene, last.windows, clip=0.0)
         bright = slice(camera.settings.most_stars)
         stars = scene.stars[bright]

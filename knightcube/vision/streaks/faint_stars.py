@@ -1,15 +1,15 @@
 """Detection of faint streaks under a known motion, and a search for the angle of rotation, on polar grids.
 
 The 3 x 3 sums of the frame are sampled on circles about the axis of rotation, where every streak is straight
-and of the same length. A running sum of that length is the matched filter of a streak: along its circle, the
-response of a star is a triangle, truncated at the border of the detector; across, it is the profile of the
-star. Peaks of the response are stars; the heights of overlapping responses are solved for together. For
-bright stars, the second difference along the circle separates merging triangles.
+and of the same length. A running sum over the length of a streak is its matched filter. Along the circle, the
+response of a star is a triangle, truncated at the border of the detector. Across the circle, it is the
+profile of the star. Peaks of the response are stars, and a linear system gives the heights of overlapping
+responses. For bright stars, the second difference along the circle separates merging triangles.
 
-If a few regions do not give the angle of rotation, because streaks are faint and fragmented or all are cut by
-the border, all circles are searched. A box along a circle is compared with the pixels before and behind it,
-together as long as the box. The squared significance of all boxes that stand out is largest at the true
-length.
+If the brightest regions do not determine the rotation angle, because streaks are faint and fragmented or the
+border cuts all of them, all circles are searched. The mean light in a box along a circle is compared with
+that of the pixels before and behind the box, which together are as long as the box. The sum of the squared
+significances of all significant boxes is largest if the boxes have the true streak length.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from knightcube.vision.frame import less_boxes
 from knightcube.vision.streaks.frame import Float32Array, ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
 
-# Spacing (px) of the circles.
+# Spacing (px) of neighbouring circles of the polar grid.
 _ACROSS = 1.8
 # Spacing (px) of the samples along a circle.
 _ALONG = 4.0
-# Number of circles processed at a time, so that they fit into the processor's cache.
+# Number of circles processed at a time, so that their samples fit into the processor's cache.
 _CHUNK = 64
-# Smallest polar angle (rad) of a circle.
+# Smallest polar angle (rad) of a circle of the grid.
 _NEAREST = 0.003
 # Spacing (px) of the points that represent the border of the detector.
 _BORDER_STEP = 8.0
@@ -62,7 +62,7 @@ class PolarGrid:
 
     @property
     def full(self) -> bool:
-        """Whether the circles are complete."""
+        """Whether the circles of the grid are complete, with azimuths from 0 to 2 pi."""
         return abs(float(self.azimuth[-1] - self.azimuth[0])) > 2.0 * np.pi - 0.05
 
     @property
@@ -71,7 +71,7 @@ class PolarGrid:
         return 0.0 if round(self.length) % 2 else 0.5
 
     def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
-        """Return the pixels (k, 2) at fractional rows and columns (k,) of the grid."""
+        """Return the pixel coordinates (k, 2) at fractional rows and columns (k,) of the grid."""
         polar = self.polar[0] + row * (self.polar[1] - self.polar[0])
         azimuth = self.azimuth[0] + column * (self.azimuth[1] - self.azimuth[0])
         local = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
@@ -79,7 +79,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return the circles that cross the detector, or one in `every` of them."""
+    """Return the polar grid of the circles that cross the detector, thinned out to one in `every` circles."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -107,12 +107,14 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
 def sampled(
     sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
 ) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
-    """Yield groups of circles: their rows, the columns on the detector, samples, and which samples exist.
+    """Yield groups of circles: rows, columns, samples, and a mask of the samples on the detector.
 
-    The samples of `sums` (zero along the border) are integer multiples of `unit`, for fast and exact
-    summation. If the circles are complete, the columns include `room` samples on either side of the detector.
+    The samples are taken from `sums`, which must be zero along the border. They are rounded to integer
+    multiples of `unit`, for fast and exact summation. If the circles are complete, the columns include `room`
+    samples on either side of the detector.
     """
-    # Directions divided by the sine of the polar angle are a term of the azimuth plus a term of the circle.
+    # A direction divided by the sine of its polar angle is the sum of a term of the azimuth and a term of
+    # the circle.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
@@ -126,7 +128,7 @@ def sampled(
         for axis, limit in ((0, last[0]), (1, last[1])):
             place = around[axis, crossing] + aloft[axis, part, None]
             place *= depth
-            # Rounding by truncation.
+            # The added 0.5 turns the truncation to an integer into rounding.
             place += np.float32(pinhole.centre[axis] + 0.5)
             np.maximum(place, np.float32(0.0), out=place)
             np.minimum(place, np.float32(limit), out=place)
@@ -153,7 +155,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
     for start in range(0, len(grid.polar), _CHUNK):
         part = slice(start, min(start + _CHUNK, len(grid.polar)))
         near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # Azimuth pi points away from the image centre.
+        # The azimuth pi points away from the image centre.
         behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
         if grid.full and pinhole.contains(behind, margin=2.0)[0]:
             yield part, slice(0, count)
@@ -167,21 +169,22 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
 
 Int32Array = npt.NDArray[np.int32]
 
-# Side (px) of the square that is summed for a sample.
+# Side (px) of the square of pixels that is summed for one sample.
 _BOX = 3.0
-# Largest sum of samples, in units.
+# Largest cumulative sum of samples, in units of the integer rounding.
 _HIGHEST = 2.0**30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSums:
-    """Samples summed over the length of a streak.
+    """Running sums of the samples over the length of a streak.
 
     Attributes:
         light: (r, c) counts.
         count: (r, c) number of existing samples.
-        span: (r, 2) first and last column of existing samples; infinite if they are not contiguous.
-        excess: (r,) noise relative to that of samples that share no pixels.
+        span: (r, 2) first and last column with a sample on each circle; infinite if the samples are not
+            contiguous.
+        excess: (r,) noise of each circle's sums, relative to the noise of samples that share no pixels.
     """
 
     light: Float32Array
@@ -193,19 +196,19 @@ class RunningSums:
 def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
     """Return the running sums of samples of `sums` within half a streak of each sample.
 
-    `sums` must be zero along the border, which represents all positions outside. It is rounded to `unit`
-    counts.
+    `sums` must be zero along the border, because positions outside the frame use the border's value. Its
+    values are rounded to multiples of `unit` counts.
     """
     width = max(round(grid.length), 1)
     before, after = width // 2, width - width // 2
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # Memory that is not written, where no circle crosses the detector, is never allocated.
+    # The operating system allocates no memory for zeros that are never written, outside the detector.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
     for part, crossing, samples, inside in sampled(sums, pinhole, grid, width, unit):
         wide = samples.shape[1]
-        # Samples, and whether they exist, with a margin of one streak on either side.
+        # The samples and the mask of existing samples have a margin of one streak length on either side.
         padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
         middle = slice(width + 1, width + 1 + wide)
         padded[0, :, middle] = samples
@@ -222,7 +225,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
         count[part, low:high] = held[1]
         begin, end = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
         whole = inside.sum(axis=1) == end - begin + 1
-        # An even number of samples is centred half a sample before its middle one.
+        # The centre of an even number of samples lies half a sample before the sample of index n/2.
         edges = np.stack([begin - 0.5, end + 0.5], axis=1) + crossing.start + grid.off_centre
         span[part] = np.where(whole[:, None], edges, span[part])
     # Samples on the slow circles near the axis share pixels, so that their noise is correlated.
@@ -236,7 +239,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
 
 
 def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the cumulative sums (r, c + 1) of the samples of `sums` before each sample of a circle."""
+    """Return the cumulative sums (r, c + 1) of all samples that precede each sample on its circle."""
     out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
     for part, crossing, samples, _ in sampled(sums, pinhole, grid, 0, 1.0):
         out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
@@ -244,29 +247,33 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
     return out
 
 
-# Minimum fraction of a streak on the detector.
+# Minimum fraction of a streak that lies on the detector, for its detection.
 _LEAST_SEEN = 0.35
-# Number of circles between stars that share no light.
+# Number of circles between two stars from which they share no light.
 _FARTHEST = 5
-# Width (px) of the point spread convolved with a pixel, as the filter assumes it.
+# Standard deviation (px) that the filter assumes for the point spread convolved with a pixel.
 _WIDTH = 1.05
-# Step (samples) of the second difference, minimum length (samples) of a streak for it, and the minimum second
-# difference of a star, in standard deviations and relative to its height.
+# Step (samples) of the second difference of the response along a circle.
 _SHARP_STEP = 3
+# Minimum length (samples) of streaks that are separated by the second difference.
 _SHARP_FROM = 40.0
+# Minimum second difference of the response of a star, in standard deviations of the noise.
 _SHARP_SIGMAS = 6.0
+# Minimum second difference of the response of a star, relative to the star's height.
 _SHARP_SHARE = 0.3
-# Minimum own part of the response of a peak that overlaps a stronger one.
+# Minimum fraction of a peak's response that no stronger, overlapping peak explains.
 _OWN_SHARE = 0.45
+# Maximum number of peaks per pass.
 _MOST_PEAKS = 1000
-# Rows and columns from a local maximum to its neighbours, in order of their distance.
+# Offsets in rows and columns from a local maximum to its neighbours, nearest first.
 _NEIGHBOURS = sorted(
     ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# Tabulated response across the circles, and number of entries per px.
+# Number of entries per px in the table of the response across the circles.
 _PER_PX = 50.0
+# Table of the response of a star against the distance across the circles.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
@@ -282,7 +289,7 @@ def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: flo
 
 
 def profile(distance: FloatArray) -> FloatArray:
-    """Return the response at `distance` px across the circle of a star, relative to that at the star."""
+    """Return the response of a star at `distance` (px) across its circle, relative to the maximum."""
     index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
     return np.asarray(_PROFILE[index])
 
@@ -290,10 +297,11 @@ def profile(distance: FloatArray) -> FloatArray:
 def sharp_peaks(
     held: RunningSums, place: IntArray, deviation: FloatArray, grid: PolarGrid
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional rows and columns of the bright stars, by the second difference of the response.
+    """Return rows and columns of the bright stars from the second difference of the response.
 
-    Its peak is narrow, so that it separates stars that are close to each other on one circle. `place` (p,)
-    are flat indices of high responses, `deviation` (p,) the noise there.
+    The second difference has narrow peaks, so that it separates stars that are close to each other on one
+    circle. `place` (p,) are flat indices of high responses, and `deviation` (p,) is the noise at these
+    indices.
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -303,7 +311,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # Scaled to the height of an isolated star; the noise is that of few samples times the leverage.
+    # The second difference is scaled to the height of an isolated star, which scales its noise as well.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -316,7 +324,7 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional rows and columns of the peaks, strongest first, that stronger ones do not explain.
+    """Return fractional rows and columns of the peaks that no stronger peak explains, strongest first.
 
     Only the flat indices `place` (p,) are searched. `span` is that of `RunningSums`.
     """
@@ -327,7 +335,8 @@ def standing_peaks(
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # A crowded frame has hundreds of thousands of pairs, most too far apart to overlap.
+    # A crowded frame has hundreds of thousands of pairs of peaks, and most pairs are too far apart to
+    # overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
@@ -353,7 +362,8 @@ def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntA
     """Return rows and columns of the flat indices `place` (p,) that are local maxima, highest first."""
     flat, columns = values.reshape(-1), values.shape[1]
     value = flat[place]
-    # The index after the last column is on the next circle, a close neighbour if the circles are complete.
+    # The flat index after the last column is on the next circle, close to the last column if the circles
+    # are complete.
     for down, beside in _NEIGHBOURS:
         summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
         place, value = place[summit], value[summit]
@@ -363,7 +373,7 @@ def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntA
 
 
 def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
-    """Return the fractional positions of peaks along `axis`, from the vertex of a parabola."""
+    """Return the fractional positions of peaks along `axis`, from a parabola through three values."""
     place = (row, column)[axis]
     size = significance.shape[axis]
     before, after = np.maximum(place - 1, 0), np.minimum(place + 1, size - 1)
@@ -374,29 +384,31 @@ def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: 
     return np.asarray(place + np.clip(offset, -0.5, 0.5))
 
 
-# Ratio of the noise of a sample to the unit to which it is rounded.
+# Ratio of a sample's noise to the unit to which the samples are rounded.
 _ROUNDING = 30.0
 # Number of passes of the search; the first one uses second differences.
 _PASSES = 3
-# Relative and absolute ridge of the equations for the heights, for stars that nearly coincide.
+# Relative ridge added to the normal equations of the heights, for stars that nearly coincide.
 _RIDGE = 0.01
+# Absolute ridge added to the normal equations of the heights.
 _TINY = 1e-6
-# Relative accuracy of the heights, and largest number of conjugate-gradient steps.
+# Relative accuracy at which the iteration for the heights stops.
 _SOLVED = 1e-4
+# Maximum number of conjugate-gradient steps for the heights.
 _MOST_GRADIENTS = 200
-# Number of responses computed at a time.
+# Number of responses computed at a time, to limit the memory.
 _SOME_PLACES = 1 << 16
-# Minimum length (px) of a streak for the filter.
+# Minimum length (px) of a streak for the matched filter.
 _LEAST_LENGTH = 6.0
-# Fraction of a streak's light in the three pixels across it.
+# Fraction of a streak's light within three pixels across it.
 _CAPTURED = 0.83
-# Noise of a sum of n overlapping samples of nine pixels, relative to a pixel's noise and the root of n.
+# Noise of a sum of n overlapping 3 x 3 samples, relative to a pixel's noise times the root of n.
 _SAMPLE_NOISE = 3.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaintStars:
-    """Detected streaks: stars (n, 2) px at mid-exposure, light (n,) counts and significance (n,)."""
+    """Detected streaks: stars (n, 2) px at mid-exposure, light (n,) counts, significance (n,)."""
 
     stars: FloatArray
     light: FloatArray
@@ -411,9 +423,9 @@ def find_faint(
     sigmas: float,
     most: int,
 ) -> FaintStars:
-    """Return the `most` significant streaks along `motion` in the frame without `modelled` light.
+    """Return the `most` significant streaks along `motion` after subtraction of the `modelled` light.
 
-    `modelled` has flat indices of pixels (m,) and their light (m,) in counts.
+    `modelled` consists of flat pixel indices (m,) and the light (m,) of these pixels in counts.
     """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
     reach = (
@@ -424,7 +436,7 @@ def find_faint(
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
     held = running_sums(_residual_sums(frame, modelled), pinhole, grid, usual / _ROUNDING)
-    # Noise by number of samples; sums of too few are excluded.
+    # The noise of a running sum depends on its number of samples; sums of too few samples are excluded.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(_LEAST_SEEN * grid.length)] = np.inf
     row, column, height = _found_stars(held, noise, grid, sigmas, most)
@@ -442,7 +454,8 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
     """Return the 3 x 3 sums (rows * columns,) of the frame without `modelled` light and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Residuals of bright stars, which are mostly their own photon noise, are attenuated.
+    # Residuals of bright stars are attenuated, because they are mostly photon noise of the stars
+    # themselves.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
@@ -460,11 +473,11 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional rows and columns, and heights, of the stars whose responses add up to `held`.
+    """Return fractional rows, columns and heights of the stars whose summed responses reproduce `held`.
 
     Each pass finds peaks in the residual response, solves for the heights of all stars together, and
-    subtracts them. `noise` is the noise by number of samples. All passes search only responses that exceed it
-    initially.
+    subtracts them. `noise` is the noise of a sum, indexed by its number of samples. All passes search only
+    the indices whose initial response exceeds the noise.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())
@@ -515,7 +528,7 @@ def _responses(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the responses (p,) at the flat indices `place` (p,), ascending, of stars of `height` (k,)."""
+    """Return the summed responses (p,) of stars of `height` (k,) at ascending flat indices `place` (p,)."""
     rows, columns = held.light.shape
     # On each neighbouring circle the response of a star is a contiguous range of columns.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
@@ -549,7 +562,7 @@ def _responses(
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Return the heights (k,) of stars whose overlapping responses add up to the response at each star."""
+    """Return the heights (k,) of stars whose overlapping responses add up to the measured response."""
     middle = np.rint(row).astype(int)
     # Pairs of stars, including each star with itself, whose responses may overlap.
     order = np.argsort(row, kind="stable")
@@ -566,7 +579,8 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * _ACROSS
     )
-    # The ridge is for stars that nearly coincide; the right side compensates its effect on the others.
+    # The ridge regularises stars that nearly coincide; the right-hand side compensates its effect on other
+    # stars.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
@@ -578,7 +592,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution (k,) of sparse equations by conjugate gradients.
 
-    The elements `overlap` (e,) of the matrix are at rows `one` and columns `other`.
+    The nonzero matrix elements `overlap` (e,) are at rows `one` and columns `other`, both (e,).
     """
     k = len(right)
     scale = 1.0 / np.sqrt(overlap[one == other])
@@ -598,19 +612,21 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
     return np.asarray(x * scale)
 
 
-# Ratio of consecutive trial lengths, and the shortest length in samples.
+# Ratio of consecutive trial lengths of the box.
 _FACTOR = 1.1
+# Shortest trial length (samples) of the box.
 _SHORTEST = 5
-# Number of circles per circle that is used.
+# Ratio of all circles of the polar grid to the circles that the angle search uses.
 _SPARSE = 2
-# Minimum significance of a box, and the significance to which it is limited (standard deviations).
+# Minimum significance (standard deviations) of a box that counts.
 _LEAST_SIGMAS = 5.0
+# Value (standard deviations) to which the significance of a box is limited.
 _ENOUGH = 40.0
 
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
     """Return the `most` likeliest angles (rad) about the axis of `rotation` (3,), likeliest first."""
-    # A rotation by one radian has the longest steps and the widest circles.
+    # A rotation by one radian, the largest one, gives the coarsest sampling.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)
@@ -621,7 +637,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
-    # Azimuth is the first axis, for contiguous memory.
+    # The azimuth is the first axis, so that memory is read contiguously.
     padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
     score = np.array([_box_significance(padded, room, int(width)) for width in widths])
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
@@ -638,7 +654,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     """Return the sum of squared significances of the boxes of `width` samples that are local maxima.
 
-    `padded` (c, r) are the cumulative sums by azimuth, with a margin of `room` samples on either side.
+    `padded` (c, r) are the cumulative sums along the azimuth, with a margin of `room` samples on either side.
     """
     stretches = (len(padded) - 2 * room - width) // width
     outer, inner, behind, beyond = (
@@ -649,7 +665,7 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The highest box of each stretch of a circle, if no neighbour is higher.
+    # The highest box of each stretch of a circle counts if neither neighbouring stretch has a higher box.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)
@@ -661,6 +677,6 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
 
 
 def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the widths (samples) within half a step of `width`, limited to `longest`."""
+    """Return the integer box widths (samples) within half a trial step of `width`, at most `longest`."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
     return np.arange(max(width - room, 2), min(width + room, longest) + 1)

@@ -1,16 +1,18 @@
 """First guesses of the motion from the bright regions of a frame, without their end points.
 
-A streak at pixel p runs along B(p) u, where u is the rotation: its normal n gives one linear equation
-n.B(p) u = 0, independent of the order of its ends, for every angle between axis and boresight. Pairs of
-regions propose axes, the others vote, and least squares refines the best one. About the axis, all stars
-rotate by one angle. The extents of the regions vote for it; a region that the frame's border cuts gives only
-a lower bound, and fragments on one circle about the axis vote together.
+A streak at pixel p runs along B(p) u, where u is the rotation vector and B(p) the image flow. The normal n of
+the streak therefore gives one linear equation n.B(p) u = 0, independent of the order of the streak's ends.
+Pairs of regions propose axes, the other regions vote for them, and least squares refines the best axis. All
+stars rotate by the same angle about the axis, and the lengths of the regions vote for this angle. A region
+that the frame's border cuts gives only a lower bound of the angle, and fragments on one circle about the axis
+vote together.
 
-If few streaks are entirely in the frame, the angle is found by a scan: along its circle about the axis, the
-light of a star is a box of the length of the rotation. The samples around the brightest regions are summed in
-boxes of every length, each placed where it contains most light. The correct length contains all of a star and
-nothing else. A box twice as long or as short explains half the chi-square, so that the scan converges from
-far away, whereas a fit of the pixels converges only within a few widths of the point spread.
+If few streaks are entirely in the frame, a scan finds the angle. Along a circle about the axis, the light of
+a star is a box whose length is the rotation angle. The samples around the brightest regions are summed in
+boxes of every trial length, and each box is placed at the maximum of its light. A box of the correct length
+contains all light of a star and no other pixels. A box that is too long or too short by a factor of two
+explains half the chi-square. The scan therefore finds the angle from far away, whereas a fit of the pixels
+converges only within a few widths of the point spread.
 """
 
 from __future__ import annotations
@@ -30,23 +32,25 @@ SCANNED_STARS = 14
 
 # Spacing (px) of the samples on the circle with the fastest image motion.
 _STEP = 2.0
-# Ratio of consecutive trial lengths, and the shortest length in samples.
+# Ratio of consecutive trial lengths of the box.
 _FACTOR = 1.04
+# Shortest trial length (samples) of the box.
 _SHORTEST = 6
 # Number of the likeliest angles that are sorted by their distance from a prior angle.
 _WEIGHED = 3
 # Largest light of a sample relative to the region's own, to limit the effect of crossing stars.
 _CAP = 2.0
-# Largest significance (standard deviations) with which a star counts.
+# Value (standard deviations) to which the significance of a star in the scan is limited.
 _ENOUGH = 60.0
-# Minimum significance (standard deviations) of a usable star, and minimum fraction of it in the frame.
+# Minimum significance (standard deviations) of a star that the scan passes to the fit.
 _CERTAIN = 8.0
+# Minimum fraction of a star's box inside the frame, for a star that the scan passes to the fit.
 _LEAST_SEEN = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circles:
-    """Circles (n,) about an axis through the brightest regions.
+    """Circles (n,) about the axis of rotation, each through one of the brightest regions.
 
     Attributes:
         frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
@@ -77,7 +81,7 @@ class AngleCandidate:
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
 ) -> Iterator[AngleCandidate]:
-    """Yield the `most` likeliest angles, with `near` (rad) given in order of their distance from it."""
+    """Yield the `most` likeliest angles, sorted by their distance from `near` (rad) if it is given."""
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
@@ -86,7 +90,7 @@ def scan_angles(
     # The weight of a bright star is limited, because it may be two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
-    # If the border cuts all stars, longer rotations explain no more, and the shortest represents them.
+    # If the border cuts all stars, longer rotations explain no more light, and the shortest one is taken.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -109,7 +113,10 @@ class _BestBoxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums (n, c + 1) of light and of samples in the frame, from azimuth `begin` in `step` rad."""
+    """Cumulative sums (n, c + 1) of light and of samples in the frame along the circles.
+
+    The first azimuth is `begin` and the spacing `step`, both in rad.
+    """
 
     total: FloatArray
     exist: FloatArray
@@ -119,7 +126,7 @@ class _Boxes:
     step: float
 
     def best(self, width: int) -> _BestBoxes:
-        """Return the boxes of `width` samples with the largest chi-square around each region."""
+        """Return the box of `width` samples with the largest chi-square around each region."""
         last = self.total.shape[1] - 1
         first = self.middle[:, None] - np.arange(width + 1)
         start, stop = np.clip(first, 0, last), np.clip(first + width, 0, last)
@@ -175,7 +182,7 @@ def _refined_angle(
     best = int(np.argmax(score))
     chosen, across = held[best], int(widths[best])
     certain = (chosen.gain > _CERTAIN**2) & (chosen.seen > _LEAST_SEEN * across)
-    # The position of a star along its path needs at least one end in the frame.
+    # The position of a star along its path is determined only if at least one end is in the frame.
     bounded = np.zeros(len(certain), dtype=np.bool_)
     for sample in (chosen.first, chosen.first + across):
         here = np.clip(sample, 0, boxes.exist.shape[1] - 2)
@@ -197,32 +204,37 @@ def _refined_angle(
     return AngleCandidate(across * boxes.step, pixel[order], light[order])
 
 
-# Number of regions whose pairs propose axes, and the smallest sine between their equations.
+# Number of the regions whose pairs propose axes of rotation.
 _PROPOSERS = 16
+# Smallest sine of the angle between the equations of two regions that propose an axis.
 _PARALLEL = 1e-9
-# Error of a region's orientation: px over its length, and minimum (rad).
+# Error (px) of a region's orientation, to be divided by the region's length (px).
 _SIDE_ERROR = 1.2
+# Minimum error (rad) of a region's orientation.
 _LEAST_ERROR = 0.012
 # Minimum length (px) of a region with a usable orientation.
 _LEAST_LENGTH = 3.5
-# Error of a region's length: px, and fraction of the length.
+# Error (px) of a region's length.
 _LENGTH_ERROR = 1.0
+# Error of a region's length, as a fraction of the length.
 _LENGTH_SHARE = 0.015
-# Number of angles taken from each ranking.
+# Number of rotation angles taken from each ranking of the angles.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) between the circles of two fragments of one star.
 _SAME_CIRCLE = 2.0
-# Relative difference of lengths up to which a region may be a star under a known motion.
+# Largest difference of a region's length from a known streak length, relative to it.
 _LIKELY_LENGTH = 0.2
+# Number of instants at which a known motion is evaluated.
 _INSTANTS = 65
-# Minimum number of entire regions, and minimum relative change of the rate, for a change in the first guess.
+# Minimum number of entire regions for a changing rate in the first guess.
 _LEAST_GROWING = 3
+# Minimum relative change of the rate for a changing rate in the first guess.
 _LEAST_GROWTH = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGuess:
-    """A start of the fit.
+    """A first guess of the motion and the stars, from which a fit starts.
 
     Attributes:
         motion: motion of the camera.
@@ -245,7 +257,7 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
     flow = image_flow(pinhole, regions.centre)
     equation = np.einsum("ni,nij->nj", regions.normal, flow)
     tolerance = np.maximum(_SIDE_ERROR / np.maximum(regions.length, 1.0), _LEAST_ERROR)
-    # Regions that are long and bright are rarely blends of several stars.
+    # Long and bright regions have a large weight, because they are rarely blends of several stars.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
     i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
@@ -312,7 +324,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     axis, agree = found
     n, owner, light = len(regions), regions.owner, regions.light
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # Azimuth zero points to the image centre, or anywhere if the axis is there.
+    # The azimuth zero points to the image centre; if the axis is at the image centre, it is arbitrary.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
@@ -331,7 +343,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     height = np.bincount(owner, light * z, n) / flux
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
     low, high = _outermost(azimuth, owner, n)
-    # The variance of a uniform arc is a twelfth of its length squared, plus that of the point spread.
+    # The variance of a uniform arc is a twelfth of its squared length, plus the variance of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return AxisGuess(
         agree,
@@ -368,10 +380,11 @@ def motions_by_length(
 def motion_by_course(
     course: CameraMotion, regions: BrightRegions, pinhole: Pinhole, most: int
 ) -> MotionGuess:
-    """Return a guess with a known motion, and the brightest entire regions of about its streak length."""
+    """Return a guess with a known motion, its stars being the brightest regions of similar length."""
     time = np.linspace(-0.5, 0.5, _INSTANTS)
     progress = course.progress(time)
-    # A region's moments are those of the positions at times uniform over the exposure.
+    # The second moment of a region is the variance of the star's positions, at times uniform over the
+    # exposure.
     wide = np.sqrt(12.0 * np.var(progress))
     length = path_lengths(pinhole, course, regions.centre) * wide
     likely = np.abs(regions.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length
@@ -382,10 +395,10 @@ def motion_by_course(
 
 
 def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
-    """Return the relative change of the rate over the exposure by the asymmetry of the regions, 0 if small.
+    """Return the relative change of the rate over the exposure from the regions' asymmetry; 0 if small.
 
-    If the rate increases from zero to twice its mean, the centre of light lies a sixth of the length from the
-    middle of the streak. The sign is positive if acceleration and rotation have the same sense.
+    If the rate increases from zero to twice its mean, the centroid lies a sixth of the length from the middle
+    of the streak. The sign is positive if acceleration and rotation have the same sense.
     """
     whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
@@ -408,7 +421,7 @@ def motions_by_scan(
 
 
 def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return the pixel of lowest azimuth of each of `n` regions, and that of highest azimuth."""
+    """Return the pixels of lowest and of highest azimuth of each of `n` regions, both (n,)."""
     order = np.argsort(owner.astype(np.int16), kind="stable")
     theirs, whose = azimuth[order], owner[order]
     start = np.searchsorted(whose, np.arange(n))
@@ -420,7 +433,7 @@ def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, 
 
 
 def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> BoolArray:
-    """Return which of the regions' pixels `pixel` (n,) lie at the frame's border."""
+    """Return which pixels `pixel` (n,) of the regions lie at the frame's border."""
     x, y, margin = regions.column[pixel], regions.row[pixel], 4
     inside_x = (x >= margin) & (x < pinhole.columns - margin)
     inside_y = (y >= margin) & (y < pinhole.rows - margin)
@@ -428,7 +441,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return the likeliest angles (rad), each with the fraction of light in regions longer than it."""
+    """Return the likeliest angles (rad), each with the fraction of the light in longer regions."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates
@@ -464,7 +477,7 @@ def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
     """Return angle, error and weight (k, 3) of pairs of neighbouring fragments on one circle."""
     part = np.flatnonzero(guess.agree & ~regions.cut)
     sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
-    # Scale from a difference of `height` to px across: d(cos) = -sin d(angle), and speed is px per azimuth.
+    # The scale converts a difference of `height`, a cosine, into px across the circles.
     scale = guess.speed[part] / sine**2
     near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
     gap = guess.first[part][None, :] - guess.last[part][:, None]
@@ -485,7 +498,8 @@ def _stars_of_angle(
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The end inside the frame gives the centre of a cut streak; a region extends about 2 px beyond an end.
+    # The end inside the frame gives the centre of a cut streak.
+    # A region extends about 2 px beyond the end of the streak.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
     middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)

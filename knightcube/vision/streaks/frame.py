@@ -1,8 +1,8 @@
 """Preparation of a frame for the fit: background, noise, unusable pixels, bright regions, width of the stars.
 
-Where the point spread is several pixels wide, pixels are summed (`Binning`): the sums determine the motion as
-well and take a fraction of the time. The unequal responses of a colour camera's raw pixels are equalised, and
-light that no star makes, such as the Earth's limb, is excluded.
+If the point spread is several pixels wide, pixels are summed (`Binning`). The sums determine the motion
+equally well and take a fraction of the computing time. The unequal responses of a colour camera's raw pixels
+are equalised, and light from other sources than stars, such as the Earth's limb, is excluded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedFrame:
-    """A frame of (rows, columns) with flat arrays; one count is one step of the converter.
+    """A frame of (rows, columns) as flat arrays, in counts of the analogue-to-digital converter.
 
     Attributes:
         shape: rows, columns.
@@ -61,14 +61,14 @@ class ReducedFrame:
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:
     """Return `pixels` (rows, columns) with background subtracted and noise estimated.
 
-    `saturation` is in counts and `gain` in electrons per count of `pixels`. If `saturation` is None, it is
-    the highest count when many pixels share it, else the maximum of the integer type.
+    `saturation` is in counts and `gain` in electrons per count of `pixels`. If `saturation` is None, the
+    highest count is used if many pixels have it, otherwise the maximum of the integer type.
     """
     top = saturation_count(pixels) if saturation is None else saturation
     pixels, step, offset = in_steps(pixels)
     top, gain = (top - offset) / step, gain * step
     background = estimate_background(pixels)
-    # In place: allocating megabytes costs more than the arithmetic.
+    # The arithmetic is in place, because the allocation of megabytes takes more time than the arithmetic.
     signal = background.map(background.level)
     np.subtract(pixels, signal, out=signal)
     floor = background.map(np.square(background.noise))
@@ -89,9 +89,9 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     )
 
 
-# Minimum area (pixels) of a region; a noise peak fills nine pixels of the 3 x 3 sum.
+# Minimum area (pixels) of a bright region; a noise peak fills nine pixels of the 3 x 3 sums.
 _LEAST_AREA = 12
-# Distance (px) by which threshold and point spread widen a region at each end.
+# Distance (px) by which threshold and point spread extend a region beyond each end of a streak.
 _BORDER = 3
 
 
@@ -161,9 +161,10 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     )
 
 
-# Minimum mean width (px) of a region that may be a limb or a reflection; the brightest stars have half of it.
+# Minimum mean width (px) of a region that may be a limb or a reflection; the brightest stars have half this
+# width.
 _BROAD = 25.0
-# Minimum length (px) assumed for the mean width.
+# Minimum length (px) by which a region's area is divided to obtain its mean width.
 _LEAST_LENGTH = 40.0
 # Side (px) of a square that fits into a limb or a reflection.
 _SOLID = 31
@@ -172,10 +173,11 @@ _ABOUT = 12
 
 
 def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with limbs and reflections excluded, None if it has none.
+    """Return `frame` with limbs and reflections excluded, None if it has no limb or reflection.
 
-    A region that is solid over more pixels than the light of any star is wide is not a star's; a net of
-    crossing streaks is not solid. The background does not follow such light, nor the pixels around it.
+    A limb or a reflection is a region that is solid over a square larger than any star; a net of crossing
+    streaks is not solid. The pixels around such a region are excluded too, because the background map does
+    not follow its light.
     """
     area = np.bincount(regions.owner, minlength=len(regions))
     broad = area > _BROAD * np.maximum(regions.length, _LEAST_LENGTH)
@@ -199,11 +201,13 @@ def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame |
     return replace(frame, signal=signal, sums=sums, bad=frame.bad | out)
 
 
-# Maximum and minimum number of the brightest regions that measure the responses of a colour mosaic.
+# Maximum number of the brightest regions that determine the responses of a colour mosaic.
 _MOST_MOSAIC_REGIONS = 24
+# Minimum number of bright regions that determine the responses of a colour mosaic.
 _LEAST_MOSAIC_REGIONS = 6
-# Difference of a response from the mean that indicates a mosaic, absolute and in standard deviations.
+# Minimum relative difference of a response from the mean that indicates a colour mosaic.
 _UNEVEN_RESPONSE = 0.06
+# Minimum difference of a response from the mean, in standard deviations, that indicates a mosaic.
 _UNEVEN_SIGMAS = 8.0
 # Interquartile range of a normal distribution, in standard deviations.
 _QUARTILES = 1.35
@@ -212,10 +216,10 @@ MEDIAN_ERROR = 1.25
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with equalised responses of its pixels, None if they are equal already.
+    """Return `frame` with equalised responses of its pixels, None if the responses are already equal.
 
     A colour camera's raw pixels lie behind a pattern of 2 x 2 filters. Each bright region has about the same
-    light on all four pixels, which gives their mean responses to stars.
+    light on all four pixels of the pattern, which gives the mean response of each pixel to stars.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
@@ -240,10 +244,12 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     )
 
 
-# Displacements (px) at which the autocorrelation is measured; at zero it contains the noise.
+# Displacements (px) at which the autocorrelation is measured.
+# At zero displacement it contains the noise.
 _NEAR, _FAR = 1, 3
-# Maximum and minimum number of the brightest regions that measure the point spread.
+# Maximum number of the brightest regions that determine the width of the point spread.
 _MOST_WIDTH_REGIONS = 12
+# Minimum number of bright regions that determine the width of the point spread.
 _LEAST_WIDTH_REGIONS = 3
 
 
@@ -251,8 +257,9 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     """Return the standard deviation (px) of the point spread without the pixel, None for too few regions.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across it is exp(-d^2/(4 w^2)).
-    Those along columns and along rows multiply to this value, whatever the direction of the streak and
-    however it bends. The median of the brightest regions ignores neighbouring stars and bright limbs.
+    The product of the autocorrelations along columns and along rows has this value for every direction and
+    curvature of the streak. The median over the brightest regions ignores neighbouring stars and bright
+    limbs.
     """
     chosen = np.flatnonzero(regions.owner < _MOST_WIDTH_REGIONS)
     owner, columns = regions.owner[chosen], frame.shape[1]
@@ -275,13 +282,13 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     return float(np.sqrt(max(float(np.median(known)) - PIXEL_VARIANCE, 0.0)))
 
 
-# Standard deviation (px) of the point spread that remains after summing pixels.
+# Minimum standard deviation (px) of the point spread after binning.
 _NARROWEST = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Sums of `size` x `size` pixels, beginning at pixel `first` (x, y), as pixels of `pinhole`."""
+    """Sums of `size` x `size` pixels, starting at pixel `first` (x, y), as the pixels of `pinhole`."""
 
     size: int
     first: tuple[int, int]
@@ -289,7 +296,7 @@ class Binning:
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for a point spread of `psf_sigma` px; a narrow one needs none.
+        """Return the binning for a point spread of `psf_sigma` px; a narrow point spread needs no binning.
 
         The same number of pixels is excluded on opposite sides, so that the optical axis stays in the centre.
         """
@@ -308,14 +315,14 @@ class Binning:
         x, y = self.first
         shape = self.pinhole.rows, self.size, self.pinhole.columns, self.size
         cut = pixels[y : y + shape[0] * self.size, x : x + shape[2] * self.size].reshape(shape)
-        # A multiple of a count, so that all sums remain multiples of the converter's step.
+        # The value is an integer, so that all sums remain multiples of one count.
         full = max(int(cut.max()), int(np.ceil(top))) * self.size**2
         sums = cut.sum(axis=(1, 3), dtype=np.uint64)
         sums[at_least(cut, top).any(axis=(1, 3))] = full
         return sums, float(full)
 
     def settings(self, settings: LikelihoodSettings) -> LikelihoodSettings:
-        """Return settings of the full frame converted to the sums."""
+        """Return the `settings` of the full frame converted to binned pixels."""
         if self.size == 1:
             return settings
         return replace(
@@ -330,7 +337,7 @@ class Binning:
         )
 
     def in_pixels(self, result: MotionResult) -> MotionResult:
-        """Return the result of the sums converted to pixels of the full frame."""
+        """Return a `result` in binned pixels converted to pixels of the full frame."""
         size = self.size
         if size == 1:
             return result
@@ -349,15 +356,16 @@ class Binning:
 
 
 def _centred_count(length: int, size: int) -> int:
-    """Return the number of sums of `size` pixels in `length`, one fewer for an odd remainder."""
+    """Return the number of bins of `size` pixels in `length`, one fewer if the remainder is odd."""
     count = length // size
     return count - 1 if (length - size * count) % 2 and size % 2 else count
 
 
-# Maximum number of bright regions.
+# Maximum number of bright regions that are kept.
 _MOST_REGIONS = 48
-# Minimum measured width (px), and minimum ratio to the described width, from which pixels are summed for it.
+# Minimum measured width (px) of the point spread for binning.
 _WIDE = 2.2
+# Minimum ratio of the measured to the described width of the point spread, for binning by the measurement.
 _WIDER = 1.5
 
 
@@ -374,7 +382,7 @@ class PreparedFrame:
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
 ) -> PreparedFrame:
-    """Return `pixels` (rows, columns) prepared for the described width of the stars, or for a larger one.
+    """Return `pixels` (rows, columns) prepared for the described point spread, or for a larger measured one.
 
     `saturation` is in counts.
     """

@@ -3,8 +3,8 @@
 Time is in units of the exposure and zero at mid-exposure. With the rate u at mid-exposure and the angular
 acceleration g, both in camera axes, the rate is u + g t and the direction v of a star obeys
 v' = -(u + g t) x v. The rotation since mid-exposure is the vector u t + g t^2/2 + (u x g) t^3/12 (Magnus
-expansion): exact without acceleration, of fourth order with it. Terms of t^3 and higher that are known from
-navigation are added to that vector. A star is identified by its pixel at mid-exposure.
+expansion). It is exact if g is zero, and otherwise of fourth order. Terms of t^3 and higher that are known
+from navigation are added to this vector. A star is identified by its pixel at mid-exposure.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from knightcube.vision.camera.lens import Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
-# Iterations that invert the lens distortion, which amounts to about 1 % of the radius.
+# Number of iterations that invert the lens distortion, which amounts to about 1 % of the radius.
 _ROUNDS = 6
 _TINY = 1e-12
 
@@ -29,7 +29,7 @@ _TINY = 1e-12
 class DistortedPinhole(Pinhole):
     """A pinhole with small errors of its calibration: image centre, focal length and cubic distortion.
 
-    The inherited projections remain those of the ideal pinhole; `paths` applies the distortion.
+    The inherited projections are those of the ideal pinhole; only `paths` applies the distortion.
 
     Attributes:
         shift: (x, y) px, displacement of the image.
@@ -60,7 +60,7 @@ class DistortedPinhole(Pinhole):
         return np.asarray(away + np.array(self.centre))
 
     def jacobian(self, points: FloatArray) -> FloatArray:
-        """Return the derivatives (m, 2, 2) of `distorted` at ideal `points` (m, 2) px."""
+        """Return the Jacobian (m, 2, 2) of the lens distortion at ideal `points` (m, 2) px."""
         away = points - np.array(self.centre)
         grown = 1.0 + self.scale + self._per_square * np.sum(away**2, axis=1)
         outer = away[:, :, None] * away[:, None, :]
@@ -98,7 +98,7 @@ class CameraMotion:
 
     @classmethod
     def between(cls, rotation: FloatArray, acceleration: FloatArray, higher: FloatArray) -> CameraMotion:
-        """Return the motion whose rotation (3,) rad from start to end is given."""
+        """Return the motion with the given `rotation` (3,), rad, from start to end of the exposure."""
         unscaled = cls(np.zeros(3), acceleration, higher)
         return replace(unscaled, rate=rotation - unscaled.rotation)
 
@@ -110,7 +110,7 @@ class CameraMotion:
     def directed(self, direction: FloatArray) -> CameraMotion:
         """Return this motion or its time reversal, whichever rotates along `direction` (3,).
 
-        The acceleration is the same in both.
+        The angular acceleration of the time-reversed motion is the same.
         """
         if self.rotation @ direction >= 0.0:
             return self
@@ -118,23 +118,23 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, odd[:, None] * self.higher_terms)
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return the motion with another rotation (3,) rad from start to end, up to its sign."""
+        """Return this motion scaled to a `rotation` (3,), rad, over the exposure, up to its sign."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
     @property
     def rotation(self) -> FloatArray:
-        """The rotation vector (3,) rad from start to end: the mean rate times the exposure."""
+        """The rotation vector (3,), rad, from start to end of the exposure: mean rate times exposure time."""
         return np.asarray(self.rate + self.higher(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0]))
 
     @property
     def halfway(self) -> FloatArray:
-        """The rotation vector (3,) rad from mid-exposure to halfway between start and end."""
+        """The rotation vector (3,), rad, from mid-exposure to the attitude halfway between start and end."""
         return np.asarray(self.acceleration / 8.0 + self.higher(np.array([-0.5, 0.5])) @ np.array([0.5, 0.5]))
 
     @property
     def relative_acceleration(self) -> float:
-        """The change of the rate along its axis over the exposure, relative to the mean rate."""
+        """The change of the rate about the mean axis over the exposure, relative to the mean rate."""
         square = float(self.rotation @ self.rotation)
         rate = self.higher(np.array([-0.5, 0.5]), 1)
         change = self.acceleration + rate[:, 1] - rate[:, 0]
@@ -146,13 +146,13 @@ class CameraMotion:
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rate along its axis over the mean rate at `time` (m,), or its first derivative."""
+        """Return the rate about the mean axis over the mean rate at `time` (m,), or its derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the sum of `higher_terms` (3, m) at `time` (m,), or its first or second derivative."""
+        """Return the rotation (3, m) of `higher_terms` at `time` (m,), or its first or second derivative."""
         out = np.zeros((3, len(time)))
         for power, term in enumerate(self.higher_terms, start=3):
             factor = (1, power, power * (power - 1))[derivative]
@@ -164,7 +164,7 @@ class CameraMotion:
 class StarPaths:
     """Points on the paths of stars: position (m, 2) px, velocity (m, 2) and acceleration (m, 2).
 
-    Velocity and acceleration are in px per exposure and px per exposure^2.
+    The velocity is in px per exposure, the acceleration in px per exposure^2.
     """
 
     position: FloatArray
@@ -197,16 +197,16 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return only the positions (m, 2) px of `paths`, which is faster."""
+    """Return the positions (m, 2), px, of `paths` without velocities, which is faster than `paths`."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     points = _pixels(pinhole, v[:2] / v[2])
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
 
 
 def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
-    """Return the matrices B (n, 2, 3), px per rad: a star at one of `points` (n, 2) px moves at B u px.
+    """Return the image-flow matrices B (n, 2, 3), px per rad, at `points` (n, 2) px.
 
-    The rate u is in rad per exposure.
+    At a rate u (rad per exposure), a star moves B u px per exposure.
     """
     return _flow(pinhole, _directions(pinhole, points)[:2]).transpose(2, 0, 1)
 
@@ -231,10 +231,10 @@ def sensitivities_and_velocity(
     v = _rotated(turned, _directions(pinhole, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
-    # A change of the rate rotates the camera by a small vector psi, the integral over t' of the rotation from
-    # t' to t. The star moves by v x psi, which is the image flow times psi.
+    # A change of the rate rotates the camera by a small vector psi, which moves the star by v x psi.
+    # The vector psi is the integral over t' of the rotation from t' to t.
     flow = _flow(pinhole, there)
-    # Mean rate since mid-exposure; the error is of higher order.
+    # The rotation is evaluated with the mean rate since mid-exposure, whose error is of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any():
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
@@ -256,17 +256,18 @@ def sensitivities_and_velocity(
     if isinstance(pinhole, DistortedPinhole):
         jacobian = pinhole.jacobian(_pixels(pinhole, there))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
-        # The star's own pixel is distorted too.
+        # The star's pixel at mid-exposure is a distorted position, so that its derivative needs the inverse
+        # Jacobian.
         change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(pinhole.undistorted(stars)))
     return change, pace
 
 
-# Below, vectors are (..., 3, m), components before points, so that each component is contiguous in memory.
+# In the functions below, vector arrays are (..., 3, m), so that each component is contiguous in memory.
 # The functions above return transposed views of such arrays.
 
 
 def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the image flow (2, 3, m) px per rad at x/z and y/z `there` (2, m)."""
+    """Return the image flow (2, 3, m), px per rad, at image coordinates `there` (2, m): x/z and y/z."""
     x, y = there
     xy = x * y
     out = np.empty((2, 3, len(x)))
@@ -288,7 +289,7 @@ def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
 
 
 def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the ideal pixels (m, 2) of x/z and y/z `there` (2, m)."""
+    """Return the ideal pixels (m, 2) of normalised image coordinates `there` (2, m): x/z and y/z."""
     pixel = pinhole.focal_length * there
     pixel += np.array(pinhole.centre)[:, None]
     return pixel.T
@@ -330,10 +331,7 @@ def _rotation_until(motion: CameraMotion, time: FloatArray) -> tuple[FloatArray,
 
 
 def _rotated(rotation: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray) -> FloatArray:
-    """Return fixed directions `v` (3, m) in the axes of a camera that rotated as `_rotation_until` gives.
-
-    Rodrigues: v cos - (a x v) sin + a (a.v)(1 - cos), with the unit vector a of the rotation.
-    """
+    """Return inertially fixed directions `v` (3, m) in the axes of the camera after `rotation`."""
     a, sine, cosine = rotation
     along = (a * a.T) @ v if a.shape[1] == 1 else a * np.sum(a * v, axis=0)
     out = (v - along) * cosine
@@ -362,25 +360,26 @@ class Shutter:
 
 # Number of polynomial coefficients that describe the rate over an exposure.
 _COURSE_TERMS = 7
-# Largest departure (px) from a constant rate at which a course counts as constant, and the number of instants
-# at which the departure is evaluated.
+# Largest departure (px) of a star's motion from a constant rate that is neglected.
 _UNEVEN = 0.05
+# Number of instants of the exposure at which the departure from a constant rate is evaluated.
 _INSTANTS = 65
-# Largest uncertainty (px over the exposure) of a usable course.
+# Largest uncertainty (px over the exposure) of a motion from navigation that the fit uses.
 _MOST_VAGUE = 3.0
-# Error of the mean rate that a wrong course causes, as a fraction of the course's own uncertainty.
+# Error of the mean rate due to an error of the motion from navigation, relative to its uncertainty.
 _COURSE_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """The rotation of the camera over the exposure as navigation knows it, from gyro and commanded torque.
+    """The rotation of the camera over the exposure as estimated from gyro and commanded torque.
 
-    The pixels determine the rate and its linear change; higher terms, for instance of a step within the
-    exposure, are better known from navigation and are held fixed in the fit.
+    The pixels determine the rate and its linear change. Higher terms, for instance of a step of the rate
+    within the exposure, are better known from navigation and are held fixed in the fit.
 
     Attributes:
-        terms: (k, 3) rad, coefficients of t, t^2, ... of the rotation vector since mid-exposure, camera axes.
+        terms: (k, 3) rad, coefficients of t, t^2, ... of the rotation vector since mid-exposure, in camera
+            axes.
         sigma: rad, standard deviation of the rate times the exposure.
     """
 
@@ -421,8 +420,8 @@ class StreakScene:
         stars: (n, 2) px at mid-exposure.
         light: (n,) counts over the exposure.
         sky: (n,) counts per pixel around each star, relative to the frame's background.
-        trusted: (n,) whether a star helps to determine the shared parameters; only light and position are
-            fitted for the others.
+        trusted: (n,) whether a star contributes to the shared parameters; of untrusted stars only light,
+            position and sky are fitted.
     """
 
     motion: CameraMotion
@@ -434,7 +433,7 @@ class StreakScene:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation of the point spread alone, px."""
+        """The standard deviation (px) of the point spread without the pixel."""
         return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:
@@ -459,7 +458,8 @@ def exposure_bounds(
     times = np.tile([-0.5, 0.5], (len(stars), 1))
     if shutter.delay_per_row == 0.0:
         return times
-    # The row of each end depends on its time. Fixed-point iteration converges: readout is slow.
+    # The row of each end of a path depends on the end's time, which is found by fixed-point iteration.
+    # It converges, because a star crosses few rows during the delay of one row.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
@@ -470,7 +470,7 @@ def exposure_bounds(
 def mid_exposure_positions(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, middles: FloatArray
 ) -> FloatArray:
-    """Return the positions (n, 2) px at mid-exposure of stars whose streaks are centred at `middles`."""
+    """Return the positions (n, 2), px, at mid-exposure of stars with streaks centred at `middles` (n, 2)."""
     if not len(middles):
         return middles
     if not motion.constant:
@@ -490,10 +490,11 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
     return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))
 
 
-# Limits for pieces of one streak: distance (px) between their circles, distance along the circle in rotations
-# of the exposure, and ratio of their light.
+# Largest distance (px) between the circles of two pieces of one streak.
 _CHAIN_ASIDE = 1.3
+# Range of the distance along the circle between two pieces, relative to the rotation angle.
 _CHAIN_APART = (0.55, 1.7)
+# Largest ratio of the light of two pieces of one streak.
 _CHAIN_RATIO = 2.5
 
 
@@ -516,9 +517,9 @@ def chained_stars(
 ) -> BoolArray:
     """Return which of the first `judged` of `stars` (n, 2) px look like pieces of a longer streak.
 
-    If the assumed rotation is too small, each star becomes a chain of streaks, end to end on one circle about
-    the axis and of equal `light` (n,), and each piece fits as well as a whole streak. Different stars rarely
-    meet in this way by chance.
+    If the assumed rotation is too small, each star becomes a chain of streaks of equal `light` (n,), end to
+    end on one circle about the axis, and each piece fits as well as a whole streak. Different stars rarely
+    form such a chain by chance.
     """
     polar, azimuth = polar_angles(pinhole, motion, stars)
     rotations = azimuth_differences(azimuth[:judged], azimuth)

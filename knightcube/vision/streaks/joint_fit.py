@@ -1,10 +1,12 @@
 """The joint fit of the motion and the brightest stars, with all stars that share their pixels.
 
-The fit iterates until the shared parameters have settled. It sees only a few pixels beyond the ends of the
-streaks: a rotation that is too small by a fifth can fit one end of every streak, and one that is too large
-has dark stretches. The brightness along the paths shows both (`true_ends`, `unbroken`). If an end lies more
-than a few widths of the point spread beyond the light, the pixels around it are only dark, and the fit may
-settle there; the end of the light along a longer stretch then corrects the length (`stretched`).
+The fit iterates until the steps of the shared parameters are small. It covers only a few pixels beyond the
+ends of the streaks, so that a wrong rotation angle can be a local maximum. A rotation that is too small by a
+fifth can fit one end of every streak; `true_ends` detects that light continues beyond the other ends. A
+rotation that is too large extends the streaks over dark pixels; `unbroken` detects dark stretches. If an end
+lies more than a few widths of the point spread beyond the light, the pixels around it contain no light that
+could attract the end. `stretched` then searches a longer distance for the end of the light and corrects the
+length.
 """
 
 from __future__ import annotations
@@ -49,60 +51,62 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Work (pixels) after which no other motion is tried. A fit in progress is finished, so that a frame may take
-# twice as much.
+# Work (pixels) after which no other motion is tried.
+# A fit in progress is finished, so that a frame may take twice this work.
 _MOST_WORK = 1_600_000
-# Fixed work of an evaluation of the model, and work per pixel of a pass over the frame.
+# Fixed work of one evaluation of the model, in equivalent pixels.
 _EVALUATION = 15_000
+# Work of a pass over the frame per pixel of the frame, relative to a pixel of a model evaluation.
 _PASS = 0.15
 
 
 class WorkBudget:
-    """Counts the work on one frame in pixels, not in time, so that results are the same on all machines."""
+    """The work on one frame, in pixels instead of seconds, so that all machines give the same results."""
 
     def __init__(self) -> None:
         self._spent = 0.0
 
     def evaluated(self, pixels: int) -> None:
-        """Count an evaluation of the model on `pixels`."""
+        """Add the work of one model evaluation on `pixels` pixels."""
         self._spent += pixels + _EVALUATION
 
     def passed(self, pixels: int) -> None:
-        """Count a pass over a frame of `pixels`."""
+        """Add the work of one pass over a frame of `pixels` pixels."""
         self._spent += _PASS * pixels
 
     @property
     def exhausted(self) -> bool:
-        """Whether the work exceeds the limit for further motions."""
+        """Whether the work exceeds the limit above which no further motion is tried."""
         return self._spent > _MOST_WORK
 
 
-# Longest displacement (px) of an end in one step.
+# Largest displacement (px) of a streak's end in one step of the fit.
 _LONGEST_STEP = 3.0
-# Displacement (px) of an end after which windows are cut again.
+# Displacement (px) of a streak's end after which the fitted windows are cut again.
 _DRIFT = 2.0
-# The same for untrusted stars in the first round. Later rounds ignore them, because the light of some of them
-# hardly determines their position.
+# Displacement (px) of an untrusted star's streak after which the first round cuts the windows again.
+# Later rounds ignore untrusted stars, because the light of some of them hardly determines their position.
 _FAINT_DRIFT = 3.2
-# Change of the acceleration, relative to the rotation, after which windows are cut again.
+# Change of the acceleration, relative to the rotation, after which the fitted windows are cut again.
 _GROWN = 0.1
-# Step of the shared parameters, in standard deviations, at which the fit has settled. The step is applied, so
-# that the remaining error is of second order.
+# Step of the shared parameters, in standard deviations, at which the fit stops.
+# The step is applied, so that the remaining error is of second order.
 SETTLED = 0.4
-# Ratio of consecutive steps above which the fit stops once its patience is exhausted.
+# Largest ratio of consecutive steps with which the fit continues after its rounds of patience.
 _LEAST_PROGRESS = 0.7
 # Number of rounds after which the selection of clipped pixels is final.
 _LOOKS = 1
-# Probability of rejecting a constant rate by chance.
+# Probability with which the score test rejects a constant rate by chance.
 _BY_CHANCE = 1e-4
-# Fraction of the limit below which the exact test is omitted.
+# Ratio of the approximate test statistic to its limit below which the exact test is omitted.
 _FAR_BELOW = 0.5
-# Number of parameters of the acceleration.
+# Number of parameters of the acceleration, the degrees of freedom of the score test.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
 """The free shared parameters of a changing rate."""
-# Largest width (px) of the point spread, and largest ratio to the initial width in a joint fit.
+# Largest width (px) of the point spread in a joint fit.
 _WIDEST = 6.0
+# Largest ratio of the fitted to the initial width of the point spread in a joint fit.
 _WIDER = 1.6
 
 
@@ -143,8 +147,8 @@ class FitProblem:
         settings: settings of the estimator.
         sigma: px, initial width of the point spread.
         growing: whether the acceleration is fitted.
-        sense: (3,) direction that the rotation must have a positive component along; None: either sense.
-        course: the motion as known from navigation; None if unknown or nearly constant.
+        sense: (3,) direction along which the rotation must have a positive component; None for either sense.
+        course: motion known from navigation; None if unknown or nearly constant.
         work: work spent on the frame.
     """
 
@@ -165,7 +169,7 @@ class FitProblem:
 
     @property
     def undecided(self) -> bool:
-        """Whether the pixels decide if the rate changes, and have not done so."""
+        """Whether the choice between a constant and a changing rate is still open."""
         return self.settings.rate_model == "auto" and not self.growing
 
     def windows(self, scene: StreakScene) -> FitWindows:
@@ -181,7 +185,7 @@ class FitProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakFit:
-    """A scene after its last step, with the equations of that step.
+    """A fitted scene, with the normal equations of its last step.
 
     Attributes:
         scene: the fitted scene.
@@ -202,11 +206,11 @@ class StreakFit:
     hidden: StreakScene | None = None
 
     def grows(self) -> bool:
-        """Return whether the pixels show a change of the rate, by a score test of the constant rate.
+        """Return whether the rate changes significantly, by a score test of the constant rate.
 
-        The scatter of the stars' accelerations enters the test (Hotelling).
+        The test accounts for the scatter of the stars' accelerations (Hotelling's T-squared).
         """
-        # The approximation without shared pixels decides most cases.
+        # The approximation that neglects shared pixels decides most cases.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
@@ -228,7 +232,7 @@ def iterate(
     how: IterationLimits,
     windows: FitWindows | None = None,
 ) -> StreakFit | None:
-    """Return the fit of all stars and the `free` (SHARED,) shared parameters, None if not determined."""
+    """Return the fit of all stars and of the `free` (SHARED,) shared parameters, None if not determined."""
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
@@ -250,7 +254,7 @@ def iterate(
         if last_step <= how.settled or wanted <= how.tolerance:
             last_step = 0.0
             break
-        # Consecutive steps in the same direction still make progress.
+        # Consecutive steps in the same direction count as progress.
         onward = (
             float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
         )
@@ -272,7 +276,7 @@ def iterate(
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
     """Return whether windows must be cut again: an end has moved, or the acceleration has changed.
 
-    `faint` (px) is the limit for the ends of untrusted stars.
+    `faint` is the displacement (px) of the ends of untrusted stars above which windows are cut again.
     """
     grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
     if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
@@ -286,43 +290,48 @@ def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint:
 
 
 def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> float:
-    """Return the median chi-square per degree of freedom of some `stars`, NaN without any."""
+    """Return the median chi-square per degree of freedom of the chosen `stars`, NaN if there are none."""
     freedom = np.maximum(evaluation.pixels[stars] - ALONE - 1.0, 1.0)
     return float(np.median(evaluation.chi2[stars] / freedom)) if len(freedom) else float("nan")
 
 
-# Length of the stretch at an end: fraction of the path, minimum (px), and its distance from the end (px).
+# Length of the stretch that is compared at each end, as a fraction of the path.
 _STRETCH = 0.1
+# Minimum length (px) of the stretch that is compared at each end.
 _LEAST_STRETCH = 8.0
+# Distance (px) of the compared stretch from the end of the path.
 _FROM_END = 4.0
+# Number of samples along the stretch at an end.
 _SAMPLES = 24
-# Number of stretches within a path, and number of samples in each.
+# Number of stretches into which a path is divided to find dark ones.
 _WITHIN = 10
+# Number of samples along each of these stretches of a path.
 _WITHIN_SAMPLES = 10
 # Offsets (px) of the samples across the path.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
 # Mean brightness of the three central pixels across a streak, relative to its light per px of length.
 _MIDDLE = 0.287
-# Brightness relative to the expected one that separates lit from dark stretches.
+# Brightness, relative to the expected brightness, below which a stretch counts as dark.
 _HALF = 0.5
-# Minimum fraction of usable pixels in a stretch.
+# Minimum fraction of usable pixels in a stretch whose brightness is measured.
 _LEAST_VALID = 0.7
-# Minimum expected brightness of a usable stretch, in standard deviations.
+# Minimum expected brightness of a stretch that is judged, in standard deviations.
 _LEAST_SIGNIFICANCE = 4.0
 # Number of instants at which the progress along a path is evaluated.
 _INSTANTS = 65
-# Minimum speed relative to the mean in the expected brightness; the point spread smooths brighter stretches.
+# Minimum speed, relative to the mean, in the expected brightness.
+# The point spread smooths the brighter light of slower stretches.
 _SLOW = 0.5
-# Brightness beyond an end, relative to the streak's mean, that indicates a trail.
+# Minimum brightness beyond an end, relative to the streak's mean, that counts as a trail.
 _TRAIL = 0.08
-# Fraction of a streak's stretches that may be dark.
+# Largest fraction of dark stretches in an unbroken streak.
 _DARK = 0.15
 
 
 def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
     """Return an array (n, 2) with 1 for the ends of streaks at which the light ends, and 0 for other ends.
 
-    Ends outside the detector and those of streaks too short to judge are NaN.
+    Ends outside the detector and ends of streaks that are too short to judge are NaN.
     """
     out = np.full((len(scene.stars), 2), np.nan)
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -331,12 +340,12 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
         return out
     scene, length = scene.select(long), length[long]
     instants = np.linspace(-0.5, 0.5, _INSTANTS)
-    # The small term in time keeps the progress increasing during a rest.
+    # The small term in time keeps the progress strictly increasing while the camera is at rest.
     progress = np.maximum.accumulate(scene.motion.progress(instants)) + 1e-9 * np.arange(_INSTANTS)
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
     for end, sign, steady, there, speed in _end_motions(camera, scene):
-        # Brightness of the stretch relative to the mean, from the time that a star spends there.
+        # The brightness of the stretch relative to the mean follows from the time that the star spends in it.
         near, far = _FROM_END / speed, (_FROM_END + stretch) / speed
         last = progress[-1 if sign > 0.0 else 0]
         begin, stop = (np.interp(last - sign * distance, progress, instants) for distance in (near, far))
@@ -351,9 +360,9 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
 
 
 def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the fraction of stars with faint light beyond an end, of the stars that can be judged.
+    """Return the fraction of the judged stars that have faint light, a trail, beyond an end.
 
-    An error of the rate's change leaves such a trail.
+    An error of the fitted change of the rate causes such trails.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     faint = _TRAIL * expected_brightness(scene.light, length)
@@ -370,9 +379,9 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield number and outward sign of both ends, a steady motion, the ends (n, 2) px, and their speed (n,).
+    """Yield for each end its number, outward sign, a steady motion, the ends (n, 2) px and speeds (n,).
 
-    The motion itself may be at rest at an end, so that the steady motion extends the paths.
+    The steady motion extends the paths beyond the ends, because the motion itself may be at rest at an end.
     """
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     steady = CameraMotion.steady(scene.motion.rotation)
@@ -383,9 +392,10 @@ def _end_motions(
 
 
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return 1 for each star that is bright along its entire path on the detector, else 0; (k,).
+    """Return an array (k,) with 1 for stars that are bright along their entire paths, and 0 for others.
 
-    Stars too short or too faint to judge are omitted.
+    Only the part of a path on the detector counts. Stars that are too short or too faint to judge are
+    omitted.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     long = length > _WITHIN * _LEAST_STRETCH
@@ -437,22 +447,26 @@ def brightness(
     return np.where(enough, total / count, np.nan), np.sqrt(variance) / count
 
 
-# Distance from an end that is searched for the end of the light: fraction of the length, minimum and maximum
-# (px), and number of steps.
+# Distance on either side of a path's end that is searched for the end of the light, relative to the path
+# length.
 _REACH = 0.08
+# Minimum and maximum distance (px) that is searched for the end of the light.
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
+# Number of steps over the searched distance.
 _STEPS = 41
-# Minimum significance of the light near a usable end, in standard deviations.
+# Minimum significance (standard deviations) of the light near an end whose position is measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Largest brightness relative to the expected one, to limit the effect of other stars.
+# Largest brightness in the search, relative to the expected brightness, to limit the effect of other stars.
 _CAP = 2.0
-# Minimum number of streaks of wrong length, minimum error (px) and largest difference (px) of their errors,
-# and minimum ratio to the number of streaks of correct length.
+# Minimum number of streaks of wrong length for a correction of the length.
 _LEAST_STREAKS = 3
+# Minimum error (px) of a streak's length that counts as wrong.
 _LEAST_OFF = 4.0
+# Largest difference (px) between the length errors of streaks that agree.
 _ALIKE = 3.0
+# Minimum ratio of the number of streaks of wrong length to that of streaks of correct length.
 _MORE = 2
-# Largest relative change of the rate for a correction of the length.
+# Largest relative change of the rate at which the length is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
 
 
@@ -478,7 +492,7 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
         mean, deviation = brightness(camera, motion, repeated, time.reshape(-1, 1))
         mean, deviation = mean.reshape(-1, _STEPS), np.maximum(deviation.reshape(-1, _STEPS), 1e-6)
         seen = np.minimum(np.maximum(mean, -expected), _CAP * expected)
-        # Log-likelihood ratio of a lit and a dark path, accumulated outwards.
+        # The log-likelihood ratio of a lit and a dark path is accumulated outwards.
         explained = np.cumsum((seen - 0.5 * expected) * expected / deviation**2, axis=1)
         last = np.argmax(explained, axis=1)
         sure = np.sum((expected / deviation) ** 2, axis=1) > _EDGE_SIGNIFICANCE**2
@@ -491,8 +505,9 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
 def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     """Return `scene` with its rotation corrected so that streaks and light have the same ends.
 
-    None if no correction is needed, or if the rate changes so much that the brightness varies along a streak.
-    The stars are moved to the centre of their ends, or to the right distance from the only end in the frame.
+    The result is None if no correction is needed, or if the rate changes so much that the brightness varies
+    along a streak. The stars are moved to the centre of their ends, or to the right distance from the only
+    end in the frame.
     """
     if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
@@ -511,7 +526,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     if stretch == 0.0:
         return None
     off = beyond / np.maximum(length, 1.0)[:, None]
-    # Time of mid-exposure under the uncorrected motion, by either end.
+    # Each end gives the time of mid-exposure under the uncorrected motion.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
@@ -520,37 +535,42 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     return replace(scene, motion=motion, stars=moved)
 
 
-# Largest relative change of the rate over the exposure; 2 is a motion from rest or to rest.
+# Largest relative change of the rate over the exposure.
+# A motion that begins or ends at rest has a change of 2.
 _MOST_CHANGE = 2.2
-# Deviation of a star, in standard deviations, from which it is not trusted.
+# Deviation of a star from the majority, in standard deviations, above which it is not trusted.
 _TRUST_SIGMAS = 3.5
-# Errors of the model at the ends (px) and in the width (px).
+# Model error (px) of the ends of a streak, added to the noise in the test of the stars.
 _END_FLOOR = 0.01
+# Model error (px) of the width of a streak, added to the noise in the test of the stars.
 _WIDTH_FLOOR = 0.002
-# Distance between streaks, in reaches, below which they are fitted together.
+# Distance between two streaks, relative to the half width of a strip, below which they are fitted together.
 _NEAR = 1.4
-# Displacement (px) of the ends between first and last fit from which faint stars are searched again.
+# Displacement (px) of the ends between first and last fit above which faint stars are searched again.
 _FAR = 6.0
+# Maximum number of searches for faint stars.
 _MOST_REPEATS = 2
-# Relative error of the light of a subtracted star on a pixel.
+# Relative error of the light that a subtracted star leaves on a pixel.
 _SUBTRACTION_ERROR = 0.35
-# Maximum number of pixels in all windows, shared pixels counted for each star. It bounds memory and time.
+# Maximum number of pixels in all windows, which bounds memory and time.
+# A shared pixel counts once for each of its stars.
 _MOST_PIXELS = 60_000
-# Fraction of those pixels for the brightest streaks in a fit with all their neighbours, and the minimum
-# number of these streaks.
+# Fraction of `_MOST_PIXELS` for the brightest streaks in a fit with all their neighbours.
 _BRIGHTEST_SHARE = 0.5
+# Minimum number of the brightest streaks in a fit with all their neighbours.
 _LEAST_BRIGHTEST = 10
-# Minimum significance of stars that are searched on the pixels of bright ones, whose ends they shift.
+# Minimum significance (standard deviations) of hidden stars on the pixels of bright streaks.
+# Hidden stars shift the ends of the bright streaks.
 _HIDDEN_SIGMAS = 4.5
-# Number of stars subtracted at a time.
+# Number of stars subtracted at a time, to limit the memory.
 _AT_ONCE = 16
 
 
 def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
     """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
-    If the motion differs much from that of `first`, or if the light ends elsewhere than the streaks, the
-    faint stars are searched again along the new motion. A fit that the light contradicts twice is rejected.
+    The faint stars are searched again along the new motion if it differs much from the motion of `first`, or
+    if the light and the streaks have different ends. A fit whose streaks have wrong ends twice is rejected.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -573,7 +593,7 @@ def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
-    """Return whether the ends of the streaks have moved by more than the fit can follow."""
+    """Return whether the ends of the streaks have moved so far that faint stars must be searched again."""
     changed = float(np.linalg.norm(after.motion.rotation - before.motion.rotation))
     turn = float(np.linalg.norm(after.motion.rotation))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
@@ -581,7 +601,7 @@ def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
 
 
 def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
-    """Return the joint fit of the stars detected along the motion of `first`, and the faint stars not fitted.
+    """Return the joint fit of stars detected along the motion of `first`, and the other faint stars.
 
     The rate is constant unless the settings or the pixels require a changing rate.
     """
@@ -612,7 +632,7 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
-    """Return the streaks along the motion of `first` other than its own, with stars at mid-exposure."""
+    """Return the streaks along the motion of `first` that are not in its fit."""
     settings, motion = camera.settings, first.scene.motion
     camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
@@ -628,10 +648,11 @@ def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
 
 
 def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
-    """Return the fit of `scene`, its motion determined by the stars that agree; None if the fit fails.
+    """Return the fit of `scene` with the motion on which its stars agree; None if the fit fails.
 
-    The pixels decide between a constant and a changing rate. The brightest untrusted stars are fitted within
-    `room` times the usual number of pixels; the light of the others is subtracted.
+    The pixels decide between a constant and a changing rate. The brightest untrusted stars are fitted, as far
+    as all windows have at most `room` times the usual number of pixels. The light of the other untrusted
+    stars is subtracted.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -651,9 +672,9 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
 
 
 def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
-    """Return the joint fit repeated from the result `last` with another `camera`, None if it fails.
+    """Return the joint fit repeated from the fit `last` with another `camera`, None if it fails.
 
-    All of the brightest stars are trusted again.
+    All bright stars are trusted at the start.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -665,8 +686,9 @@ def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Return a fit of the brightest streaks of `last` with all stars on their pixels.
 
-    Stars hidden in a streak shift its ends. If the joint fit had no room for them, fewer streaks with all
-    hidden stars determine the motion better. None if there was room, or if the fit fails or diverges.
+    Stars hidden in a streak shift its ends. If the joint fit had no room for the hidden stars, a fit of fewer
+    streaks with all their hidden stars determines the motion better. The result is None if the joint fit had
+    room for all stars, or if the new fit fails or diverges.
     """
     others, scene = last.hidden, last.scene
     if others is None or not len(others.light):
@@ -688,7 +710,10 @@ def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 
 
 def _excessive(motion: CameraMotion) -> bool:
-    """Return whether the rate changes by more than the model describes, unless the motion is a known one."""
+    """Return whether the rate changes more than the model allows.
+
+    A motion known from navigation is never excessive.
+    """
     if motion.higher_terms.any():
         return False
     return float(np.linalg.norm(motion.acceleration)) > _MOST_CHANGE * float(np.linalg.norm(motion.rate))
@@ -716,7 +741,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return which stars (n,) are fitted: the trusted ones, and the brightest others while there is room."""
+    """Return which stars (n,) are fitted: trusted ones and, within the pixel limit, the brightest others."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))

@@ -1,17 +1,18 @@
 """The pixels that are fitted, and the normal equations of a scene: gradient and information (Fisher scoring).
 
-Strips cover long streaks, patches cover spots. The model of the strips expands the light of a streak, which
-is inversely proportional to its speed, and fails near a rest: if the rate grows from zero or falls to it, a
-patch covers the slow part of each streak.
+Strips cover long streaks, patches cover spots. The light of a streak per px is inversely proportional to the
+star's speed. The model of the strips expands this light about each block and fails if the speed is near zero.
+If the rate increases from zero or decreases to zero, a patch therefore covers the slow part of each streak.
 
-The weight of a pixel is the inverse of the variance that the model predicts, so that the fixed point is the
-maximum likelihood for Poisson noise. The residual is that of all stars together, so that streaks may cross.
-The shared parameters (rate, acceleration, width) are solved for after the four parameters of each star are
-eliminated. Stars that share pixels are coupled, which a few rounds of conjugate gradients account for.
+The weight of a pixel is the inverse of the variance that the model predicts, so that the iteration converges
+to the maximum likelihood for Poisson noise. The residual of a pixel is relative to the light of all stars, so
+that streaks may cross. The shared parameters (rate, acceleration, width) are solved for after the four
+parameters of each star are eliminated. Shared pixels couple the parameters of their stars; a few
+conjugate-gradient steps account for the coupling.
 
-Each star also gives its own estimate of the shared parameters. A blend of two stars is wider or longer than
-the others, and light of another star shifts its ends; such stars disagree with the majority and are no longer
-trusted.
+Each star also gives its own estimate of the shared parameters. A blend of two stars is wider or longer than a
+single star, and light of another star shifts the ends of a streak. Such stars disagree with the majority and
+are no longer trusted.
 """
 
 from __future__ import annotations
@@ -36,20 +37,20 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
-# Length of a path, in widths, below which it is a spot.
+# Length of a path, in widths of the point spread, below which a star counts as a spot.
 _SPOT_WIDTHS = 8.0
 # Distance of the predicted light from saturation, in standard deviations, below which a pixel is excluded.
-# The prediction decides, because a selection by the noise would be biased.
+# The prediction decides, because a selection by the measured light would be biased by its noise.
 _MARGIN = 3.0
 # Number of instants at which the position of a star is evaluated.
 _INSTANTS = 9
 # Residual, relative to the model, that is never clipped.
 _UNRESOLVED = 0.1
-# Largest relative change of the speed along a strip over a width of the point spread.
+# Largest relative change of a star's speed over one width of the point spread within a strip.
 _STEADY = 0.05
-# Minimum length of the fast part of a path, in widths; the patch covers shorter ones.
+# Minimum length of the fast part of a path, in widths; a patch covers a path with a shorter fast part.
 _LEAST_FAST = 4.0
-# Minimum speed, px per exposure.
+# Minimum speed (px per exposure) in divisions by the speed.
 _SLOWEST = 1e-3
 # Number of instants at which the rate is evaluated to find the slow part.
 _SAMPLES = 129
@@ -57,18 +58,18 @@ _SAMPLES = 129
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """The frame on blocks of pixels; arrays (b, ...) unless stated otherwise.
+    """The data of the frame on b blocks of pixels. Arrays have the shape (b, ...) unless stated otherwise.
 
     Attributes:
-        slot: number of the pixel among all fitted pixels, the same for all stars that share it; the number of
-            fitted pixels if the pixel is outside the frame.
+        slot: index of the pixel among all fitted pixels, the same for all stars that share the pixel. For a
+            pixel outside the frame it is the number of fitted pixels.
         inside: whether the pixel is fitted.
         signal: counts above the background.
-        floor: counts^2, variance without a star.
+        floor: counts^2, variance of the pixel without a star.
         ceiling: counts above the background at which the pixel saturates.
         gain: electrons per count.
         crowded: (e,) flat positions of the pixels that other stars share.
-        common: (e,) their numbers among all shared pixels.
+        common: (e,) indices of the pixels `crowded` among all shared pixels.
     """
 
     slot: IntArray
@@ -81,9 +82,10 @@ class BlockPixels:
     common: IntArray
 
     def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights (1/variance, 0 if excluded) and residuals for the modelled light `total` by slot.
+        """Return weights and residuals of the pixels for the modelled light `total`, indexed by slot.
 
-        Residuals beyond `clip` standard deviations plus a tenth of the model are excluded; 0 disables this.
+        The weight is 1/variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip` standard
+        deviations plus a tenth of the model are excluded; `clip` 0 excludes none.
         """
         model = total.take(self.slot)
         variance = np.maximum(model, np.float32(0.0))
@@ -130,13 +132,13 @@ class FitWindows:
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
         """Return the light (m + 1,) of all stars by slot, from the light of each star on its own pixels.
 
-        The last element is for pixels outside the frame.
+        The last element collects the light on pixels outside the frame.
         """
         light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
         return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
-        """Return the windows restricted to some pixels."""
+        """Return the windows restricted to the pixels of the masks `on_strips` and `on_patches`."""
         return replace(
             self,
             on_strips=replace(self.on_strips, inside=on_strips),
@@ -147,7 +149,7 @@ class FitWindows:
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) of each star's window, `reach` widths around its path.
 
-    All lines of all strips are as long as the line that its path crosses most obliquely.
+    All lines of all strips have the length of the line that a path crosses most obliquely.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -170,7 +172,7 @@ def cut_windows(
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Each pixel is numbered by its last occurrence; only memory of fitted pixels is touched.
+    # Each pixel gets the number of its last occurrence, so that only memory of fitted pixels is touched.
     order = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
     number[named] = order
@@ -202,14 +204,17 @@ def cut_windows(
 def _strips_and_patches(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, room: float
 ) -> tuple[IntArray, IntArray, Strips, Patches]:
-    """Return the stars with strips (a,) and with patches (b,), and those, `room` px around the paths."""
+    """Return the stars with strips (a,), the stars with patches (b,), the strips and the patches.
+
+    They cover the pixels within `room` px of the paths.
+    """
     times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)
     whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
     long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # A patch covers the slow part of a streak, or all of a spot.
+    # A patch covers the slow part of a streak, or the entire path of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
     stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
@@ -222,7 +227,7 @@ def _strips_and_patches(
 
 
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the times (n, 2) between which each star is fast enough for a strip, and those of its slow part.
+    """Return start and end times (n, 2) of each star's fast part, for a strip, and of its slow part.
 
     The slow part is at the end towards which the rate decreases. A missing part has zero duration.
     """
@@ -234,7 +239,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # A star is slow where its speed may change too much over a width.
+    # A star is slow at times at which its speed may change too much over one width of the point spread.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:
@@ -249,7 +254,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the strips without the pixels of a patch of the same star."""
+    """Return the strips without the pixels that belong to a patch of the same star."""
     both = np.isin(long, spot)
     if not both.any():
         return strips
@@ -273,14 +278,14 @@ def _block_pixels(
     crowded: IntArray,
     common: IntArray,
 ) -> BlockPixels:
-    """Return the frame on blocks of pixels `index`, see `BlockPixels`."""
+    """Return the data of the frame on the blocks of pixels with the flat indices `index`."""
     signal = frame.signal.take(index)
     return BlockPixels(
         slot.reshape(index.shape),
         inside & ~frame.bad.take(index),
         signal,
         frame.floor.take(index),
-        # The background is the difference of counts and signal.
+        # The saturation level is relative to the background, which is the raw counts minus the signal.
         np.float32(frame.top) - frame.counts.take(index) + signal,
         frame.gain,
         crowded,
@@ -308,13 +313,13 @@ class Evaluation:
     """The normal equations of a scene.
 
     Attributes:
-        information: (n, SHARED + ALONE, SHARED + ALONE), of the pixels of each star.
-        gradient: (n, SHARED + ALONE), of the pixels of each star.
+        information: (n, SHARED + ALONE, SHARED + ALONE) Fisher information of each star's pixels.
+        gradient: (n, SHARED + ALONE) gradient of the log-likelihood of each star's pixels.
         chi2: (n,) chi-square of the pixels of each star.
         pixels: (n,) number of pixels of each star.
         crowds: derivatives of the light on shared pixels.
         shared: number of shared pixels.
-        kept: which pixels of the strips and of the patches were not excluded.
+        kept: masks of the pixels of the strips and of the patches that were not excluded.
     """
 
     information: FloatArray
@@ -328,16 +333,16 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Derivatives of the light on pixels (e,) that other stars share, in order of their blocks (b,).
+    """Derivatives of the light on e pixels that other stars share, sorted by their b blocks.
 
     Attributes:
         star: (b,) star of each block.
-        matrix: (b, i, SHARED + ALONE) coefficients of the images for the derivatives.
+        matrix: (b, i, SHARED + ALONE) coefficients with which the i images form the derivatives.
         block: (e,) block of each pixel.
         first: (b,) first pixel of each block.
         slot: (e,) number of each pixel among all shared pixels.
         weight: (e,) weight of each pixel.
-        images: (i, e) images on the pixels.
+        images: (i, e) values of the images on the pixels.
     """
 
     star: IntArray
@@ -354,7 +359,7 @@ def evaluate(
 ) -> Evaluation:
     """Return the normal equations of `scene` on its windows.
 
-    `clip` is that of `BlockPixels.residual`. `growing`: whether the acceleration is fitted.
+    For `clip` see `BlockPixels.residual`. `growing` states whether the acceleration is fitted.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
@@ -402,7 +407,7 @@ def model_images(
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Return the images of the strips, the light of the spots and its derivatives, for stars of unit light.
 
-    One additional image is left for the residual.
+    The last image of the strips is uninitialised and later holds the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -415,7 +420,7 @@ def model_images(
 def _block_coefficients(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return coefficients (b, IMAGES, SHARED + ALONE) of the images for the derivatives of each block."""
+    """Return the coefficients (b, IMAGES, SHARED + ALONE) with which the images form the derivatives."""
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -440,8 +445,8 @@ def _add(
 ) -> None:
     """Add blocks of pixels, in order of their stars, to the normal equations.
 
-    The last image is the residual. Its products with the other images give the gradient, and its product with
-    itself gives the chi-square.
+    The last image is the residual. The products of the residual with the other images give the gradient, and
+    its square gives the chi-square.
     """
     blocks, count = images.shape[:2]
     flat = images.reshape(blocks, count, -1)
@@ -464,7 +469,7 @@ def _add(
 def _shared_pixels(
     star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
 ) -> SharedPixels:
-    """Return the derivatives on the pixels that other stars share."""
+    """Return the derivatives of the light on the pixels that other stars share."""
     block, place = np.divmod(view.crowded, images.shape[2])
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
@@ -488,11 +493,14 @@ def _shared_pixels(
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the light of spots, the last uninitialised."""
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the light of spots.
+
+    The last element along the second axis is uninitialised.
+    """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
-    # The width includes the pixel, so that d sigma / d width = width / sigma.
+    # The width contains the variance of the pixel, so that d sigma / d width = width / sigma.
     images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
     images[:, 7:9] = change[:, 6:8] * light
     images[:, 9] = spots
@@ -503,9 +511,10 @@ def _spot_images(
 def apply_information(
     evaluation: Evaluation, shared: FloatArray, alone: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the product of the information of all stars with a vector of `shared` (SHARED,) and `alone`.
+    """Return the product of the information matrix of all stars with the vector (`shared`, `alone`).
 
-    `alone` (n, ALONE) are the parameters of each star. The coupling of stars that share pixels is included.
+    `shared` (SHARED,) has the shared parameters and `alone` (n, ALONE) the parameters of each star. The
+    coupling of stars that share pixels is included.
     """
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
@@ -529,12 +538,12 @@ _CONVERGED = 1e-2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """One step of the fit and the covariance.
+    """One step of the fit, with the covariance of the parameters.
 
     Attributes:
         shared: (SHARED,) step of the shared parameters.
         alone: (n, ALONE) step of the parameters of each star.
-        eliminated: equations that neglect the coupling of stars.
+        eliminated: normal equations without the coupling of stars.
     """
 
     shared: FloatArray
@@ -551,7 +560,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared parameters with each star's."""
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of shared and own parameters of each star."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -570,7 +579,7 @@ class EliminatedEquations:
         kept: (k,) indices of the fitted shared parameters.
         own: (n, ALONE, ALONE) inverse of each star's block.
         gain: (n, k, ALONE) product of the coupling block and `own`.
-        inner: (k, k) covariance of the shared parameters.
+        inner: (k, k) covariance of the fitted shared parameters.
     """
 
     kept: IntArray
@@ -589,12 +598,12 @@ class EliminatedEquations:
 def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | None:
     """Return the eliminated equations, None if they do not determine the shared parameters.
 
-    `free` (SHARED,) tells which shared parameters are fitted.
+    The mask `free` (SHARED,) selects the fitted shared parameters.
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # A star outside the frame has no information on its light; a unit keeps its block regular.
+    # A star outside the frame gives no information on its light; a diagonal of 1 keeps its block regular.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
@@ -616,14 +625,14 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 
 
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
-    """Return the step to the maximum, None if the shared parameters are not determined.
+    """Return the step to the maximum likelihood, None if the shared parameters are not determined.
 
-    At most `rounds` conjugate-gradient steps account for shared pixels; 0 neglects them.
+    At most `rounds` conjugate-gradient steps account for shared pixels; with 0 rounds they are neglected.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    # The prior of the sky is zero; that of the position is centred at its current value.
+    # The prior mean of the sky is zero; the prior mean of the position is the current position.
     offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
     alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
@@ -632,14 +641,15 @@ def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: i
 
 
 def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (3, 3) of the rate with shared pixels accounted for, None if not determined."""
+    """Return the covariance (3, 3) of the rate, including the effect of shared pixels, None if singular."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
     alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
-        # Scaled for a solution of order one, so that one tolerance suits all.
+        # The right-hand side is scaled for a solution of order one, so that one tolerance suits all
+        # components.
         unit = np.zeros(SHARED)
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
@@ -656,7 +666,8 @@ def _conjugate(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the solution of the coupled normal equations for the right-hand side `right`.
 
-    The equations without coupling precondition the conjugate gradients, so that a few rounds suffice.
+    The equations without coupling are the preconditioner of the conjugate gradients, so that a few steps
+    suffice.
     """
     x = eliminated.solve(*right)
     if rounds == 0:
@@ -718,17 +729,18 @@ def stepped(
     return after, max(ends, abs(float(solution.shared[6])))
 
 
-# Information of a star, relative to the best one, below which it is ignored.
+# Information of a star, relative to the star with most information, below which the star is ignored.
 _NOTHING = 1e-9
-# Information of a star on a direction, relative to its best direction, below which it is ignored.
+# Information of a star along an eigenvector, relative to its largest eigenvalue, below which it is ignored.
 _KNOWN = 1e-4
-# Minimum effective number of stars for a scatter; unequal weights reduce the effective number.
+# Minimum effective number of stars for an estimate of their scatter.
+# Unequal weights reduce the effective number.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEstimates:
-    """Each star's estimate of the shared parameters along k directions: change and deviation, both (n, k)."""
+    """The n stars' estimates of shared parameters along k directions: changes and deviations, (n, k)."""
 
     change: FloatArray
     deviation: FloatArray
@@ -736,7 +748,7 @@ class StarEstimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """The equations of each star for the free shared parameters, its own parameters eliminated.
+    """Each star's normal equations for the free shared parameters, with its own parameters eliminated.
 
     Attributes:
         kept: (k,) indices of the free shared parameters.
@@ -758,7 +770,7 @@ def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
     """Return each star's estimates of the rate, along its axis and two normal directions, and of the width.
 
-    All are changes of the scene's values, in rad per exposure, and in px for the width.
+    The estimates are changes relative to the scene, in rad per exposure for the rate and in px for the width.
     """
     axis = scene.motion.rotation / max(float(np.linalg.norm(scene.motion.rotation)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
@@ -776,8 +788,8 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
 def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     """Return the squared significance of `step` (SHARED,) of the shared parameters, and the number of stars.
 
-    The scatter of the stars limits the significance if it exceeds the noise, so that one blended star does
-    not make a step significant.
+    If the scatter of the stars exceeds their noise, the significance is relative to the scatter, so that one
+    blended star does not make a step significant.
     """
     alone = star_equations(evaluation, step != 0.0)
     if alone is None:
@@ -813,7 +825,8 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # The uncertainty of the median keeps a star that is better known than all others.
+        # The uncertainty of the median is included, so that a star with a smaller error than all others is
+        # kept.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
@@ -826,7 +839,7 @@ def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # Squared weights, so that many faint stars do not hide the scatter of a few bright ones.
+    # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
     # The largest of several values is expected to exceed one by about a standard deviation.
@@ -836,7 +849,8 @@ def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
 def contradiction(alone: StarEquations) -> float:
     """Return the chi-square per degree of freedom of all stars' equations about their common solution.
 
-    Unlike `disagreement` it includes all directions that a star determines, with the noise of each star.
+    In contrast to `disagreement`, all directions that a star determines contribute, with the noise of each
+    star.
     """
     total = alone.information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))

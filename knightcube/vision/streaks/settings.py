@@ -1,4 +1,4 @@
-"""Settings of the maximum-likelihood estimator; the defaults suit the demonstration's camera."""
+"""Settings of the maximum-likelihood estimator. The defaults are for the camera of the demonstration."""
 
 from __future__ import annotations
 
@@ -15,36 +15,38 @@ RateModel = Literal["auto", "constant", "accelerating"]
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodSettings:
-    """How the motion is estimated from a frame.
+    """Settings of the estimate of the motion from one frame.
 
     Attributes:
         gain: electrons per count.
-        saturation: counts at which a pixel saturates; None: the highest count of the frame if several pixels
-            share it, else the maximum of the integer type.
-        saturated_fraction: fraction of saturated pixels from which a frame is rejected.
-        psf_sigma: px, initial standard deviation of the point spread; from 2 px on, pixels are summed.
-        rate_model: `constant`; `accelerating`: a linear change of the rate is fitted too; `auto`: chosen by
-            the pixels.
-        line_time: s, delay of each row's exposure to the row above (rolling shutter); 0: global shutter.
-            None: unknown, fitted as 0 with a large uncertainty.
+        saturation: counts at which a pixel saturates. If None, it is the highest count of the frame if
+            several pixels have it, otherwise the maximum of the integer type.
+        saturated_fraction: minimum fraction of saturated pixels at which a frame is rejected.
+        psf_sigma: px, initial standard deviation of the point spread. If it is 2 px or more, pixels are
+            summed.
+        rate_model: `constant` for a constant rate, `accelerating` for a linear change of the rate, or `auto`
+            for a choice by a test on the pixels.
+        line_time: s, delay of each row's exposure relative to the row above (rolling shutter), 0 for a global
+            shutter. If None, it is unknown, and the fit uses 0 with a large uncertainty.
         threshold_sigmas: threshold of the 3 x 3 sums for the first guess, in standard deviations.
         most_stars: maximum number of the brightest stars, which determine the motion.
-        most_neighbours: maximum number of fainter stars that overlap the bright ones and are fitted too.
-        most_faint: maximum number of further stars that are detected and subtracted.
+        most_neighbours: maximum number of fitted fainter stars that overlap the bright stars.
+        most_faint: maximum number of faint stars that are detected and subtracted without a fit.
         faint_sigmas: minimum significance of a detected streak.
         reach: half width of the fitted strip along a path, in widths of the point spread.
-        clip: residuals beyond this number of standard deviations are excluded.
-        least_stars: minimum number of stars; two determine a rate, but cannot contradict each other.
+        clip: residual, in standard deviations, above which a pixel is excluded.
+        least_stars: minimum number of stars. Two stars determine a rate, but their agreement does not test
+            it.
         least_length: px, minimum median path length.
         least_significance: minimum ratio of the rate to its standard deviation.
         worst_misfit: chi-square per degree of freedom above which a motion is rejected, if the residuals also
             exceed `worst_displacement`.
-        worst_displacement: px, displacement across the streaks that is equivalent to the residuals.
+        worst_displacement: px, largest displacement across the streaks that is equivalent to the residuals.
         worst_shaking: largest displacement (px), or relative change of brightness, common to all streaks.
         worst_uncertainty: largest relative uncertainty (one standard deviation) of the rate due to errors of
             the model.
-        sign_sigmas: ratio of the prior's projection on the axis to its standard deviation from which the
-            prior decides the direction of time.
+        sign_sigmas: minimum ratio of the prior rate's projection on the axis to its standard deviation, for a
+            decision about the direction of time.
         knowledge: accuracy of the camera's calibration.
     """
 
@@ -85,14 +87,15 @@ class LikelihoodSettings:
 
     @property
     def shutter_unstated(self) -> bool:
-        """Whether the type of shutter is unknown, so that it may be a rolling one."""
+        """Whether the type of shutter is unknown, so that it may be a rolling shutter."""
         return self.line_time is None and self.line_time_sigma > 0.0
 
 
 def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
     """Return the accuracy of the pinhole that replaces a calibrated `lens` in the fit of streaks.
 
-    The fit has no distortion, so that the difference between lens and pinhole counts as an uncertainty.
+    The fit does not model the distortion, so that the difference between lens and pinhole counts as an
+    uncertainty.
     """
     middle = 0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)
     square = math.hypot(*middle) ** 2 / lens.focal_length**2
