@@ -141,7 +141,7 @@ def switch(prefix: Path, name: str) -> None:
     if current == release:
         return
     if not (release / MANIFEST).is_file():
-        raise SystemExit(f"install: {release} is no complete release")
+        raise SystemExit(f"install: {release} is not a complete release")
     os.sync()
     if current is not None:
         _link(prefix / "previous", current)

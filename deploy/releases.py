@@ -104,7 +104,7 @@ class Trials:
         self._path = folder / TRIALS
         self.starts: dict[str, int] = {}
         self.proven: list[str] = []
-        # Whatever stands in the file, the flight starts: a damaged count is no count.
+        # Whatever the file contains, the flight starts: a damaged count is ignored.
         with suppress(OSError, *DAMAGED):
             kept = json.loads(_text(self._path, LARGEST_RECORD))
             starts = {str(name): int(count) for name, count in kept["starts"].items()}
@@ -116,7 +116,7 @@ class Trials:
         return release.name not in self.proven and self.starts.get(release.name, 0) >= UNCLEAN
 
     def count(self, release: Path) -> None:
-        """Count a start of a release that is not proven; a folder that cannot be written is no obstacle."""
+        """Count a start of a release that is not proven. An error while writing it is ignored."""
         if release.name in self.proven:
             return
         self.starts[release.name] = min(self.starts.get(release.name, 0) + 1, UNCLEAN)

@@ -3,7 +3,7 @@
 Run by knightcube-safe.service with Python's standard library alone, from the folder of `coils-off`. It ends
 with status 0 when the flight is to be tried: after 30 s, and after twice as long each time that the flight is
 given up again, up to an hour; at once after the command `mode`. The command `safe` puts the next try an hour
-off, `ping` is answered. Other commands are refused, and datagrams that are no commands are not answered.
+off, `ping` is answered. Other commands are refused, and datagrams that are not commands get no answer.
 
 Environment: KNIGHTCUBE_COMMANDS, the command socket, none without it; RUNTIME_DIRECTORY, where the number of
 tries is kept until the next boot of the board.
@@ -77,7 +77,7 @@ class SafeState:
         self.due = now + tries.pause(tries.number)
 
     def answer(self, data: bytes, now: float) -> bytes | None:
-        """Obey a datagram; return the answer, None for one that is no command."""
+        """Obey a datagram; return the answer, or None if the datagram is not a command."""
         name = command_name(data)
         if not name:
             return None

@@ -34,8 +34,8 @@ Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
 | 15 | | the fields below |
 | last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
 
-Types are u unsigned, i signed, f IEEE 754, followed by their bytes; S is UTF-8 text in so many bytes, padded
-with zeros, with at least one.
+A type is u (unsigned integer), i (signed integer) or f (IEEE 754), with its size in bytes. S with a size in
+bytes is UTF-8 text, padded with zeros; its last byte is always zero.
 """
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# A busy machine is no failure.
+# No test may fail because the machine is busy.
 settings.register_profile("any-machine", deadline=None)
 settings.load_profile("any-machine")
 

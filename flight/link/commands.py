@@ -252,7 +252,7 @@ class LoadParameters:
     @property
     def text(self) -> str:
         """The command as printable text."""
-        return f"load-parameters {crc_of(self.values):08x} in place of {self.replaced:08x}"
+        return f"load-parameters {crc_of(self.values):08x} replacing {self.replaced:08x}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -186,7 +186,7 @@ class Navigation:
             self._bytes_since_ns = now_ns
         without_ns = now_ns - max(self._received_ns, self._bytes_since_ns)
         unusable = without_ns > limit_ns
-        text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
+        text = f"bytes but no reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
         text = text if unusable else "readings come again"
         self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum

@@ -151,7 +151,7 @@ def check(state: StoredState) -> None:
     for name, learned in state.learned.items():
         size = len(learned.values)
         if [len(row) for row in learned.covariance] != [size] * size:
-            raise ValueError(f"{name}: the covariance of {size} values is no {size} x {size} matrix")
+            raise ValueError(f"{name}: the covariance of {size} values is not a {size} x {size} matrix")
         values, covariance = learned.arrays()
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise ValueError(f"{name}: a value or its covariance is not finite")
@@ -439,7 +439,7 @@ class StateStore:
         if newest is None or newest.copy is None:
             if not bad:
                 return StoredState()
-            self._report(events.STATE_LOST, f"{bad}: defaults, taken for an unclean shutdown")
+            self._report(events.STATE_LOST, f"{bad}: defaults are used, as after an unclean shutdown")
             return StoredState(running=True)
         self._generation = newest.copy.generation
         if bad:
@@ -575,7 +575,8 @@ class StateKeeper:
             report(events.PARAMETERS_LEFT, "it had just been loaded when the last boot ended uncleanly")
         if self.record.after_unclean:
             last = begun.unclean[-1]
-            text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} recently"
+            recent = self.record.unclean_recent
+            text = f"boot {last.boot}, last state of {last.utc}; recent unclean shutdowns: {recent}"
             report(events.UNCLEAN_SHUTDOWN, text)
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:

@@ -89,7 +89,7 @@ def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
     if isinstance(value, enum.Enum):
         return ["enum", name, value.name]
     if (parts := _field_names(type(value))) is None:
-        raise FlightError(f"a {name!r} is no value that a worker may send")
+        raise FlightError(f"a worker cannot send this value of class {name!r}")
     return ["fields", name, [_tree(getattr(value, part), arrays) for part in parts]]
 
 
@@ -121,7 +121,7 @@ class _Reader:
                 return _array(dtype, [], next(self._buffers))[()]
             case ["flag" | "enum" as tag, str(name), member]:
                 return _member(name, tag, member)
-        raise FlightError(f"{str(tree)[:80]!r} is no value")
+        raise FlightError(f"{str(tree)[:80]!r} does not encode a value")
 
 
 def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
@@ -129,7 +129,7 @@ def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
     if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
         raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
     if not all(type(length) is int and length >= 0 for length in shape):
-        raise FlightError("an array's shape is no list of lengths")
+        raise FlightError("the shape of an array is not a list of lengths")
     kind = np.dtype(dtype)
     if math.prod(shape) * kind.itemsize != len(buffer):
         raise FlightError(f"an array of {dtype} and shape {shape} does not fill {len(buffer)} bytes")
@@ -142,7 +142,7 @@ def _built(name: str, items: list[Any]) -> Any:
     kind: Any = _class(name)
     parts = _field_names(kind)
     if parts is None or len(parts) != len(items):
-        raise FlightError(f"{name!r} is no class of {len(items)} values")
+        raise FlightError(f"{name!r} is not a class with {len(items)} fields")
     if issubclass(kind, tuple):
         return tuple.__new__(kind, items)
     value = object.__new__(kind)
@@ -154,7 +154,7 @@ def _built(name: str, items: list[Any]) -> Any:
 def _member(name: str, tag: str, member: Any) -> Any:
     kind = _class(name)
     if not issubclass(kind, enum.Enum) or issubclass(kind, enum.Flag) != (tag == "flag"):
-        raise FlightError(f"{name!r} is no {tag}")
+        raise FlightError(f"{name!r} is not a class of kind {tag!r}")
     if tag == "flag":
         return kind(operator.index(member))
     return kind[member]
@@ -164,7 +164,7 @@ def _class(name: str) -> type:
     module, _, qualified = name.partition(":")
     found = getattr(sys.modules.get(module), qualified, None)
     if not isinstance(found, type):
-        raise FlightError(f"{name!r} is no class that the control process has")
+        raise FlightError(f"{name!r} is not a class that the control process has")
     return found
 
 

@@ -188,7 +188,7 @@ def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> 
         times: instants, UTC without a time zone.
 
     Raises:
-        UsageError: for lines that are no two-line element set or describe no orbit.
+        UsageError: if the lines are not a two-line element set or do not describe an orbit.
         OrbitError: if SGP4 fails at one of the times, as for an orbit that has decayed.
     """
     satellite = TwoLineElements(*elements)

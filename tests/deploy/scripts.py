@@ -16,7 +16,7 @@ TESTBED = ROOT / "config" / "testbed.yaml"
 
 
 def script(name: str) -> Any:
-    """Return a Python script of deploy/, which is no package, as a module."""
+    """Import a Python script of deploy/, which is not a package, and return its module."""
     spec = importlib.util.spec_from_file_location(name, DEPLOY / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None

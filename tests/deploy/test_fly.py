@@ -102,7 +102,7 @@ CHOOSERS: dict[str, Callable[[Path], None]] = {
     "names a path": _text("print('../../../tmp ')"),
     "names the folder": _text("print('. ')"),
     "names a pattern": _text("print('* ')"),
-    "names a folder that is no release": _text("print('0.1.0+2/venv ')"),
+    "names a folder that is not a release": _text("print('0.1.0+2/venv ')"),
 }
 
 

@@ -63,7 +63,7 @@ def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(
     assert "0 bytes are too short for a packet" in reasons[2]
     assert "has come before" in reasons[4]
     assert modes_of(run)[2:] == [Mode.HOLD]
-    assert len(channel.answers) == 2, "nothing that is no command is answered"
+    assert len(channel.answers) == 2, "only commands are answered"
     assert "command-socket" in event_names(run)
     assert "command-refused" in event_names(run)
     assert "task-failed" not in event_names(run)

@@ -289,4 +289,6 @@ def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -
     cycles = run["control"]["cycle"]
     assert np.diff(cycles.astype(int)).max() in {40, 41}
     assert (np.diff(run["control"]["time_ns"]) >= 25_000_000).all()
-    assert true_current(run, 4.6, 5.0).max() == 0.0, "a command half a second old is no command"
+    assert true_current(run, 4.6, 5.0).max() == 0.0, (
+        "a current commanded half a second ago must not be driven"
+    )

@@ -121,7 +121,7 @@ def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
     assert np.diff(windows).max() < 2e-3
     braking = time > 0.5
     off = np.abs(truth["current"][braking]).max(axis=1) == 0.0
-    assert 0.3 < off.mean() < 0.5, "two fifths of the time the magnetometer is heard alone"
+    assert 0.3 < off.mean() < 0.5, "the coils are off for two fifths of the time, while the field is measured"
     assert np.abs(truth["current"][braking][:, 2]).max() > 0.05
     assert (run["control"]["state"][20:] == 3).all()
 

@@ -50,7 +50,7 @@ def _streaked(run: Run) -> tuple[BoolArray, FloatArray]:
 
 
 def test_streaks_of_a_slew_are_long_enough_to_tell_the_rate_and_no_longer(flown: Run) -> None:
-    """Of 5 to 100 px as soon as stars are no points; frames of points keep the usual exposure."""
+    """Streaks are 5 to 100 px long; frames whose stars are points keep the usual exposure."""
     streaked, moved = _streaked(flown)
     exposure = flown["streak"]["exposure"]
     assert streaked.sum() >= 8

@@ -53,7 +53,7 @@ def parse(text: str) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         newest = int(np.flatnonzero(epochs == 2025)[0])
         found = {pair: int(table[newest, order().index(pair)]) for pair in PUBLISHED}
     except (IndexError, ValueError, KeyError) as error:
-        raise UsageError(f"the source is no table of IGRF-14 to degree {DEGREE} ({error})") from error
+        raise UsageError(f"the source is not a table of IGRF-14 to degree {DEGREE} ({error})") from error
     if found != PUBLISHED:
         raise UsageError(f"the dipole of 2025 is {found}, published is {PUBLISHED} (0.01 nT)")
     kept = epochs >= FIRST_EPOCH

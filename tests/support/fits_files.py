@@ -14,6 +14,6 @@ def fits_file(stored: Image, bits: int, **cards: object) -> bytes:
     header: dict[str, object] = {"SIMPLE": "T", "BITPIX": bits, "NAXIS": 2}
     header |= {"NAXIS1": stored.shape[1], "NAXIS2": stored.shape[0]} | cards
     text = b"".join(_card(keyword, value) for keyword, value in header.items() if value is not None)
-    text += b"COMMENT   END = 3 is no end".ljust(80) + b"END".ljust(80)
+    text += b"COMMENT   END = 3 does not end the header".ljust(80) + b"END".ljust(80)
     body = stored.tobytes()
     return text.ljust(-(-len(text) // 2880) * 2880) + body.ljust(-(-len(body) // 2880) * 2880, b"\0")

@@ -211,7 +211,7 @@ class Readings:
 
 
 def readings(suite: SensorSuite, truth: World, rng: np.random.Generator) -> Readings:
-    """Return the drawn readings; when each is to be had is the caller's to ask of the world."""
+    """Return drawn readings of every instant. The caller asks `truth` when each of them is available."""
     gyros, magnetometer = suite.gyros, suite.magnetometer
     if gyros is None or magnetometer is None:
         raise ValueError(f"suite {suite.name} lacks gyros or a magnetometer")

@@ -27,8 +27,8 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One look: monotonic time in s; by name, processor seconds since start and proportional set in bytes.
 
-    `own` is the part of that which is no file's: other processes that come and go do not change it. `turns`
-    is of each main thread since its start: on a processor, and ready but waiting for one, s.
+    `own` is the part of that memory not mapped from files: other processes that come and go do not change it.
+    `turns` is of each main thread since its start: on a processor, and ready but waiting for one, s.
     """
 
     time: float

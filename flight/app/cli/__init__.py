@@ -114,7 +114,7 @@ def _obey(words: Sequence[str]) -> int:
     try:
         try:
             parser = _parser(words)
-        except OSError as error:  # a module that cannot be read is no mistake of the user's
+        except OSError as error:  # an unreadable module is a failure, not a mistake of the user
             raise FlightError(str(error)) from error
         options = parser.parse_args(words)
         status: int = options.command(options)

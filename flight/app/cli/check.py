@@ -201,7 +201,7 @@ def _fly(verdict: CheckResult) -> None:
 
 
 def flight_problems(result: RunResult) -> list[str]:
-    """Return the problems of a flight; with injected faults, events and alarms are no problems."""
+    """Return the problems of a flight. Events and alarms count only if no faults are injected."""
     ending = result.ending
     problems = [text for text in (result.log_error, result.restart, ending.coil_error) if text]
     if result.interrupted:

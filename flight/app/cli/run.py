@@ -190,7 +190,7 @@ def seed_number(text: str) -> int:
     try:
         value = int(text)
     except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from error
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 2^64 - 1") from error
     if not 0 <= value < 2**64:
         raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to 2^64 - 1")
     return value

@@ -165,7 +165,7 @@ class SatelliteEstimation(BodyEstimation):
         try:
             elements = None if config.elements is None else TwoLineElements(*config.elements)
         except UsageError as error:
-            raise ConfigError("elements", f"are no two-line elements: {error}") from error
+            raise ConfigError("elements", f"are not valid two-line elements: {error}") from error
         self.environment = EstimatedEnvironment(elements, services.clock)
         self._services = services
         self.orbit_filter, self.learned_problems = _filter(config, self.environment, learned, _utc(services))

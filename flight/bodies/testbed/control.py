@@ -568,7 +568,7 @@ class CageField:
         try:
             self._elements = TwoLineElements(*section.elements)
         except UsageError as error:
-            raise ConfigError("cage.elements", f"are no two-line elements: {error}") from error
+            raise ConfigError("cage.elements", f"are not valid two-line elements: {error}") from error
         self._scale = section.scale
         self._date_zero = UNIX_EPOCH + (clock.utc_ns() - clock.now_ns()) / (DAY * SECOND_NS)
         self._near: Ephemeris | None = None

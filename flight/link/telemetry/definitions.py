@@ -313,7 +313,7 @@ COMMAND = Packet(
     "Outcome of a command, also sent as the answer to its sender",
     (
         flag("obeyed", "whether the command was executed; no means refused"),
-        Field("name", "S16", "-", "name of the command; empty for bytes that are no command"),
+        Field("name", "S16", "-", "name of the command; empty if the bytes are not a command"),
         Field("source", "S16", "-", "source of the command: socket, udp or timeline"),
         counter("count", "commands received since start"),
         Field("mode", "u1", "-", "mode after the command", states=MODES),

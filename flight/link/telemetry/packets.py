@@ -231,8 +231,10 @@ def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> Telem
                 struct.pack(">" + _struct_code(field), *items)
         except (TypeError, ValueError, OverflowError, struct.error) as error:
             kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
-            return TelemetryError(f"packet {name}: {field.name} = {value!r} is no {kind}: {error}")
-    return TelemetryError(f"packet {name}: mission time {time_ns!r} is no i8")
+            return TelemetryError(
+                f"packet {name}: {field.name} = {value!r} cannot be stored as {kind}: {error}"
+            )
+    return TelemetryError(f"packet {name}: mission time {time_ns!r} cannot be stored as i8")
 
 
 BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAYOUTS.values()}

@@ -13,7 +13,7 @@ const table = await (await fetch("/api/table")).json();
 const modes = fieldOf(table, "health", "mode");
 const newest = {};
 const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, flight_silence: 0, surroundings: null };
-let heard = 0;
+let receivedAt = 0;
 let line = null;
 let seeking = false;
 let unknown = false; // the console no longer knows this page
@@ -51,7 +51,7 @@ function connect() {
 }
 
 function take(said) {
-  heard = performance.now();
+  receivedAt = performance.now();
   if (said.again) for (const name of Object.keys(newest)) delete newest[name];
   Object.assign(newest, said.newest);
   Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence, flight_silence: said.flight_silence,
@@ -72,7 +72,7 @@ function take(said) {
 
 // A flight that has ended says so in its last event; a log that just stops is a dead link.
 function light() {
-  const silent = (performance.now() - heard) / 1000;
+  const silent = (performance.now() - receivedAt) / 1000;
   const ended = newest.event?.name === "stopped";
   const [kind, words] = unknown ? ["dead", "address stale"] : silent > DEAD_AFTER || line.readyState !== WebSocket.OPEN ? ["dead", "console lost"]
     : !state.live ? ["past", state.speed > 0 ? `replay ${state.speed} x` : "replay, paused"]

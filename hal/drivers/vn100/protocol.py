@@ -222,7 +222,7 @@ def build(command: str, *fields: object, checksum: Checksum = "crc16") -> bytes:
 
 
 def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
-    """Return the sentence of a whole line, or None when it is no sentence or its checksum fails.
+    """Return the sentence of a whole line, or None if the line is not a sentence or its checksum fails.
 
     `XX` instead of a checksum is accepted only with `allow_none`: a unit never sends it.
     """

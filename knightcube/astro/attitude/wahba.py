@@ -196,7 +196,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
     eigenvectors of Davenport's K. Only one is a minimum, unless the largest eigenvalue is double, as for
     mirrored directions: then a circle of attitudes has the minimum loss.
 
-    Raises AttitudeError if the method does not converge, or converges to a point that is no minimum.
+    Raises AttitudeError if the method does not converge, or converges to a point that is not a minimum.
     """
     weight = seen.weight[:, None]
     # Of the order of the inverse square of the directions' spread, rad.

@@ -3,8 +3,8 @@
 A command is an assumption, a measured rate is not. While a coil is broken the model predicts an acceleration
 that does not occur: the innovations of the gyro, which agree with their covariance in every healthy flight,
 exceed it within one to a few samples. The currents are then unknown, from a little earlier on, and the filter
-follows the gyro. A change of the rate that no coil current can cause is no reason: then the gyro may be
-faulty.
+follows the gyro. A change of the rate that no coil current can cause does not count as contradiction,
+because the gyro may be faulty.
 
 The commands are trusted again when the rate follows them. Over the last second the share g of the commanded
 change c of the rate is fitted to the gyro samples, z = b + g c. The commands must have moved the body enough

@@ -105,7 +105,7 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` refitted with all catalogue stars; None if the fit fails or gives another rate."""
-    # Under a rolling shutter an ambiguous rate lies between two motions and is no start of a fit.
+    # Under a rolling shutter an ambiguous rate lies between two motions: a fit must not start from it.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None

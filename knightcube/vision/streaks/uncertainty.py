@@ -288,7 +288,8 @@ def _error_displacements(
 
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     """Return the camera with a lens of these errors (m,), in standard deviations, as in `apparent_rates`."""
-    sizes = zip(_error_sizes(camera).items(), error, strict=False)  # the line time is no property of the lens
+    # The line time, the last error, does not belong to the lens.
+    sizes = zip(_error_sizes(camera).items(), error, strict=False)
     found = {name: sigma * float(by) for (name, sigma), by in sizes}
     scale, x, y, cubic = (
         found.get(name, 0.0) for name in ("focal length", "centre x", "centre y", "distortion")

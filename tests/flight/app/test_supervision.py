@@ -33,7 +33,7 @@ class Watchers:
 
 
 class Events(Recorder):
-    """Keeps the events in place of writing them."""
+    """Keeps the events instead of writing them."""
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, str]] = []
@@ -81,7 +81,7 @@ def supervision(watchers: Watchers, events: Events, clock: ManualClock, coils: C
 
 def test_ready_is_said_once_after_the_first_good_cycle(supervision: Supervision, watchers: Watchers) -> None:
     supervision.feed()
-    assert watchers.calls == ["feed"], "progress alone is no readiness"
+    assert watchers.calls == ["feed"], "progress without a good cycle is not reported as readiness"
     supervision.beat()
     supervision.beat()
     assert watchers.calls == ["feed", "beat", "ready: flying", "beat"]

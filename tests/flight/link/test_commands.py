@@ -136,7 +136,7 @@ def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
         noise = generator.bytes(int(generator.integers(0, 100)))
         data = heads[k % len(heads)] + noise if k % 2 else noise
         with contextlib.suppress(CommandError):
-            pytest.fail(f"taken for {unpack(data)}: {data!r}")
+            pytest.fail(f"accepted as {unpack(data)}: {data!r}")
 
 
 @pytest.mark.parametrize(

@@ -34,5 +34,5 @@ def cores(_: Any) -> list[int]:
 
 
 def function(_: Any) -> Any:
-    """Return what is no value."""
+    """Return a function, which a worker cannot send."""
     return function

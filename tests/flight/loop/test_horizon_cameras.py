@@ -110,7 +110,7 @@ def test_a_dead_camera_does_not_keep_the_others_and_is_reported_until_it_is_back
     bench.cameras[1].dead = True
     bench.fly(130)
     assert {tuple(frames) for frames in bench.jobs} == {(0,)}
-    assert bench.said.index(True) > 120, "a minute's pause is no loss"
+    assert bench.said.index(True) > 120, "a pause of one minute is not reported as a loss"
     bench.cameras[1].dead = False
     bench.fly(10)
     assert not bench.said[-1]

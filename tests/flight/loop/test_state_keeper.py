@@ -96,7 +96,7 @@ def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -
     assert second.record.mode == "hold"
     ((kind, text),) = second.notices()
     assert kind is events.UNCLEAN_SHUTDOWN
-    assert text == "boot 1, last heard of 1970-01-01T00:00:21Z: 1 recently"
+    assert text == "boot 1, last state of 1970-01-01T00:00:21Z; recent unclean shutdowns: 1"
     assert not second.notices(), "reported once"
 
 
@@ -189,7 +189,7 @@ def test_a_hung_disk_delays_neither_note_nor_close(monkeypatch: pytest.MonkeyPat
     assert time.monotonic() - start < 0.5
     keeper.close(clean=True)
     assert time.monotonic() - start < 5.0
-    assert on_disk(disk).running, "an end that was not written is no clean end"
+    assert on_disk(disk).running, "a clean end counts only once it is on the disk"
     disk.let_go.set()
 
 

@@ -81,7 +81,7 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
             reports = Reports()
             allowed = [state_of(3)] if stop == calls else [state_of(2), state_of(3)]
             assert StateStore(FOLDER, reports, after).load() in allowed
-            assert not reports.kinds, "a crash is no damage"
+            assert not reports.kinds, "a crash must not be reported as damage"
             found += 1
     assert found > 30
 

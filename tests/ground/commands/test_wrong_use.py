@@ -23,7 +23,7 @@ PLAN = "plan --from 0.1 --to 0"
         ("command --to TMP/none slew 5", "q2 = 5.0 must lie within -0.68 to 0.68"),
         ("solve TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
         ("rate TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
-        ("run step_demo --out TMP/a --seed 1e22", "'1e22' is no whole number"),
+        ("run step_demo --out TMP/a --seed 1e22", "'1e22' is not a whole number from 0 to 2^64 - 1"),
         ("run step_demo --out TMP/a --seed 99999999999999999999", "from 0 to 2^64 - 1"),
         ("run step_demo --out TMP/a --realtime --devices /etc/passwd", "/etc/passwd names no server"),
         ("identify step_demo --run TMP/held --duration 5", "holds a run already: give another folder, or"),

@@ -123,7 +123,7 @@ def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_ove
     with (folder / "flight-0001.ccsds").open("ab") as file:
         file.write(Packer().pack(EVENT, round(6.5e9), stopped))
     page.wait("document.getElementById('light').textContent === 'flight ended'")
-    assert "<b>done</b>" in page.text("#events"), "a log's texts are no markup"
+    assert "<b>done</b>" in page.text("#events"), "a text of a log must not be interpreted as markup"
     assert page.text("#play") == "replay"
     page.page.click("#play")
     page.wait("document.getElementById('light').textContent === 'replay 1 x'")

@@ -337,7 +337,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     words = [command.text for command in sent]
     assert words[:5] == ["ping 7", "mode safe: bored", "mode hold", "slew to q2 +0.2500", "clear coil-broken"]
     assert words[5].startswith("point ground")
-    assert words[6:] == [f"load-parameters {crc_of(table):08x} in place of 00000007", "dump-parameters"]
+    assert words[6:] == [f"load-parameters {crc_of(table):08x} replacing 00000007", "dump-parameters"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,9 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--duration", type=float, default=200.0)
-    parser.add_argument("--bare", action="store_true", help="the bare testbed in place of the whole stack")
+    parser.add_argument(
+        "--bare", action="store_true", help="simulate the bare testbed instead of the whole flight stack"
+    )
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     config = believed()

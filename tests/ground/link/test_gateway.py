@@ -35,7 +35,7 @@ PATIENCE_S = 60.0
 
 
 class Satellite:
-    """In place of a terminal: keeps what goes up, and gives what is to come down."""
+    """Stands for the terminal: keeps the uplinked frames, and returns the frames of the downlink."""
 
     def __init__(self) -> None:
         self.up: list[bytes] = []

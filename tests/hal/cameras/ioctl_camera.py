@@ -36,7 +36,7 @@ class Knob:
 
 
 class IoctlCamera:
-    """Callable in place of fcntl.ioctl.
+    """A callable that replaces fcntl.ioctl.
 
     Attributes:
         sizes: of the formats that it has, {fourcc: (columns, rows)}.

@@ -16,7 +16,7 @@ I2C_TIMEOUT = 0x0702
 
 
 class IoctlWire:
-    """Callable in place of fcntl.ioctl.
+    """A callable that replaces fcntl.ioctl.
 
     Attributes:
         wire: the emulated bus that answers.

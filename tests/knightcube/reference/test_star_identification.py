@@ -1,4 +1,4 @@
-"""Each classical method on lists of a synthetic sky: it finds the stars, and refuses what is no sky."""
+"""Each classical method on star lists of a synthetic sky: it finds the stars, and refuses random points."""
 
 from __future__ import annotations
 

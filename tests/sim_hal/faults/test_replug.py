@@ -63,8 +63,8 @@ def test_the_port_is_open_again_within_two_seconds(tmp_path: Path) -> None:
             found = receive(port, 0.05)
         assert found.startswith(b"after")
         assert time.monotonic() - begun < 2.0
-        port.send(b"heard")
-        assert os.read(ends[0], 16) == b"heard"
+        port.send(b"reply")
+        assert os.read(ends[0], 16) == b"reply"
         pull_out(ends)
     finally:
         port.close()

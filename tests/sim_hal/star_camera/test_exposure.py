@@ -68,7 +68,7 @@ def test_a_streak_of_changing_rate_is_exact() -> None:
 
 @pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
 def test_jitter_between_samples_is_followed(jitter: float) -> None:
-    """Kinks of up to a pixel or so at every one of 200 samples; the smallest is taken for smooth motion."""
+    """Kinks of up to about one pixel at each of 200 samples; the smallest are treated as smooth motion."""
     rng = np.random.default_rng(8)
     times = np.linspace(0.0, 1.0, 201)
     turn = np.outer(times, [0.0, 50.0 / FOCAL, 0.0]) + rng.normal(0.0, jitter / FOCAL, (201, 3))

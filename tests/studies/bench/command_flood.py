@@ -1,8 +1,9 @@
 """The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
 
-The step demonstration flies in real time and listens on UDP for commands: left alone, then with 20,000
-datagrams a second at its port that are no commands, then with as many that begin as commands do. A peer sends
-twenty pings, each once. Stated are the lateness of the control cycles and how many pings were answered.
+The step demonstration flies in real time and listens on UDP for commands: undisturbed, then with 20,000
+datagrams a second at its port that are not commands, then with 20,000 a second that begin like commands. A
+peer sends twenty pings, each once. The lateness of the control cycles and the number of answered pings are
+printed.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ FLOODS = ("none", "no commands", "begin as commands")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly all, print; return 1 where a ping went unanswered under datagrams that are no commands."""
+    """Fly all and print; return 1 if a ping was lost, except under datagrams that begin like commands."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default %(default)s)"

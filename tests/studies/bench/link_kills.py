@@ -177,7 +177,7 @@ class _SkyWire(Wire):
 
 
 class _GroundOut(GroundWire):
-    """The ground's line, likewise."""
+    """The ground's line, whose frames also leave the process one by one."""
 
     def __init__(self, way: Way) -> None:
         super().__init__(Wire())

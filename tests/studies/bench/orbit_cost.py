@@ -2,8 +2,8 @@
 
 Flies the first seconds of config/orbit.yaml by `python -m flight run` in lock-step, from the tip-off to
 pointing, and reads from its log what a control cycle and the workers' jobs took. A cycle includes the
-emulated side of the coils' wire, without the jobs. Cycles are told by their median: other work on the machine
-lengthens some.
+emulated side of the coils' wire, without the jobs. The median over the cycles is reported, because other
+work on the machine lengthens some of them.
 """
 
 from __future__ import annotations

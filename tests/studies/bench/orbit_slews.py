@@ -4,8 +4,8 @@ Slews of 30 to 180 deg from rest to rest, of a 1U (inertia 1.1e-3 kg m^2, 0.0959
 (0.0066 and 0.0333 kg m^2, 0.2 A m^2, 300 to 1,200 s), in the orbits of the space station and of a
 Sun-synchronous satellite, in the field of WMM2025. `--recorded` plans those of `optimum_orbit.json` beside
 their optima, and flies the dipoles by an integrator of the test's own. `--job` runs the planner's job of the
-flight instead: prediction, slew within cones planned with air and sunlight and then anew with the
-areas that it shows, and table. Times are of this process's processor.
+flight instead: prediction, slew within cones, planned with air and sunlight and then planned again with
+the areas that the body exposes on it, and table. Times are of this process's processor.
 """
 
 from __future__ import annotations

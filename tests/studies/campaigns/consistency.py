@@ -8,7 +8,7 @@ of its packets and falls silent twice for 0.5..1 s. Every 5 s the star camera gi
 rate over 1 s with a full covariance when the stars streak; on the free body it gives an attitude too.
 
 NEES over its degrees of freedom is 1 for an honest covariance: 95 % band from chi-square over independent
-runs. NIS likewise, over all measurements that were taken in.
+runs. NIS over its degrees of freedom has a band of the same kind, over all accepted measurements.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ QUATERNION_BOUND, RATE_BOUND = 1.75e-3, 1.75e-4
 EXPOSURE, CAMERA_PERIOD = 40, 200
 """Cycles."""
 LEAST_STREAK = 1.0e-3
-"""rad: three px of a 20 deg field, less is no streak."""
+"""Length (rad) of the shortest streak: three px of a field of 20 deg."""
 RATE_SIGMAS: FloatArray = np.array([1.5e-5, 1.5e-5, 1.5e-4])
 TRACKER_SIGMAS: FloatArray = np.array([5e-5, 5e-5, 5e-4])
 

@@ -48,7 +48,7 @@ LEAST_ARC = 5
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` revolutions, and the table of headings, which is no draw."""
+    """Return `runs` drawn revolutions, and the fixed table of headings."""
     drawn = [Case(f"orbit/{run}", (seed, run), {"kind": "orbit"}) for run in range(runs)]
     betas = np.arange(0.0, 75.1, BETA_STEP)
     return drawn + [

@@ -39,7 +39,7 @@ SATURATED = 1.5
 """Mean over all attitudes of the sum of a unit vector's components, by size."""
 DIRECTIONS = 2000
 CLOSER, TRIES = (0.06, 0.02, 0.007), 60
-"""rad: the worst direction is looked for again so near to it, with so many more."""
+"""Spreads (rad) of the directions tried around the worst one so far, and their number for each spread."""
 
 
 def least_time(momentum: FloatArray, field: FloatArray, step: float, reach: float, left: float) -> float:

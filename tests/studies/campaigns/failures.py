@@ -8,8 +8,8 @@ standard deviations of the noise under its streak (`scenes.usable`).
 Right is an answer that is not wrong. Wrong is one more than 6 of its own standard deviations off (the square
 root of its NEES; chance: 1 in 13 million) and more than 1 % of the rate off, as a vector. Either alone is
 counted too: the first is a covariance that says too much, the second may be an honest answer from streaks of
-a few px. Any other outcome is a refusal, by its status; where the usable stars move less than the estimator's
-least length there is no rate to be had, and a refusal is right.
+a few px. Any other outcome is a refusal, by its status; if the usable stars move less than the estimator's
+minimum length, the rate cannot be determined, and a refusal is right.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 LOOKED_FROM, LOOKED = 2.0, 3.0
 """s: from when in a flight the monitor's mean is whole, and how long an upset's trace is looked for."""
 FEW = 3
-"""Samples of the unit: a difference up to this is no effect."""
+"""Largest difference in the number of the unit's samples that does not count as an effect."""
 BACK_WITHIN = 2.0
 """s: limit for a part's recovery once it answers again."""
 _OUT_OF_REACH = {"nack", "slow", "intermittent"}

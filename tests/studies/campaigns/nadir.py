@@ -7,7 +7,7 @@ coarsely in camera axes: solar strings to 5 deg an axis, magnetometer to 2 deg. 
 the finder knows, its limb's height to 1 km, and with air that it does not: scale height and haze are drawn.
 
 Errors are angles between true and found nadir (both axes together); NEES is of the two axes, 2 by chance.
-Wrong is an accepted answer more than half a degree off; refused and ambiguous are no answers.
+An accepted answer more than half a degree off is wrong; refused and ambiguous frames count as unanswered.
 """
 
 from __future__ import annotations

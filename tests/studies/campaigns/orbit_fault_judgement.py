@@ -98,7 +98,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
     match part_of(kind):
         case "coil" | "bridge":
             found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
-        case part if kind.kind == "upset":  # a bit that matters is told, or the unit's samples lack
+        case part if kind.kind == "upset":  # not reported: exercised only if the unit misses samples
             came = int(_within(flown, "imu", at, at + LOOKED).sum())
             found = part == "imu" and round(LOOKED / CYCLE) - came > FEW
         case "monitor" if kind.kind == "delayed":

@@ -130,7 +130,9 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         by_cell.setdefault(result["fault"], {}).setdefault(result["mode"], []).append(result)
     exercised = [r for r in results if r["exercised"]]
     defects = {
-        "not told": [r for r in exercised if r["told_s"] is None and not r["fault"].startswith("elements")],
+        "not reported": [
+            r for r in exercised if r["told_s"] is None and not r["fault"].startswith("elements")
+        ],
         "not working again at the end": [r for r in results if not r["works"]],
         "current while blind": [r for r in results if r["blind_current_a"] > ZERO],
         "driven by a false attitude": [r for r in results if r["beyond_s"] > BEYOND],

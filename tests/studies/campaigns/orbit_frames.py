@@ -9,7 +9,7 @@ light of all cameras gives a coarse nadir, and with the Sun a coarse attitude, t
 the field at 1 Hz go to the filter throughout; frames, whose rendering takes most of a run, once a minute.
 
 Variants: `level` (UW, swaying about the local vertical), `any` (UW, turned by a random constant rotation),
-`vt` (three cameras, likewise turned) and `2 Hz` (UW, level, frames at 2 Hz for a minute, 20 min before
+`vt` (three cameras, turned in the same way) and `2 Hz` (UW, level, frames at 2 Hz for a minute, 20 min before
 sunset). Time is processor time of one core for all that a flight would do at an instant; the budget of 2 Hz
 is 500 ms. NEES is of attitude and gyro bias over six errors; 1 is honest.
 """

@@ -2,7 +2,7 @@
 
 The flight is that of `orbit_pointing_flight`. For LEARN s the body is held among the stars by the pointing
 law, and the filter learns torques and residual dipole; then it is slewed from where it is. Law `path` flies
-the table of the planner worker (`pointing_job`); `blind` likewise, planned without torques; `eigen-axis`
+the table of the planner worker (`pointing_job`); `blind` flies a table planned without torques; `eigen-axis`
 follows the turn about one axis in fifth-order time by the pointing law with preview; `projected` by
 proportional and derivative torque whose part along the field is lost.
 """

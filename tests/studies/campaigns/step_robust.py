@@ -111,7 +111,7 @@ def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
     def become(faults: LineFaults) -> None:
         wire.faults = faults
 
-    # After the release: late samples of the held body would be taken for the flight's beginning.
+    # Only after the release: late samples of the held body would look like samples of the flight.
     rigged.at(0.5, lambda: become(usual))
     for begin, span in drawn["dropouts_s"]:
         rigged.at(begin, lambda: become(LineFaults(silent=True)))

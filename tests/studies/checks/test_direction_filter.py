@@ -127,7 +127,7 @@ def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
 
 
 def test_directions_that_contradict_each_other_begin_nothing() -> None:
-    """The Sun taken for where it is not: the angle to nadir is off by 3 deg, each is good to 0.02."""
+    """A wrong direction of the Sun: its angle to nadir is off by 3 deg, with sigmas of 0.02 deg."""
     sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
     estimator.rate(0, RATE)
     turn = attitude_matrix(sky.attitude(0.0))

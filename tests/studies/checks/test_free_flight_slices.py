@@ -16,7 +16,9 @@ def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> 
     result = detumble.run(Case("a", (20_261_123, 0), {**CASE, "law": "attitude", "speed": 0.014}))
     assert not result["lost"]
     assert result["seconds"] < 400.0
-    assert result["fastest_deg"] < 1.3 * np.degrees(0.014), "but for the gyro's bias and a held dipole"
+    assert result["fastest_deg"] < 1.3 * np.degrees(0.014), (
+        "only the gyro's bias and a held dipole may add to the rate"
+    )
     found = detumble.summarise([result], tmp_path)
     assert found.facts["knightcube/attitude"]["worst"] == result["seconds"]
     assert "knightcube" in found.text

@@ -1,4 +1,4 @@
-"""A slice of campaign `orbit-faults`: two faults of an orbit are told, and a blind current is found out."""
+"""A slice of campaign `orbit-faults`: two faults of an orbit are reported, a blind current is detected."""
 
 from __future__ import annotations
 

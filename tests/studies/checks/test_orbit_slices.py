@@ -37,7 +37,7 @@ def test_the_shares_are_the_paper_s(seen: list[Result]) -> None:
     for share in shares:
         assert share["vt/level"]["horizon"][3] == 1.0
         assert share["uw/level"]["horizon"][4] == 0.0
-        # 4.1: within 15 deg the horizon is in all three, but for the last degree.
+        # 4.1: within 15 deg the horizon is in all three cameras, except in the last degree.
         assert share["vt/within 15 deg"]["horizon"][3] > 0.97
         assert sum(share["vt/within 15 deg"]["horizon"][:2]) == 0.0
         # 4.3: tipped back and forth by 90 deg, at least two cameras at all times.

@@ -67,7 +67,7 @@ def test_the_cameras_of_usu_are_tipped_like_the_satellite() -> None:
 
 
 def written(tmp_path: Path, old: str, new: str) -> Path:
-    """Return a suite that is VT's but for one change."""
+    """Write the suite VT with one text replaced; return its file."""
     text = Path("config/sensors/vt.yaml").read_text()
     assert old in text
     path = tmp_path / "suite.yaml"

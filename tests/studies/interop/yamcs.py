@@ -249,7 +249,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.yamcs", description=__doc__)
     parser.add_argument("place", type=Path, metavar="FOLDER", help="does not exist yet")
     kind = parser.add_mutually_exclusive_group()
-    for name, words in (("orbit", "the satellite in place of the testbed"), ("short", "less than a minute")):
+    for name, words in (
+        ("orbit", "fly the satellite instead of the testbed"),
+        ("short", "fly for less than a minute"),
+    ):
         kind.add_argument(f"--{name}", dest="plan", action="store_const", const=name, help=words)
     options = parser.parse_args()
     if problem := missing():

@@ -160,7 +160,8 @@ def current_and_slopes(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the current (n,) in A and its partial derivatives by q2, q2' and q2'' (n,) each.
 
-    5.6 with the exact w' in place of a differentiated polynomial of w, the thread and the disturbance.
+    Equation 5.6 of the thesis with the exact w' instead of the derivative of a polynomial for w, and with the
+    torques of the thread and of the disturbance.
     """
     square = 1.0 - q2 * q2
     by_acceleration = 2.0 / np.sqrt(square)  # dw'/dq2'', and dw/dq2' as well

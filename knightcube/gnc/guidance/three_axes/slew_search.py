@@ -53,7 +53,7 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Last barrier parameters: of a warm start, and of a path that is flown."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Constraint violations below which an iterate that is no optimum yet is accepted: as a warm start, and as a
+"""Constraint violations below which an iterate is accepted before it is an optimum: as a warm start, and as a
 path to fly. Many runs converge slowly. The closing removes the residuals."""
 _STEPS_FREE = 25
 """Newton steps for a path without the dipole limit."""
@@ -177,7 +177,7 @@ class SlewSolver:
     def found(self, descent: NewtonRun, maximum: int, enough: float = 0.0) -> SolvedPath | None:
         """Return the path found within `maximum` more steps; None if there is none.
 
-        An iterate whose constraint violation is less than `enough` is accepted although it is no optimum.
+        An iterate whose constraint violation is less than `enough` is accepted although it is not an optimum.
         """
         program, before = descent.program, descent.program.steps
         point = descent.run(maximum)

@@ -117,5 +117,5 @@ def test_plans_may_not_count_on_more_field_than_the_cage_makes(
         _field(strong, section)
     assert config.cage is not None
     none = configuration.replace(config, cage=Cage(elements=("1 nothing", "2 nothing")))
-    with pytest.raises(ConfigError, match=r"cage.elements.*no two-line elements"):
+    with pytest.raises(ConfigError, match=r"cage.elements.*not valid two-line elements"):
         _field(none, section)

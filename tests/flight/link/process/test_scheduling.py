@@ -46,8 +46,8 @@ def texts(link: BothEnds, counter: int) -> list[str]:
     [
         ("2262-04-12T00:00:00", "ping 1", "2262-04-12T00:00:00 is beyond 2262-04-11T23:47:16Z"),
         ("9999-12-31T23:59:59-14:00", "ping 1", "is beyond"),
-        ("2099-01-01T00:00:00", "ping 4294967296", "number = 4294967296 is no u4"),
-        ("2099-01-01T00:00:00", "ping -1", "number = -1 is no u4"),
+        ("2099-01-01T00:00:00", "ping 4294967296", "number = 4294967296 cannot be stored as u4"),
+        ("2099-01-01T00:00:00", "ping -1", "number = -1 cannot be stored as u4"),
     ],
 )
 def test_a_number_that_a_file_or_a_packet_does_not_hold_is_refused_when_it_is_scheduled(

@@ -147,7 +147,7 @@ def test_a_report_that_cannot_be_packed_is_counted_said_and_does_not_end_the_lin
     link.collect()
     assert link.status()[["refused_beyond", "unreported"]].tolist() == (3, 3)
     assert [text.partition(" could")[0] for text in said] == ["3 reports"]
-    assert "counter = 39614081257132168796771975168 is no i8" in said[0]
+    assert "counter = 39614081257132168796771975168 cannot be stored as i8" in said[0]
 
 
 def test_reports_that_newer_ones_displace_are_counted(tmp_path: Path) -> None:

@@ -96,9 +96,9 @@ def test_sequence_counts_are_kept_for_each_apid_and_wrap_at_14_bits() -> None:
     [
         ({"rate": None}, "missing: rate"),
         ({"spin": 1.0}, "no such field: spin"),
-        ({"index": -1}, "index = -1 is no u4"),
-        ({"index": "north"}, "index = 'north' is no u4"),
-        ({"q2": "north"}, "q2 = 'north' is no f8"),
+        ({"index": -1}, "index = -1 cannot be stored as u4"),
+        ({"index": "north"}, "index = 'north' cannot be stored as u4"),
+        ({"q2": "north"}, "q2 = 'north' cannot be stored as f8"),
     ],
 )
 def test_values_that_do_not_fit_are_refused_by_name(change: dict[str, object], complaint: str) -> None:
@@ -133,7 +133,7 @@ def test_a_text_is_cut_between_characters_and_made_valid() -> None:
 
 
 def test_a_number_is_no_text() -> None:
-    with pytest.raises(TelemetryError, match="name = 3 is no S32"):
+    with pytest.raises(TelemetryError, match="name = 3 cannot be stored as S32"):
         Packer().pack(EVENT, 0, code=1, severity=0, suppressed=0, name=3, text="")
 
 

@@ -127,7 +127,7 @@ def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
 
 
 def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
-    """The unit is heard, but its fields are of no use: nothing is braked by what is merely predicted."""
+    """The unit answers, but its samples are rejected: no coil brakes by a field that is only predicted."""
     law = detumbler()
     law.begin(0)
 

@@ -5,8 +5,9 @@ The angle theta = 2 asin q2 is used rather than q2 because its kinematics are li
 theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
 what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own
 time: a late measurement is put where it belongs and those after it are applied again. A rate from a
-streaked image is the mean over its exposure: the angle at the exposure's start is kept as one more state
-until its end (stochastic cloning, Roumeliotis and Burdick 2002): acceleration is no contradiction.
+streaked image is the mean rate over its exposure. Until the exposure ends, the angle at its start is
+kept as one more state (stochastic cloning, Roumeliotis and Burdick 2002), so that an acceleration within the
+exposure does not contradict the mean.
 """
 
 from __future__ import annotations

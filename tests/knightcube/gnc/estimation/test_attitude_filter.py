@@ -132,7 +132,7 @@ def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out(
 
 
 def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
-    """Whatever the measurements say of the other axes, a swing of the thread is no turn about it."""
+    """The filter ignores what the sensors measure about the other axes, such as a swing of the thread."""
     flight = fly(6, 60, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)

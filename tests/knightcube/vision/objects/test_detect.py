@@ -1,4 +1,4 @@
-"""The three indicators: by hand, for stars at every angle, and for what is no star.
+"""The three indicators: by hand, for stars at every angle, and for objects that are not stars.
 
 Objects among the stars: found when they are there, quiet when they are not, overlaps told apart.
 
@@ -219,7 +219,7 @@ def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: floa
     report, path = _see(motion, 4.0, exposure=exposure)
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
-    # The ends' order is the one of slower motion; both rates are told.
+    # The ends are in the order of the slower motion; the rates of both orders are reported.
     assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
     assert found.other_relative_rate > found.relative_rate
     np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)
@@ -264,7 +264,7 @@ def test_frames_without_an_object_have_none() -> None:
         assert report.verdicts.count(Verdict.STAR) >= 4
 
 
-# A second star so many px along and across the first one's streak of 55 px, and its magnitude.
+# Offset (px) of a second star along and across the streak of the first, 55 px long, and its magnitude.
 @pytest.mark.parametrize(
     ("along", "across", "magnitude"),
     [

@@ -1,4 +1,4 @@
-"""Objects beside stars and brighter than stars, through the vision job: neither is taken for the other."""
+"""Objects beside stars and brighter than stars, through the vision job: neither is mistaken for the other."""
 
 from __future__ import annotations
 

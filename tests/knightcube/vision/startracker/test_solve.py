@@ -52,7 +52,7 @@ def _solve(
     frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
-    # The simulated lens is perfect but for its focal length.
+    # The simulated lens has no distortion; only its focal length may be wrong.
     camera, settings = NARROW.pinhole, SolveSettings(uncalibrated_lens=False)
     return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 

@@ -165,7 +165,7 @@ def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: flo
 
 
 def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() -> None:
-    """The camera rests for a third of the exposure and then accelerates, which is no linear change."""
+    """The camera rests for a third of the exposure and then accelerates: the rate is not linear in time."""
     turn = turn_of(np.radians(70.0), 40.0, 0.9)
     share = 1.0 / 3.0
 

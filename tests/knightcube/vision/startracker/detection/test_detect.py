@@ -306,7 +306,7 @@ def test_wrong_predictions_are_refused() -> None:
 
 
 def test_stars_that_move_by_a_few_pixels_are_measured_where_they_are_in_the_middle() -> None:
-    """Trails of 3 px along a slope: errors as large as claimed; faint stars are no noise of the others."""
+    """Trails of 3 px along a slope: the errors are as large as claimed, also among faint stars."""
     rng = np.random.default_rng(12)
     trail, squares, claims = np.array([2.5, 1.5]), [], []
     for _ in range(6):
