@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import pytest
 
+from flight.link import events
 from flight.link.modes import Mode
+from flight.loop import facts
 from flight.loop.modes import AttitudeWatch, Trigger
+from flight.schema.document import ConfigError
 from flight.schema.sections import Modes
 from hal.interfaces.wires import SECOND_NS
+from tests.flight.loop.mode_bench import SATELLITE, ModeBench
 
 FAST, LOW, LOW_FOR = 0.02, 0.008, 3.0
 
@@ -81,3 +87,277 @@ def test_an_attitude_that_is_lost_for_long_enough_ends_pointing(watched: Watched
         trigger = watch.trigger(Mode.POINT, known, second * SECOND_NS)
         assert (trigger is Trigger.LOST) is (second >= 12), second
     assert watch.trigger(Mode.ACQUIRE, False, 30 * SECOND_NS) is None
+
+
+def test_the_flight_starts_in_its_initial_mode_when_readings_and_coils_are_there() -> None:
+    bench = ModeBench(settings=Modes(initial="hold", boot_patience=5.0))
+    assert bench.step(answers=False) is Mode.BOOT
+    assert bench.step(known=False) is Mode.BOOT
+    assert bench.events == []
+    assert bench.step() is Mode.HOLD
+    assert bench.control.since_ns == 3 * SECOND_NS
+    assert [(row["before"], row["mode"], row["trigger"]) for row in bench.records] == [
+        (0, 0, "begin"),
+        (0, 3, "start in hold"),
+    ]
+    assert bench.events == [], "the end of the boot is no event"
+
+
+def test_a_boot_without_readings_is_reported_after_its_patience() -> None:
+    bench = ModeBench(settings=Modes(initial="hold", boot_patience=5.0))
+    for _ in range(5):
+        bench.step(known=False)
+    assert bench.events == []
+    bench.step(known=False)
+    assert bench.events == ["boot-waits"]
+
+
+@pytest.mark.parametrize(("unclean", "mode"), [(2, Mode.HOLD), (3, Mode.SAFE)])
+def test_after_three_unclean_shutdowns_the_flight_starts_in_safe(unclean: int, mode: Mode) -> None:
+    bench = ModeBench(settings=Modes(initial="hold", crash_limit=3), unclean=unclean)
+    assert bench.step() is mode
+    assert bench.events == (["crashed-often"] if unclean >= 3 else [])
+
+
+@pytest.mark.parametrize(("unclean", "flies"), [(0, True), (3, False)])
+def test_the_configured_steps_are_flown_in_the_demonstration_and_while_booting_into_it(
+    unclean: int, flies: bool
+) -> None:
+    bench = ModeBench(unclean=unclean)
+    assert bench.control.flies_steps is flies
+    bench.step()
+    assert bench.control.flies_steps is flies
+    configured = bench.control.target(0)
+    assert (configured is not None) is flies
+
+
+def test_a_body_without_the_initial_mode_is_refused() -> None:
+    with pytest.raises(ConfigError, match="this body has detumble, safe"):
+        ModeBench(SATELLITE, Modes(initial="hold"))
+
+
+def flying(initial: str = "hold", **changes: Any) -> ModeBench:
+    """Return a testbed in its first mode."""
+    bench = ModeBench(settings=Modes(initial=cast(Any, initial), **changes))
+    bench.step()
+    return bench
+
+
+def test_a_hold_takes_its_attitude_from_the_first_estimate() -> None:
+    bench = flying()
+    bench.step(known=False)
+    bench.step()
+    bench.step()
+    wanted = bench.control.wanted
+    assert wanted is not None
+    assert wanted.law.text == "here at 1000000000"
+    assert bench.control.target(0) is wanted
+
+
+def test_a_hold_with_a_large_error_is_impossible_after_its_patience() -> None:
+    bench = flying(hold_error=0.5, hold_patience=3.0)
+    bench.targets.off = 0.5
+    for _ in range(10):
+        assert bench.step() is Mode.HOLD
+    bench.targets.off = 0.51
+    for _ in range(3):
+        assert bench.step() is Mode.HOLD
+    bench.step()
+    assert bench.control.mode is Mode.SAFE
+    assert bench.events == ["hold-impossible", "mode"]
+    assert bench.texts[1] == "hold -> safe, reaction safe: hold-impossible"
+    assert "zero" in bench.asked
+
+
+def test_in_the_demonstration_only_an_overdue_attitude_counts_as_an_error() -> None:
+    bench = flying("testbed-demo", hold_patience=1.0)
+    bench.targets.off = 3.0
+    for _ in range(5):
+        assert bench.step() is Mode.TESTBED_DEMO
+    for _ in range(3):
+        bench.step(overdue=0.6)
+    assert bench.control.mode is Mode.SAFE
+
+
+def test_a_fast_body_is_detumbled_after_8_cycles() -> None:
+    bench = flying(tumble_rate=0.5)
+    bench.targets.rate = 0.5
+    for _ in range(10):
+        assert bench.step() is Mode.HOLD
+    bench.targets.rate = 0.51
+    for _ in range(7):
+        assert bench.step() is Mode.HOLD
+    bench.step()
+    assert bench.control.mode is Mode.DETUMBLE
+    assert bench.control.detumbles
+    assert bench.asked.count("detumble") == 1
+
+
+def test_detumbling_ends_when_the_rate_was_low_for_its_time_at_an_attitude_that_can_be_held() -> None:
+    bench = flying("detumble")
+    bench.targets.holdable = False
+    for _ in range(4):
+        assert bench.step(rate=0.009) is Mode.DETUMBLE
+    bench.targets.holdable = True
+    for rate in (0.01, 0.009, 0.009):
+        assert bench.step(rate=rate) is Mode.DETUMBLE
+    assert bench.step(rate=0.009) is Mode.HOLD
+    assert bench.asked.count("release") == 1, "the old path is released"
+
+
+def test_a_slew_arrives_when_angle_and_rate_were_small_for_their_time() -> None:
+    bench = flying(arrived_angle=0.02, arrived_rate=0.03, arrived_for=2.0)
+    assert bench.control.command(Mode.SLEW, bench.now_ns, 0.2) == ""
+    assert bench.control.mode is Mode.SLEW
+    wanted = bench.control.wanted
+    assert wanted is not None
+    assert wanted.law.text == "0.2 as number 1"
+    for bench.targets.off, bench.targets.rate in ((0.02, 0.0), (0.0, 0.03), (0.019, 0.029), (0.019, 0.029)):
+        assert bench.step() is Mode.SLEW
+    assert bench.step() is Mode.HOLD
+    assert bench.control.wanted is wanted, "the attitude of the slew is held"
+    assert bench.texts[-1].startswith("slew -> hold, arrived: 0.0190 rad off")
+
+
+def test_a_slew_is_late_after_its_limit_and_becomes_a_hold() -> None:
+    bench = flying(slew_limit=3.0)
+    bench.targets.off = 0.1
+    bench.control.command(Mode.SLEW, bench.now_ns, 0.2)
+    for _ in range(3):
+        assert bench.step() is Mode.SLEW
+    bench.step()
+    assert bench.control.mode is Mode.HOLD
+    assert "slew-late" in bench.events
+
+
+def test_without_an_estimate_for_too_long_the_mode_is_safe() -> None:
+    bench = flying(blind_limit=3.0)
+    for _ in range(3):
+        assert bench.step(known=False) is Mode.HOLD
+    bench.step(known=False)
+    assert bench.control.mode is Mode.SAFE
+    assert bench.events[0] == "blind"
+
+
+def test_commands_are_refused_with_a_reason() -> None:
+    bench = ModeBench(settings=Modes(initial="hold"))
+    command = bench.control.command
+    assert command(Mode.HOLD, 0) == "not while in boot"
+    assert command(Mode.BOOT, 0) == "boot cannot be commanded"
+    assert command(Mode.SUN, 0) == "sun cannot be commanded of this body"
+    bench.step()
+    assert command(Mode.SLEW, bench.now_ns, cast(Any, "far")) == "too far"
+    assert bench.control.mode is Mode.HOLD
+    command(Mode.SLEW, bench.now_ns, 0.1)
+    wanted = bench.control.wanted
+    assert wanted is not None
+    assert wanted.law.text == "0.1 as number 1", "a refused command is not counted"
+    assert command(Mode.SAFE, bench.now_ns) == ""
+    assert command(Mode.SAFE, bench.now_ns) == ""
+    assert bench.events.count("mode") == 2, "a command for the present mode changes nothing"
+
+
+def test_a_latched_fault_bars_the_way_out_of_safe_until_it_is_cleared() -> None:
+    bench = flying()
+    for _ in range(2):
+        bench.facts.update(facts.TOO_HOT, True, bench.now_ns, "hot")
+    assert bench.control.mode is Mode.SAFE
+    assert bench.control.command(Mode.HOLD, bench.now_ns) == "not before it is cleared: too-hot"
+    bench.facts.clear("too-hot")
+    assert bench.control.command(Mode.HOLD, bench.now_ns) == ""
+    assert bench.control.mode is Mode.HOLD
+
+
+def test_reactions_without_a_mode_act_on_the_coils_or_stop_the_flight() -> None:
+    bench = flying()
+    bench.control.react(events.COIL_BROKEN, 0, "x")
+    bench.control.react(events.COIL_FAULT, 0, "x")
+    bench.control.react(events.CYCLE_SLIP, 0, "x")
+    assert bench.asked == ["isolate", "zero"]
+    assert bench.control.restart == ""
+    bench.control.react(events.MEMORY_HIGH, 0, "2 GB")
+    assert bench.asked[2:] == ["stop"]
+    assert bench.control.restart == "memory-high: 2 GB"
+    assert bench.control.mode is Mode.HOLD
+
+
+def test_new_limits_apply_to_all_conditions() -> None:
+    bench = flying()
+    bench.control.adopt(
+        Modes(initial="hold", arrived_for=0.5, hold_error=0.1, hold_patience=1.0, tumble_rate=0.2)
+    )
+    bench.targets.off = 0.11
+    bench.step()
+    assert bench.control.mode is Mode.HOLD
+    bench.step()
+    assert bench.control.mode is Mode.SAFE
+
+
+def orbiting(**changes: Any) -> ModeBench:
+    """Return a satellite in safe mode."""
+    bench = ModeBench(
+        SATELLITE, Modes(initial="safe", tumble_rate=FAST, known_for=2.0, lost_for=4.0, **changes)
+    )
+    bench.step(known=False)
+    return bench
+
+
+def test_a_satellite_boots_with_a_rate_alone_and_seeks_the_sun_in_safe() -> None:
+    bench = orbiting()
+    assert bench.control.mode is Mode.SAFE
+    assert bench.asked == ["zero", "sun"]
+    assert bench.control.acquires_sun
+    assert bench.control.target(0) is None
+
+
+@pytest.mark.parametrize(("mode", "text"), [(Mode.SUN, "sun"), (Mode.POINT, None)])
+def test_a_command_to_point_leads_through_the_acquisition(mode: Mode, text: str | None) -> None:
+    bench = orbiting()
+    assert bench.control.command(mode, bench.now_ns) == ""
+    assert bench.control.mode is Mode.ACQUIRE
+    for _ in range(2):
+        assert bench.step() is Mode.ACQUIRE
+    assert bench.step() is mode
+    assert (bench.control.wanted is None) is (mode is Mode.POINT)
+    found = bench.control.target(0)
+    assert found is not None
+    assert (found.law.text == "configured") is (mode is Mode.POINT)
+    for _ in range(4):
+        assert bench.step(known=False) is mode
+    assert bench.step(known=False) is Mode.ACQUIRE
+
+
+def test_a_commanded_target_is_pointed_to_and_kept_through_an_acquisition() -> None:
+    bench = orbiting()
+    bench.control.command(Mode.POINT, bench.now_ns, cast(Any, "nadir"))
+    for _ in range(3):
+        bench.step()
+    found = bench.control.target(0)
+    assert found is not None
+    assert found.law.text == "nadir as number 1"
+    for _ in range(5):
+        bench.step(known=False)
+    for _ in range(3):
+        bench.step()
+    assert bench.control.target(0) is found
+    bench.control.command(Mode.POINT, bench.now_ns)
+    configured = bench.control.target(0)
+    assert configured is not None
+    assert configured.law.text == "configured"
+
+
+def test_a_satellite_that_is_slow_acquires_its_attitude_after_detumbling() -> None:
+    bench = orbiting()
+    bench.control.command(Mode.DETUMBLE, bench.now_ns)
+    for rate in (0.02, 0.009, 0.009):
+        assert bench.step(known=False, rate=rate) is Mode.DETUMBLE
+    assert bench.step(known=False, rate=0.009) is Mode.ACQUIRE
+
+
+def test_a_satellite_that_tumbles_while_it_acquires_is_detumbled() -> None:
+    bench = orbiting()
+    bench.control.command(Mode.POINT, bench.now_ns)
+    for _ in range(7):
+        assert bench.step(known=False, rate=1.01 * FAST) is Mode.ACQUIRE
+    bench.step(known=False, rate=1.01 * FAST)
+    assert bench.control.mode is Mode.DETUMBLE

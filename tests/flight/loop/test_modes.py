@@ -9,6 +9,7 @@ from itertools import product
 
 import pytest
 
+from flight.link.events import Reaction
 from flight.link.modes import Mode
 from flight.loop.facts import FACTS
 from flight.loop.modes import (
@@ -17,6 +18,7 @@ from flight.loop.modes import (
     SAFING_REACTIONS,
     STARTS,
     TRANSITIONS,
+    HoldTimer,
     ModeChange,
     ModeMachine,
     Row,
@@ -24,6 +26,7 @@ from flight.loop.modes import (
     Trigger,
     TriggerAnswer,
     check,
+    modes_moved_by,
 )
 from knightcube.errors import FlightError
 
@@ -150,3 +153,70 @@ def test_labels_lead_back_to_their_modes() -> None:
     assert [Mode.named(mode.label) for mode in Mode] == list(Mode)
     with pytest.raises(ValueError, match="'fly' is not a mode: use boot, safe"):
         Mode.named("fly")
+
+
+@pytest.mark.parametrize(
+    ("mode", "changes"),
+    [
+        (Mode.HOLD, {}),
+        (Mode.SLEW, {Trigger.REACT_HOLD: Mode.HOLD, Trigger.ARRIVED: Mode.HOLD}),
+        (Mode.TESTBED_DEMO, {Trigger.COMMAND_DEMO: TriggerAnswer.STAY}),
+        (
+            Mode.DETUMBLE,
+            {
+                Trigger.COMMAND_SUN: TriggerAnswer.STAY,
+                Trigger.COMMAND_POINT: TriggerAnswer.STAY,
+                Trigger.COMMAND_DETUMBLE: TriggerAnswer.STAY,
+                Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
+                Trigger.DETUMBLED: Mode.HOLD,
+                Trigger.SLOWED: Mode.ACQUIRE,
+            },
+        ),
+        (
+            Mode.ACQUIRE,
+            {
+                Trigger.KNOWN_SUN: Mode.SUN,
+                Trigger.KNOWN_POINT: Mode.POINT,
+                Trigger.COMMAND_SUN: TriggerAnswer.STAY,
+                Trigger.COMMAND_POINT: TriggerAnswer.STAY,
+            },
+        ),
+        (Mode.SUN, {Trigger.LOST: Mode.ACQUIRE, Trigger.COMMAND_SUN: TriggerAnswer.STAY}),
+        (Mode.POINT, {Trigger.LOST: Mode.ACQUIRE}),
+    ],
+)
+def test_a_steered_mode_follows_commands_and_reactions_with_its_exceptions(mode: Mode, changes: Row) -> None:
+    usual: Row = {
+        Trigger.COMMAND_SAFE: Mode.SAFE,
+        Trigger.COMMAND_DETUMBLE: Mode.DETUMBLE,
+        Trigger.COMMAND_HOLD: Mode.HOLD,
+        Trigger.COMMAND_SLEW: Mode.SLEW,
+        Trigger.COMMAND_DEMO: Mode.TESTBED_DEMO,
+        Trigger.COMMAND_SUN: Mode.SUN,
+        Trigger.COMMAND_POINT: Mode.POINT,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+    }
+    expected = {trigger: TriggerAnswer.STAY for trigger in Trigger} | dict(usual) | dict(changes)
+    assert dict(TRANSITIONS[mode]) == expected
+
+
+def test_a_condition_counts_when_it_has_held_for_its_time_without_a_gap() -> None:
+    timer = HoldTimer(2.0)
+    assert not timer.update(True, 5)
+    assert not timer.update(True, 2_000_000_004)
+    assert timer.update(True, 2_000_000_005)
+    assert not timer.update(False, 2_000_000_006)
+    assert not timer.update(True, 2_000_000_007)
+    timer.require(1.0)
+    assert not timer.update(True, 3_000_000_006)
+    assert timer.update(True, 3_000_000_007)
+    timer.reset()
+    assert not timer.update(True, 3_000_000_008)
+
+
+def test_a_reaction_without_a_mode_change_has_an_effect_in_every_mode() -> None:
+    assert modes_moved_by(Reaction.NOTE) == frozenset(Mode)
+    assert modes_moved_by(Reaction.HOLD) == {Mode.SLEW}
+    assert modes_moved_by(Reaction.SAFE) == frozenset(Mode) - {Mode.SAFE}
+    assert modes_moved_by(Reaction.DETUMBLE) == frozenset(Mode) - {Mode.BOOT, Mode.SAFE, Mode.DETUMBLE}
