@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import json
 import pkgutil
 from collections.abc import Iterator
 from enum import Enum
+from pathlib import Path
 from types import ModuleType
 
 import msgspec
@@ -19,6 +21,7 @@ import knightcube
 import sim_hal
 from flight.schema import devices, orbit, sections, testbed
 from hal.interfaces.wires import SECOND_NS
+from tests.support.section_defaults import defaults_of
 
 OF_CAMERA = (devices.Camera, devices.StarTrackerSection)
 SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
@@ -138,3 +141,9 @@ def test_a_default_that_differs_is_found() -> None:
         resistance: float = 1.0
 
     assert _disagreements(Other, devices.Coils) == ["Other.stale_after = 0.3, Coils.stale_after = 0.25"]
+
+
+def test_the_defaults_are_the_published_ones() -> None:
+    """A configuration without these keys flies with them, so a change is a change of the interface."""
+    published = json.loads(Path(__file__).with_name("published_defaults.json").read_text(encoding="utf-8"))
+    assert json.loads(json.dumps(defaults_of(devices, orbit, sections, testbed))) == published
