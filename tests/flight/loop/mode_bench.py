@@ -99,6 +99,10 @@ class ModeBench:
     def _note(self, what: str) -> Any:
         return lambda *_: self.asked.append(what)
 
+    def mode(self) -> Mode:
+        """Return the present mode."""
+        return self.control.mode
+
     def step(
         self,
         *,

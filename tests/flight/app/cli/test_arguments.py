@@ -1,0 +1,22 @@
+"""The arguments of the board's commands are the published ones, with their defaults and choices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import COMMANDS
+from tests.support.command_options import arguments_of, published
+
+PUBLISHED = published(Path(__file__).with_name("published_arguments.txt"))
+
+
+def test_the_commands_are_the_published_ones() -> None:
+    assert list(COMMANDS) == list(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_command_has_its_published_arguments(name: str) -> None:
+    """Scripts and units depend on them: an argument that changes here changes the interface."""
+    assert arguments_of(f"flight.app.cli.{name}:configure") == PUBLISHED[name]
