@@ -439,7 +439,7 @@ class StateStore:
         if newest is None or newest.copy is None:
             if not bad:
                 return StoredState()
-            self._report(events.STATE_LOST, f"{bad}: defaults are used, as after an unclean shutdown")
+            self._report(events.STATE_LOST, f"{bad}: defaults are used, which counts as an unclean shutdown")
             return StoredState(running=True)
         self._generation = newest.copy.generation
         if bad:

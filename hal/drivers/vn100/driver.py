@@ -480,7 +480,7 @@ class ReadingConverter:
 
     def _ascii_sample(self, line: AsciiLine) -> _Sample | None:
         values = measurement(line.sentence)
-        # VNYMR lines, which a unit sends that lost its settings, are not accepted as readings.
+        # A VNYMR line is not accepted as a reading: a unit that lost its settings sends it.
         if values is None or len(values.attitude) != 4:
             return None
         return 0, values.attitude, values.gyro, values.mag, values.accel

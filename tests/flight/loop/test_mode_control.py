@@ -100,7 +100,7 @@ def test_the_flight_starts_in_its_initial_mode_when_readings_and_coils_are_there
         (0, 0, "begin"),
         (0, 3, "start in hold"),
     ]
-    assert bench.events == [], "the end of the boot is no event"
+    assert bench.events == [], "the end of the boot is not reported as an event"
 
 
 def test_a_boot_without_readings_is_reported_after_its_patience() -> None:

@@ -196,7 +196,7 @@ def _apid(packet: bytes) -> int:
 
 
 def _same(a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> tuple[bool, bool]:
-    """Return whether two packets differ in labels only, and whether the new one only has more fields."""
+    """Return whether two packets are equal except for labels, and whether the new packet just adds fields."""
     if a == b:
         return True, False
     first, second = old.get(_apid(a)), new.get(_apid(b))
