@@ -208,7 +208,7 @@ class UbloxReceiver:
         self._parser = UbxParser()
         self._requested_ns = -SILENCE_NS
         self._fix_arrival_ns = clock.now_ns()
-        self._last_byte_ns = self._last_fix_ns = -1
+        self._last_byte_ns = -1
         self._refused = self._out_of_range = 0
 
     def poll(self) -> list[GpsReading]:
@@ -235,7 +235,6 @@ class UbloxReceiver:
             out_of_range=self._out_of_range,
             refused=self._refused,
             last_byte_ns=self._last_byte_ns,
-            last_fix_ns=self._last_fix_ns,
         )
 
     def close(self) -> None:
@@ -248,13 +247,9 @@ class UbloxReceiver:
         if kind == NAV_PVT and len(payload) == PVT_LENGTH:
             self._fix_arrival_ns = self._clock.now_ns()
             try:
-                reading = reading_of(unpack_pvt(payload), arrival_ns, self._port.baud_rate)
+                return reading_of(unpack_pvt(payload), arrival_ns, self._port.baud_rate)
             except OutOfRange:
                 self._out_of_range += 1
-                return None
-            if reading.valid:
-                self._last_fix_ns = arrival_ns
-            return reading
         return None
 
     def _set_up(self) -> None:

@@ -43,7 +43,7 @@ class ImuLink:
     """Counters of the inertial unit's line since start; they only grow, so differences give rates.
 
     On a silent line `last_byte_ns` does not change; on a corrupt one bytes arrive without packets.
-    `last_byte_ns` and `last_packet_ns` are -1 before the first.
+    `last_byte_ns` is -1 before the first byte.
     """
 
     bytes_received: int
@@ -53,7 +53,6 @@ class ImuLink:
     out_of_range: int
     not_finite: int
     last_byte_ns: int
-    last_packet_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +83,7 @@ class GpsReading:
 
 @dataclass(frozen=True, slots=True)
 class GpsLink:
-    """Counters of the receiver's line since start; they only grow. Times are -1 before the first.
+    """Counters of the receiver's line since start; they only grow. `last_byte_ns` is -1 before any byte.
 
     `refused` counts commands that the receiver rejected, `out_of_range` impossible epochs.
     """
@@ -96,7 +95,6 @@ class GpsLink:
     out_of_range: int
     refused: int
     last_byte_ns: int
-    last_fix_ns: int
 
 
 @dataclass(frozen=True, slots=True)

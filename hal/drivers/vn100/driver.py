@@ -529,7 +529,6 @@ class Vn100:
         self._recovery = Recovery(port, settings)
         self._converter = ReadingConverter(settings, byte_ns, self._recovery.reset)
         self._last_byte_ns = -1
-        self._last_packet_ns = -1
 
     def configure(self) -> None:
         """Set the unit up in its volatile memory; its flash is not written.
@@ -580,7 +579,6 @@ class Vn100:
             self._converter.out_of_range,
             self._converter.not_finite,
             self._last_byte_ns,
-            self._last_packet_ns,
         )
 
     @property
@@ -602,8 +600,6 @@ class Vn100:
         for arrival_ns, data in self._port.receive():
             self._last_byte_ns = arrival_ns
             items += self._parser.feed(arrival_ns, data)
-        if items:
-            self._last_packet_ns = items[-1].arrival_ns
         return items
 
     def _ask(self, question: Question) -> tuple[str, ...]:
