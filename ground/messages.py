@@ -33,13 +33,13 @@ ORIGINATOR = "KNIGHTCUBE"
 _SECOND_NS = 1_000_000_000
 
 
-def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> list[Path]:
+def write_tracking_data(run: Run, path: Path) -> list[Path]:
     """Write the measured tracks of a run to `path` and return it in a list.
 
     There is one segment per object, with right ascension and declination measured in each frame, in ICRS at
     mid-exposure. The camera's aberration is removed, the light time is not. Standard deviations are in
-    comments, because the message has no keyword for them. MAG is the mean of the last sightings. `now` is the
-    date of the message. Raises UsageError if no object was tracked or `path` cannot be written.
+    comments, because the message has no keyword for them. MAG is the mean of the last sightings. Raises
+    UsageError if no object was tracked or `path` cannot be written.
     """
     tracks = run["track"]
     measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)] if len(tracks) else tracks
@@ -48,7 +48,7 @@ def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> li
     start_ns = int(run["run"]["utc_ns"][-1])
     lines = [
         "CCSDS_TDM_VERS = 2.0",
-        f"CREATION_DATE = {ccsds_date(round((now or datetime.now(UTC)).timestamp() * 1e9))}",
+        f"CREATION_DATE = {ccsds_date(round(datetime.now(UTC).timestamp() * 1e9))}",
         f"ORIGINATOR = {ORIGINATOR}",
     ]
     for number in sorted(set(measured["number"].tolist())):
@@ -184,17 +184,17 @@ def _orbit(number: int, tracks: PacketArray, start_ns: int) -> ObjectOrbit:
 _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 
-def write_orbit_messages(found: list[ObjectOrbit], folder: Path, now: datetime | None = None) -> list[Path]:
+def write_orbit_messages(found: list[ObjectOrbit], folder: Path) -> list[Path]:
     """Write one message per orbit into a folder and return the files.
 
-    `now` is the date of the messages. Raises UsageError if the folder cannot be written.
+    Raises UsageError if the folder cannot be written.
     """
     paths = []
     for item in found:
         if item.orbit is None:
             continue
         path = folder / f"object-{item.number}.opm"
-        lines = _message(item, now or datetime.now(UTC))
+        lines = _message(item, datetime.now(UTC))
         try:
             folder.mkdir(parents=True, exist_ok=True)
             path.write_text("\n".join(lines) + "\n", encoding="ascii")

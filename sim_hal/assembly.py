@@ -112,18 +112,17 @@ def assemble(
     line: SerialEnd,
     truth: TruthRecorder | None = None,
     expose: Expose | None = None,
-    wait: Callable[[int], None] | None = None,
     gps_line: SerialEnd | None = None,
     expose_wide: ExposeWide | None = None,
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`.
 
     `now_ns` returns the simulation's time; `line` and `gps_line` are the device ends of the serial lines;
-    `expose` and `expose_wide` replace the cameras' renderers (in real time a process of its own); `wait`
-    advances time while the bus hangs. Raises ConfigError for an invalid world.
+    `expose` and `expose_wide` replace the cameras' renderers (in real time a process of its own). Raises
+    ConfigError for an invalid world.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
-    coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wait)
+    coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns)
     world = make_world(WorldInputs(config, section, coils.circuit.currents, now_ns()))
     unit = _unit(config, section, world, coils.circuit, line, np.random.default_rng(unit_seed), now_ns())
     objects = sky_objects(section, now_ns(), world)
@@ -167,9 +166,8 @@ def assemble_coils(
     section: Simulation,
     generator: np.random.Generator,
     now_ns: Callable[[], int],
-    wait: Callable[[int], None] | None = None,
 ) -> CoilHardware:
-    """Build the coils; `now_ns` returns the simulation's time, `wait` advances time while the bus hangs."""
+    """Build the coils; `now_ns` returns the simulation's time."""
     coils, truth = config.coils, section.truth
     pwm = EmulatedPca9685(coils.address, now_ns)
     wired = wirings(coils.channels, truth.resistance or coils.resistance, coils.signs)
@@ -179,7 +177,7 @@ def assemble_coils(
     monitor, fitted = None, config.power_monitor
     if fitted is not None:
         monitor = EmulatedIna219(fitted.address, now_ns, circuit.mean_supply, fitted.shunt)
-    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
+    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor])
     return CoilHardware(bus, pwm, monitor, circuit)
 
 

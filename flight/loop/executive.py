@@ -105,12 +105,9 @@ class LockStepRunner:
         borrowed_ns: time spent on jobs in the calling thread.
     """
 
-    def __init__(
-        self, clock: Clock, workers: Sequence[Worker], stopwatch: Callable[[], int] = time.perf_counter_ns
-    ) -> None:
+    def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
         self._clock = clock
         self._workers = {worker.name: worker for worker in workers}
-        self._stopwatch = stopwatch
         self._pending: dict[str, JobResult] = {}
         self.borrowed_ns = 0
 
@@ -120,14 +117,14 @@ class LockStepRunner:
             return False
         spec = self._workers[worker]
         now_ns = self._clock.now_ns()
-        begun = self._stopwatch()
+        begun = time.perf_counter_ns()
         outcome: Outcome = "done"
         value, error = None, ""
         try:
             value = spec.function(argument)
         except Exception as failure:  # noqa: BLE001 - containment boundary: the worker runner
             outcome, error = "failed", f"{type(failure).__name__}: {failure}"
-        spent_ns = self._stopwatch() - begun
+        spent_ns = time.perf_counter_ns() - begun
         self.borrowed_ns += spent_ns
         self._pending[worker] = JobResult(
             worker, outcome, value, error, now_ns, now_ns + spec.latency_ns, spent_ns

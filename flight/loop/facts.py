@@ -347,8 +347,8 @@ class StreamWatch:
 class Streams:
     """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
 
-    def __init__(self, rows: tuple[StreamLimits, ...], time_ns: int = 0) -> None:
-        self._watches = {row.name: StreamWatch(row, time_ns) for row in rows}
+    def __init__(self, rows: tuple[StreamLimits, ...]) -> None:
+        self._watches = {row.name: StreamWatch(row, 0) for row in rows}
 
     def begin(self, time_ns: int) -> None:
         """Discard earlier readings; count from `time_ns`."""

@@ -183,12 +183,12 @@ class ModeChange:
 class ModeMachine:
     """The mode and the transition table, without side effects. `since_ns` is when the mode was entered."""
 
-    def __init__(self, time_ns: int = 0, table: Table = TRANSITIONS) -> None:
+    def __init__(self, table: Table = TRANSITIONS) -> None:
         """Begin in BOOT. Raises FlightError for an invalid table."""
         check(table)
         self._table = table
         self.mode = Mode.BOOT
-        self.since_ns = time_ns
+        self.since_ns = 0
 
     def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
         """Return the mode to which `trigger` would lead now, or why the mode would stay."""

@@ -198,14 +198,14 @@ def report_of(packet: bytes) -> Report:
 class UdpGround:
     """UDP line with one frame per datagram."""
 
-    def __init__(self, address: str, listen: str | None = None) -> None:
-        """Send to HOST:PORT and receive at `listen`, by default any free port. Raises FlightError."""
+    def __init__(self, address: str) -> None:
+        """Send to HOST:PORT and receive at any free port. Raises FlightError."""
         self._address = host_port(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._socket.setblocking(False)
         with _reaching(address):
-            self._socket.bind(("", 0) if listen is None else host_port(listen))
+            self._socket.bind(("", 0))
 
     def fileno(self) -> int:
         """Return the socket's file descriptor."""
@@ -263,9 +263,7 @@ class StreamGround:
         self._close()
 
 
-def open_terminal(
-    address: str, keys: Path, settings: TerminalSettings | None = None, listen: str | None = None
-) -> Terminal:
+def open_terminal(address: str, keys: Path, settings: TerminalSettings | None = None) -> Terminal:
     """Open HOST:PORT (UDP), tcp:HOST:PORT, or /dev/FILE@BAUD. Raises UsageError, FlightError."""
     settings = settings or TerminalSettings()
     vault = Vault(keys)
@@ -282,7 +280,7 @@ def open_terminal(
                 port = serial.Serial(device, int(baud), exclusive=True)
                 line = StreamGround(address, port.fileno(), settings.frame_bytes, port.close)
             else:
-                line = UdpGround(address, listen)
+                line = UdpGround(address)
     except ValueError as error:
         raise UsageError(f"{address}: give HOST:PORT, tcp:HOST:PORT or /dev/FILE@BAUD") from error
     return Terminal(line, vault, settings)

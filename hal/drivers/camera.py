@@ -75,21 +75,18 @@ class ServedCamera:
         counts: counts of its frames by outcome.
     """
 
-    def __init__(
-        self, device: CameraDevice, clock: Clock, patience_ns: int = PATIENCE_NS, patient: bool = False
-    ) -> None:
+    def __init__(self, device: CameraDevice, clock: Clock, patient: bool = False) -> None:
         """Open the camera and serve it.
 
         Raises DeviceError when it cannot be opened; a `patient` camera counts as lost until it opens.
 
-        A camera that delivers nothing within `patience_ns` and six exposures after a trigger is reopened; a
+        A camera that delivers nothing within `PATIENCE_NS` and six exposures after a trigger is reopened; a
         free-running camera may be in an exposure, and may need several more to apply a new setting.
         """
         self.name = device.name
         self.counts = device.counts
         self._device = device
         self._clock = clock
-        self._patience_ns = patience_ns
         self._lock = threading.Lock()
         self._asked: tuple[int, int] | None = None  # exposure, trigger: not yet passed to the device
         self._frame: Frame | None = None
@@ -164,7 +161,7 @@ class ServedCamera:
             asked, self._asked = self._asked, None
         if asked is not None:
             exposure_ns, trigger_ns = asked
-            self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + self._patience_ns
+            self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + PATIENCE_NS
             self._device.expose(exposure_ns, trigger_ns)
         frame = self._device.collect()
         if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:

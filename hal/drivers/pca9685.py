@@ -35,6 +35,8 @@ CHANNELS = 16
 COUNTS = 4096
 BLOCK_CHANNELS = 8  # fit into the 32 bytes of one SMBus block
 OSCILLATOR_HZ = 25e6
+FREQUENCY_HZ = 50.0
+"""Frequency of the PWM period."""
 OSCILLATOR_START_NS = 500_000
 
 PwmCounts = tuple[int, int]
@@ -74,11 +76,11 @@ def prescale_for(frequency_hz: float) -> int:
 class Pca9685:
     """One chip on a bus. Nothing is retried here; the caller handles failures."""
 
-    def __init__(self, bus: I2cBus, address: int, clock: Clock, frequency_hz: float = 50.0) -> None:
+    def __init__(self, bus: I2cBus, address: int, clock: Clock) -> None:
         self._bus = bus
         self._address = address
         self._clock = clock
-        self._prescale = prescale_for(frequency_hz)
+        self._prescale = prescale_for(FREQUENCY_HZ)
         self.name = _name(address)
 
     def configure(self) -> None:

@@ -60,9 +60,9 @@ def first_edges(binary: BoolArray) -> IntArray:
     return np.where(np.any(rises, axis=1), np.argmax(rises, axis=1) + 1, -1)
 
 
-def horizon_points(lines: Image, run: int = RUN) -> IntArray:
+def horizon_points(lines: Image) -> IntArray:
     """Return the edge (n,) of each line (n, m) after normalisation, binarisation and filter; -1 for none."""
-    return first_edges(run_filtered(binarised(lines, high_average(lines)), run))
+    return first_edges(run_filtered(binarised(lines, high_average(lines)), RUN))
 
 
 class NoCircleError(FlightError):
@@ -186,10 +186,10 @@ class LevelCamera:
     axis: tuple[float, float]
 
 
-def horizon_plane_depth(altitude: float, radius: float = MEAN_RADIUS) -> float:
+def horizon_plane_depth(altitude: float) -> float:
     """Return the distance (m) of the limb's plane below the satellite: d - R^2/d with d = R + altitude."""
-    distance = radius + altitude
-    return distance - radius**2 / distance
+    distance = MEAN_RADIUS + altitude
+    return distance - MEAN_RADIUS**2 / distance
 
 
 def graphic_nadir(

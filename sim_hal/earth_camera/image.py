@@ -128,19 +128,18 @@ class EarthCameraModel:
     def fuga15d(
         cls,
         field_of_view: float = math.radians(67.0),
-        centre: tuple[float, float] | None = None,
         k1: float = 0.0,
         k2: float = 0.0,
         **numbers: Any,
     ) -> Self:
         """Return the camera of Meller et al.: 512 x 512, 8 bits, logarithmic over six decades, 67 deg.
 
-        `field_of_view` (rad) is without distortion, edge to edge. `k1`, `k2` and `centre` are those of
+        `field_of_view` (rad) is without distortion, edge to edge. `k1` and `k2` are those of
         `knightcube.vision.camera.lens.Lens`. `numbers` are other attributes, such as `response="linear"`.
         """
         rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
         ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)
-        lens = Lens(columns, rows, ideal.focal_length, centre or ideal.centre, k1, k2)
+        lens = Lens(columns, rows, ideal.focal_length, ideal.centre, k1, k2)
         return cls(lens=lens, **numbers)
 
     @property

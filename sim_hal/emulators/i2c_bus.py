@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Protocol
 
+_TIMEOUT_NS = 20_000_000
 _BLOCK_LIMIT = 32
 """Maximum number of bytes of a block."""
 
@@ -64,12 +65,10 @@ class EmulatedI2cBus:
     def __init__(
         self,
         parts: Sequence[I2cPart] = (),
-        timeout_ns: int = 20_000_000,
         wait: Callable[[int], None] | None = None,
     ) -> None:
         """Connect the parts; `wait` advances time by a time-out (ns); without `wait` no time passes."""
         self._parts = list(parts)
-        self._timeout_ns = timeout_ns
         self._wait = wait
         self._faults: list[_Fault] = []
         self._closed = False
@@ -231,7 +230,7 @@ class EmulatedI2cBus:
 
     def _fail(self, fault: _Fault, address: int) -> None:
         if fault.code == errno.ETIMEDOUT and self._wait is not None:
-            self._wait(self._timeout_ns)
+            self._wait(_TIMEOUT_NS)
         raise OSError(fault.code, f"{fault.text}, address 0x{address:02x} on the emulated bus")
 
     @staticmethod

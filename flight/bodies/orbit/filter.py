@@ -358,7 +358,7 @@ class StepReplay:
             for measurement in step.late:
                 self._advance(step, time_ns, measurement.time_ns)
                 time_ns = measurement.time_ns
-                if self._apply(measurement, step):
+                if self._apply(measurement):
                     used.add(id(measurement))
             self._advance(step, time_ns, step.end_ns)
             self._end(step)
@@ -388,7 +388,7 @@ class StepReplay:
             used = free.field(now, step.around.field, settings.field_noise**2 / step.fields * _EYE)
             self.refused_fields = 0 if used else self.refused_fields + 1
 
-    def _apply(self, measurement: Measurement, step: FilterStep) -> bool:
+    def _apply(self, measurement: Measurement) -> bool:
         """Apply a measurement to the estimate of its time; return whether it passed the gate."""
         free = self.free
         if isinstance(measurement, AttitudeMeasurement):

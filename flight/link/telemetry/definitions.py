@@ -62,9 +62,9 @@ class Field:
     bits: States = ()
 
 
-def counter(name: str, meaning: str, kind: str = "u4") -> Field:
+def counter(name: str, meaning: str) -> Field:
     """Return the field of a counter, which wraps at the end of its range."""
-    return Field(name, kind, "-", meaning, wraps=True)
+    return Field(name, "u4", "-", meaning, wraps=True)
 
 
 def flag(name: str, meaning: str) -> Field:

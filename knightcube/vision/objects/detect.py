@@ -128,6 +128,12 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
+# Distance of the centre of rotation from the boresight, in focal lengths, beyond which it is degenerate. The
+# axis of the rotation decides, because the centre by least squares is too near: its errors and the projection
+# make parallel chords intersect.
+_FARTHEST_CENTRE = 3.0
+
+
 def evaluate(
     endpoints: FloatArray,
     sigma: FloatArray,
@@ -135,7 +141,6 @@ def evaluate(
     pinhole: Pinhole,
     bounds: tuple[float, float, float],
     strict: float = 2.5,
-    farthest_centre: float = 3.0,
 ) -> Indicators:
     """Return the indicators of streaks under the rotation that the stars share.
 
@@ -146,9 +151,6 @@ def evaluate(
         pinhole: the camera.
         bounds: least deviations at which each indicator fires.
         strict: robust standard deviations within the image that must be exceeded too, as in the thesis.
-        farthest_centre: distance of the centre from the boresight, in focal lengths, beyond which it is
-            degenerate. The axis of the rotation decides, because the centre by least squares is too near: its
-            errors and the projection make parallel chords intersect.
     """
     vectors = pinhole.unit_vectors(endpoints)
     stars = star_ends(vectors, rotation)
@@ -160,7 +162,7 @@ def evaluate(
     expected = pinhole.project(stars)
     quiet = residual <= bounds[2]
     centre = centre_of_rotation(endpoints[quiet]) if np.count_nonzero(quiet) >= 2 else np.full(2, np.nan)
-    normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > farthest_centre * abs(rotation[2])
+    normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
     # Both differences from a star, in px across and along the streak at one end.
