@@ -1,11 +1,13 @@
 """The light of streaks and spots on the pixels, and its derivatives with respect to all parameters.
 
 A long streak is fitted on strips: lines of pixels across its path, columns if the path runs more along rows
-than across them, rows otherwise. Ten lines form a block, over which the sensitivity to the motion is linear.
-Long paths are divided in time, and where their major axis changes; each part keeps the pixels nearest to it.
-The pixels stay fixed while the fit proceeds; only their distances from the path are updated.
+than across them, rows otherwise. Ten lines form a block, over which the derivatives with respect to the
+motion are linear. Long paths are divided into parts in time, and also at points at which their major axis
+changes. Each part has the pixels that are nearest to it. The pixels stay fixed while the fit proceeds; only
+their distances from the path are updated.
 
-Near a pixel the path is an arc: s along it, n across it, speed v. The light of a star of unit light is
+Near a pixel the path is an arc with the coordinates s along it and n across it and the speed v. The light of
+a star of unit light is
 
     m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
 
@@ -19,8 +21,8 @@ moves the path by c(t), the light changes by
 where e0 and e1 are the light per px of path at the two ends. Seven images serve all parameters, with
 coefficients for each block; the first moment of m accounts for the change of c_n along a block.
 
-A spot, a short streak, or the slow part of a longer one is summed over instants of the exposure
-(Gauss-Legendre), each a Gaussian integrated over every pixel. The sum is exact, for a star at rest too.
+A spot, a short streak, or the slow part of a longer streak is a sum of Gaussians at instants of the exposure
+(Gauss-Legendre quadrature), each integrated over every pixel. The sum is also exact for a star at rest.
 """
 
 from __future__ import annotations
@@ -51,21 +53,23 @@ LINES = 10
 STEEPEST = 0.68
 """Minimum cosine between a path and the normal of its lines, slightly below that of the diagonals."""
 
-# Largest rotation (rad) of one part of a path, for which the path is monotonic along its major axis.
+# Largest rotation (rad) of one part of a path, so that the part is monotonic along its major axis.
 _LONGEST_ROTATION = 1.1
+# Number of instants at which a part of a path is evaluated to find its crossings with the lines.
 _SAMPLES = 17
-# Ratio of the velocities along rows and columns at which a path is divided. At 1, the seam could follow a
-# diagonal of pixels and lose all of them.
+# Ratio of the velocities along rows and columns at which a path is divided.
+# At a ratio of 1, the seam between the parts could follow a diagonal of pixels and lose all of them.
 _DIAGONAL = 1.03
-# Number of instants at which the direction of a part is evaluated.
+# Number of instants at which the direction of a part of a path is evaluated.
 _INSTANTS = 7
-# Minimum speed, px per exposure.
+# Minimum speed (px per exposure) in divisions by the speed.
 _SLOWEST = 1e-3
-# Minimum cosine between a path and the normal of a line beyond the end of its part.
+# Minimum cosine between a path and the normal of a line that lies beyond the end of the path's part.
 _MOST_BENT = 0.5
-# Width (px) of the seam between two parts of a straight path, and its growth for a bent path, relative to the
-# third power of the width over the square of the radius.
+# Width (px) of the seam between two parts of a straight path.
 _SEAM = 0.003
+# Growth of the seam for a bent path, relative to the third power of the strip's width times the squared
+# curvature.
 _ARC = 0.3
 
 
@@ -105,7 +109,8 @@ def cut_strips(
 ) -> Strips:
     """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures.
 
-    `ending` (n, 2) tells which times are ends of the path, beyond which pixels are included; None: all.
+    The mask `ending` (n, 2) states which times are ends of a path; pixels beyond these ends are included.
+    None stands for all times.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
@@ -155,7 +160,7 @@ class _Lines:
 def _parts(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return star, start and end time of each part, and whether those are ends of the path (.., 2)."""
+    """Return star, start and end times of each part, and a mask (.., 2) of the times that end a path."""
     turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
     pieces = max(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
@@ -229,13 +234,13 @@ def _pixels(
     corner = np.stack([np.where(along, lines.line, minor), np.where(along, minor, lines.line)], axis=-1)
     step = np.where(along, [[0, 1]], [[1, 0]])
     aside, ahead = path_distances(corner, step, position, tangent, 2 * half + 1)
-    # An accuracy of 0.01 px suffices.
+    # An accuracy of 0.01 px suffices for the selection of pixels, so that float32 is used.
     pace, curved = speed.astype(np.float32), bend.astype(np.float32)
     ahead /= np.maximum(np.float32(1.0) - curved * aside, np.float32(0.5))
     aside -= np.float32(0.5) * curved * ahead * ahead
     foot = np.divide(ahead, pace, out=ahead)
     foot += lines.time.astype(np.float32)
-    # A pixel between two parts may be lost, but none is counted twice.
+    # A pixel between two parts of a path may be lost, but no pixel is counted twice.
     seam, room = (_SEAM + _ARC * width**3 * np.square(bend)) / speed, width / speed
     start = low[lines.part, None] + np.where(outer[lines.part, :1], -room, seam)
     stop = high[lines.part, None] - np.where(outer[lines.part, 1:], -room, seam)
@@ -246,7 +251,7 @@ def _pixels(
     within &= foot < stop.astype(np.float32)
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
-    # Only blocks and pixels of which some are within.
+    # Blocks without a pixel inside the strip are dropped.
     crossed = np.flatnonzero(within.any(axis=(1, 2)))
     used = np.flatnonzero(within.any(axis=(0, 2)))
     begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
@@ -265,7 +270,8 @@ def path_distances(
     """Return the distances (count, b, l) px of each line's pixels across the path and along it.
 
     `corner` and `step` are those of `Strips`; `position` and `tangent` (b, l, 2) are those of the path where
-    it crosses the line. The pixels are the first axis, for fast operations on long arrays.
+    it crosses the line. The pixels of a line are the first axis, so that operations run along long contiguous
+    arrays.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
@@ -282,9 +288,10 @@ def _speed(path: StarPaths) -> FloatArray:
     return np.maximum(np.hypot(path.velocity[:, 0], path.velocity[:, 1]), _SLOWEST)
 
 
-# Gauss-Legendre nodes of a piece of the path; about one per width of the point spread is exact to 1e-4.
+# Gauss-Legendre nodes and weights of one piece of a path.
+# About one node per width of the point spread is exact to 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
-# Length of a piece, in widths of the point spread.
+# Length of a piece of a path, in widths of the point spread.
 _PIECE_WIDTHS = 8.0
 # Distance from a patch, in widths of the point spread, up to which light reaches its pixels.
 _BEYOND = 5.5
@@ -376,7 +383,8 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # One more sample on either side; a path that is never near is kept entirely.
+    # The near part is extended by one sample on either side; a path that is never near its patch is kept
+    # entirely.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -387,16 +395,17 @@ def _pieces(
     out = np.empty((n, count + 1))
     for star in range(n):
         part = slice(first[star], last[star] + 1)
-        # The small term in time separates samples of a star at rest.
+        # The small term in time keeps the path length strictly increasing for a star at rest.
         run = way[star, part] + 1e-6 * np.arange(last[star] + 1 - first[star])
         out[star] = np.interp(run[0] + share * (run[-1] - run[0]), run, sampled[star, part])
     return out
 
 
 def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractions (n, m, p) of light at `place` (n, m) on `pixels` (n, p), and two derivatives.
+    """Return the fractions (n, m, p) of light on `pixels` (n, p), and two derivatives.
 
-    The derivatives are with respect to `place` and `sigma`.
+    The light is a Gaussian of width `sigma` at `place` (n, m). The derivatives are with respect to `place`
+    and `sigma`.
     """
     right = (pixels[:, None, :] + 0.5 - place[..., None]) / sigma
     left = right - 1.0 / sigma
@@ -411,9 +420,10 @@ IMAGES = 7
 
 # Number of blocks computed at a time, so that their pixels fit into the processor's cache.
 _AT_ONCE = 256
-# Distance from an end, in widths, beyond which its profile is 0 or 1.
+# Distance from the end of a streak, in widths of the point spread, beyond which the light is zero or full.
 _ENDS = 5.5
-# Largest distance, in widths along the path, between a pixel and the crossing of its line.
+# Largest distance, in widths along the path, between a pixel and the point at which the path crosses the
+# pixel's line.
 _OBLIQUE = 7.0
 # Time step of numerical differences, in exposures.
 _STEP = 1e-4
@@ -455,7 +465,7 @@ def _draw(
     shutter: Shutter,
     width: float,
 ) -> None:
-    """Compute images of some blocks; `path` has position, tangent, speed and acceleration on their lines."""
+    """Compute the images of the blocks `part`, with position, tangent, speed and acceleration in `path`."""
     speed, time = path[2], strips.time[part]
     # Acceleration along the path, px per exposure^2.
     gained = np.sum(path[3] * path[1], axis=-1)
@@ -473,7 +483,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # First moment of the light along the path, without the part that the ends cut off.
+    # This image is the first moment along the path of the light between the ends of the exposure.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]
@@ -502,11 +512,11 @@ def _endless(
     u *= np.float32(1.0 / width**2)
     light = np.multiply(u, np.float32(-0.5), out=ahead)
     np.exp(light, out=light)
-    # Slow stretches are brighter, and so is the inside of a bend.
+    # The light is inversely proportional to the speed, and larger on the inside of a bend.
     light *= np.float32(1.0) + squeeze * (np.float32(0.5) + np.float32(0.375) * squeeze)
     light *= np.float32(1.0) - s * (gained / speed**2).astype(np.float32)
     scale = _BELL / (width * speed)
-    # Sum of the fourth powers of the tangent's components.
+    # The factor 1 - 2 tx^2 ty^2 is the sum of the fourth powers of the tangent's components.
     square = scale * (_KURTOSIS / (24.0 * width**4)) * (1.0 - 2.0 * np.square(tx * ty))
     u = (u - np.float32(6.0)) * u
     u *= square.astype(np.float32)
@@ -524,7 +534,7 @@ def _ends(
     part: slice,
     width: float,
 ) -> None:
-    """Cut the light in `out[:, 0]` at both ends of the exposure, and set the images of the ends.
+    """Limit the light in `out[:, 0]` to the path between both ends, and compute the images of the ends.
 
     `along` (b, LINES, k) px is the distance along the path from the centre of each block. `lines` has the
     times at which the path crosses each line (b, LINES) and the centre (b, 1), and speed and acceleration.
@@ -543,7 +553,7 @@ def _ends(
         before_end = crossing[near] - end
         u += _wide((centre[near] - end) * speed[near] - 0.5 * gained[near] * before_end**2)
         if rolling:
-            # The end depends on the row of the pixel.
+            # With a rolling shutter, the end of the exposure depends on the row of the pixel.
             u -= shutter.delay(strips.rows(near + part.start)) * _wide(speed[near])
         u *= np.float32(sign / width)
         bell = u * u
@@ -554,7 +564,8 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # A slower star is brighter, so that an end cuts off more or less light.
+        # If the speed changes along the path, the light per px at the end differs from that at the centre of
+        # the block.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
@@ -574,14 +585,14 @@ def coefficients(
     strips: Strips,
     growing: bool = True,
 ) -> FloatArray:
-    """Return coefficients (b, IMAGES, 8) of the images for the derivatives of the light of a unit star.
+    """Return coefficients (b, IMAGES, 8) with which the images form the derivatives of a star of unit light.
 
     The parameters are rate (3), acceleration (3), x and y. The columns of the acceleration are zero unless
     `growing`.
     """
     centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
     of_block = stars[strips.star]
-    # Each star has two ends, with a rolling shutter each block.
+    # Each star has two ends; with a rolling shutter, each block has its own two ends.
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:

@@ -25,7 +25,10 @@ from knightcube.vision.streaks.settings import RateModel
 
 
 class StreakStatus(Enum):
-    """Whether a frame gave a rate, or the reason; the values are those of the `streak` telemetry packet."""
+    """Outcome of a frame: a rate, or why there is none.
+
+    The values are those of the `streak` telemetry packet.
+    """
 
     RATE = "rate"
     AMBIGUOUS = "ambiguous"
@@ -61,9 +64,10 @@ class FrameMotion:
         status: `rate`: the rate is known; `ambiguous`: the rate is known up to its sign; others: no rate.
         checksum: checksum of the pixels, which differs between any two exposures of a working sensor.
         exposure: exposure time, s.
-        length: px, median length of the streaks used, else of the streaks or regions found; NaN without any.
-        endpoints: (found, 2, 2) px. With a rate, all first ends are simultaneous, and with status `rate` they
-            are earlier than the second ends.
+        length: px, median length of the used streaks, otherwise of all found streaks or regions; NaN if none
+            is found.
+        endpoints: (found, 2, 2) px. If the frame has a rate, all first ends are simultaneous. With status
+            `rate` they are earlier than the second ends.
         used: (found,) which streaks determine the rate.
         rate: (3,) rad/s, camera axes, of the camera with respect to the stars; None if unknown.
         covariance: (3, 3) rad^2/s^2 of `rate`; None if unknown.
@@ -102,7 +106,8 @@ class FrameMotion:
 class MotionResult(FrameMotion):
     """The maximum-likelihood motion of one exposure and its stars; `rate` is the mean over the exposure.
 
-    `used` stars determine the motion; `length` and `residual` (expected error) are those of the used stars.
+    The `used` stars determine the motion. `length` and `residual`, here the expected error, refer to these
+    stars.
 
     Attributes:
         stars: (n, 2) px at mid-exposure.
@@ -118,8 +123,8 @@ class MotionResult(FrameMotion):
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: the fitted model, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
-        reason: why there is no rate, in one line; empty with a rate.
-        course: known rotation whose higher terms the fit used; None without one.
+        reason: reason for a missing rate, in one line; empty if there is a rate.
+        course: rotation from navigation whose higher terms the fit used; None if it used none.
         line_time_sigma: s, standard deviation of the shutter's line time.
     """
 
@@ -194,7 +199,7 @@ def validate(
 def admit(
     pixels: Image, previous_checksum: int | None, saturation: float, saturated_fraction: float
 ) -> tuple[int, StreakStatus | None]:
-    """Return the checksum of `pixels`, and why the frame is unusable: black, saturated or frozen; else None.
+    """Return the checksum of `pixels`, and the status of an unusable frame: black, saturated or frozen.
 
     A frame equal to the previous one indicates a frozen camera, because two exposures differ in their noise.
     """
@@ -206,7 +211,7 @@ def admit(
 
 
 def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float) -> Result:
-    """Return `result` with the direction of time of the prior, unchanged if the prior is too uncertain."""
+    """Return `result` in the direction of time of the prior, unchanged if the prior is too uncertain."""
     if result.rate is None or prior_rate is None:
         return result
     sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)

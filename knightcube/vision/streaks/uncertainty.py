@@ -1,9 +1,9 @@
 """The covariance of the fitted rotation, including errors that the model does not describe.
 
-Photon noise gives the smallest covariance. The scatter of the stars beyond their noise increases it, and so
-do errors of the camera's calibration as far as the stars do not reveal them. Two errors are common to all
-stars and cause no scatter: a point spread of another width or shape, which moves the ends of all streaks, and
-vibration of the body. The residuals at the ends and along the streaks bound both.
+Photon noise gives the smallest covariance. The covariance is increased by the scatter of the stars beyond
+their noise, and by errors of the camera's calibration that the stars do not determine. Two errors are common
+to all stars and cause no scatter: a point spread of another width or shape, which moves the ends of all
+streaks, and vibration of the body. The residuals at the ends and along the streaks bound these two errors.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from knightcube.vision.streaks.normal_equations import (
 from knightcube.vision.streaks.streak_model import LINES
 from knightcube.vision.streaks.streak_result import MotionResult
 
-# Residual of a pixel with light of another star: standard deviations, plus a fraction of the brightest pixel
-# of its line.
+# Residual of a pixel, in standard deviations, above which the pixel contains light of another star.
 _FOREIGN_SIGMAS = 5.0
+# Part of that residual limit proportional to the light, as a fraction of the brightest pixel of the line.
 _FOREIGN_SHARE = 0.6
 # Minimum sensitivity of a pixel to a displacement, relative to the most sensitive pixel of its block.
 _LEAST_SENSITIVITY = 0.02
@@ -91,7 +91,7 @@ class Displacement:
     """The rms displacement (px) that would explain residuals.
 
     Attributes:
-        shown: displacement beyond chance.
+        shown: displacement beyond the expectation from noise.
         chance: upper bound, with the statistical uncertainty added.
     """
 
@@ -100,7 +100,7 @@ class Displacement:
 
 
 def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement of the ends along the paths, None if no end is in the frame."""
+    """Return the displacement of the ends along the paths that explains the residuals, None without ends."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = light * (left.images[:, 3] + left.images[:, 4])
     near = _sensitive(left, change)
@@ -111,7 +111,7 @@ def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement 
 
 
 def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement across the paths away from their ends, None without streaks."""
+    """Return the displacement across the paths that explains the residuals, None without streaks."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = np.abs(light * left.images[:, 1])
     along = _sensitive(left, change) & ~_sensitive(left, light * (left.images[:, 3] + left.images[:, 4]))
@@ -143,13 +143,13 @@ def _displacement(
     )
 
 
-# Instants at which a path is compared with its displacement by an error.
+# Instants at which a path is compared with the same path displaced by a calibration error.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
-# Minimum speed, px per exposure.
+# Minimum speed (px per exposure) in divisions by the speed.
 _SLOWEST = 1e-3
-# Indices of rate and position among the sensitivities.
+# Indices of rate and star position among the parameters of the sensitivities.
 _RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
-# Probability of a correction by chance.
+# Probability with which a calibration error is corrected by chance.
 _BY_CHANCE = 1e-5
 
 
@@ -160,7 +160,7 @@ class CalibrationCorrection:
     Attributes:
         step: (k,) correction of the shared parameters; 0 if the errors are not significant.
         added: (k, k) covariance added to that of an exact camera.
-        described: (k, k) part of it due to errors of described size.
+        described: (k, k) part of `added` due to errors of described size.
         score: (n, k) gradient of each star after correction.
         error: (m,) likeliest errors, in standard deviations.
     """
@@ -217,19 +217,21 @@ def correct(
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
-    """Return the covariance (k, k) due to errors whose information from the stars is `left` (m, m).
+    """Return the covariance (k, k) due to calibration errors with the information matrix `left` (m, m).
 
-    A correction is uncertain by its own size, because a large displacement of streaks is underestimated.
+    Each correction is assumed to be uncertain by its own size, because a large displacement of streaks is
+    underestimated.
     """
     change = leading @ error
     return np.asarray(leading @ np.linalg.inv(left) @ leading.T + np.outer(change, change))
 
 
 def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
-    """Return the apparent rate changes (n, 3, m) rad per exposure of each star by errors of one sigma each.
+    """Return apparent rate changes (n, 3, m) of each star due to each error of one standard deviation.
 
-    Exactly known quantities are omitted; the error of the shutter is the last. A streak determines the
-    position of its path across and, by its ends, its length.
+    They are in rad per exposure. Exactly known quantities are omitted, and the error of the shutter is the
+    last one. A streak determines the position of its path in the direction across it and, by its ends, its
+    length.
     """
     errors = _error_sizes(camera)
     n = len(scene.stars)
@@ -299,7 +301,7 @@ def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     return replace(camera, pinhole=lens)
 
 
-# Number of time bins over the exposure.
+# Number of time bins over the exposure for the common motion of the streaks.
 _BINS = 48
 # Minimum significance of a common motion, in standard deviations.
 _SIGNIFICANT = 4.0
@@ -321,9 +323,9 @@ class CommonMotion:
 def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
     """Return the motion common to the trusted streaks, zero without long streaks.
 
-    Vibration displaces all streaks equally at each time across their paths, and changes their brightness
-    along the paths, where the motion slows down or speeds up. The residuals are averaged over the stars by
-    time. Only products of different stars are summed, so that a neighbour of one star has no effect.
+    At each time, vibration displaces all streaks equally across their paths. Along the paths it changes their
+    speed and thereby their brightness. The residuals are averaged over the stars by time. Only products of
+    different stars are summed, so that light of a star's neighbour has no effect.
     """
     if not len(left.star):
         return CommonMotion()
@@ -348,7 +350,8 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
     """Return the rms displacement common to all stars, 0 if not significant.
 
-    `cell` (m,) numbers star and time bin; `score` (m, 2) and `information` (m,) of the lines are summed.
+    `score` (m, 2) and `information` (m,) of m lines are summed in cells of star and time bin with the index
+    `cell` (m,).
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
@@ -369,22 +372,25 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     return float(np.sqrt(common / weight))
 
 
-# Minimum relative change of the rate for a motion that begins or ends near rest.
+# Minimum relative change of the rate of a motion that begins or ends near rest.
 _NEAR_REST = 1.5
+# Maximum number of bright streaks that are tested for a reversed rotation.
 _MOST_STARS = 10
-# Step (px) of the light along a path, margin (px) before the rest, and length in lengths of the fitted path.
+# Step (px) of the light along a path.
 _STEP = 0.5
+# Margin (px) before the point at which a star is at rest.
 _BEFORE = 5.0
+# Length of the examined path, relative to the fitted path.
 _BEYOND = 1.9
-# Half width (px) of the pixels around a path.
+# Half width (px) of the band of pixels around a path.
 _ASIDE = 3
-# Reversing motions that are compared: ratio of the durations of the shorter and the longer part, and ratio of
-# the path length to the fitted one.
+# Trial ratios of the durations of the shorter and the longer part of a reversing motion.
 _SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
+# Trial ratios of the path length of a reversing motion to the fitted length.
 _LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
-# Relative error of the profile across a path.
+# Relative error of the model's profile across a path.
 _PROFILE_ERROR = 0.05
-# Largest improvement of chi-square by one star.
+# Largest improvement of chi-square that one star contributes.
 _MOST_IMPROVEMENT = 100.0
 
 
@@ -414,10 +420,11 @@ class _PathLight:
 def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
     """Return the improvement of chi-square of bright streaks by a rotation that reverses in the exposure.
 
-    It is 0 if no such rotation is better, or if the rate is far from zero or known from navigation. For a
-    linear rate, the light along a path is 1/sqrt(s) at s px from the rest. A rotation that reverses covers
-    the first part of the path twice, which doubles the light there. Two parts of equal length look like a
-    motion from rest, and no pixel distinguishes the two.
+    The improvement is 0 if no such rotation is better, or if the rate is far from zero or known from
+    navigation. For a linear rate, the light along a path is 1/sqrt(s) at s px from the rest. A rotation that
+    reverses covers the first part of the path twice, which doubles the light there. If both parts are equally
+    long, the light is the same as that of a motion from rest, and the pixels do not distinguish the two
+    motions.
     """
     motion, change = scene.motion, scene.motion.relative_acceleration
     if abs(change) < _NEAR_REST or motion.higher_terms.any():
@@ -476,7 +483,8 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     `shares` are ratios of the durations of the two parts. Light and sky of the star are fitted.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    # Light before each edge; a negative share stands for a motion that begins after the rest.
+    # The light before each edge of the cells.
+    # A negative share stands for a motion that begins after the rest.
     share, root = shares[:, None, None], np.sqrt(np.clip(edges / lengths[:, None], 0.0, 1.0))
     before = np.maximum(root, -share) + np.minimum(root, np.maximum(share, 0.0)) + np.minimum(share, 0.0)
     light = np.diff(before / (1.0 + share), axis=-1)
@@ -490,25 +498,29 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient steps for the covariance.
 _CONJUGATE = 12
-# Number of stars up to which they hardly contradict each other, and the factor on their variance.
+# Number of stars up to which their agreement does not test the motion, and the factor on the variance for so
+# few stars.
 _UNCHECKED = (2, 4.0)
-# Relative difference of variances up to which fitted and described point spread are equal.
+# Relative difference of variances up to which the fitted and the described point spread count as equal.
 _SAME_SPREAD = 0.05
-# Uncertainty of the ends, relative to the root of the difference of the variances.
+# Uncertainty of the ends, relative to the root of the difference between fitted and described variance.
 _END_SHARE = 0.6
-# Uncertainty of the ends by their residuals: minimum (px), and factors on the displacement shown and on its
-# upper bound.
+# Minimum uncertainty (px) of the ends if their residuals indicate a displacement.
 _END_FLOOR = 0.12
+# Uncertainty of the ends, relative to the displacement that explains their residuals.
 _END_SHOWN = 1.5
+# Uncertainty of the ends, relative to the upper bound of the displacement that explains their residuals.
 _END_CHANCE = 0.5
-# Uncertainty of the ends (px) per px, or per relative brightness, of common motion.
+# Uncertainty of the ends (px) per unit of common motion, in px across or relative brightness along the paths.
 _END_COMMON = 25.0
-# Maximum number of corrections of the lens, error (standard deviations) at which they stop, and relative
-# uncertainty of the rotation that makes them worthwhile if the stars do not show an error.
+# Maximum number of corrections of the lens.
 _MOST_LENSES = 3
+# Largest calibration error (standard deviations) after which the correction of the lens stops.
 _SMALL_ERROR = 0.2
+# Relative uncertainty of the rotation due to the lens above which a correction is tried without a significant
+# error.
 _WORTHWHILE = 0.002
-# Ratio of the covariance to that of noise above which errors of the model cause it (three sigma).
+# Ratio of the covariance to that of noise above which model errors must be its cause (three sigma).
 _BEYOND_NOISE = 9.0
 
 
@@ -519,8 +531,8 @@ class RotationUncertainty:
     Attributes:
         rotation: (3,) rad, corrected for errors of the calibration that the stars show.
         covariance: (3, 3) rad^2.
-        model_error: uncertainty due to errors of the model, relative to the rotation; that of an undescribed
-            shutter is only in the covariance.
+        model_error: uncertainty due to errors of the model, relative to the rotation. The uncertainty of an
+            undescribed shutter is only in the covariance.
         common_motion: motion common to all streaks.
         aside: px, displacement across the streaks that would explain the residuals.
     """
@@ -546,7 +558,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if brightest is not None:
         lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
     rotation = scene.motion.rotation + lens.step
-    # The cause of rejected stars may affect the others too, to a smaller degree.
+    # The cause of the rejected stars may also affect the accepted stars, to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
     judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
     spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)
@@ -561,7 +573,8 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     ends = float(np.sqrt(2.0) * end / result.length)
     # A fit that did not settle is uncertain by its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
-    # A common error of the ends changes the length of the rotation; the axis gets the same uncertainty.
+    # An error common to all streak ends changes the rotation angle.
+    # The axis gets the same uncertainty as the angle.
     longer = ends**2 * float(rotation @ rotation)
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
@@ -583,7 +596,7 @@ class _LensEffect:
     Attributes:
         step: (3,) rad, correction of the rotation.
         added: (3, 3) rad^2, covariance added.
-        described: (3, 3) rad^2, part of it due to errors of described size.
+        described: (3, 3) rad^2, part of `added` due to errors of described size.
         spread: variance of the stars' scatter, relative to the noise.
         error: (m,) errors relative to `counted`, in standard deviations.
         counted: (m,) errors already corrected in the fit; None without any.
@@ -602,7 +615,7 @@ class _LensEffect:
 def _corrected_lens(
     camera: FitProblem, whole: StreakFit, exposure: float
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
-    """Return camera and fit with the likeliest errors of the lens corrected, and their remaining effect.
+    """Return camera and fit after correction of the likeliest lens errors, and their remaining effect.
 
     Large displacements of streaks are underestimated, so that the fit is repeated with the corrected lens
     until the correction is small. This is done if the stars show an error, or if the lens contributes most of
@@ -645,7 +658,7 @@ def _lens_effect(
     shared = np.zeros((len(trusted), len(equations.kept), apparent.shape[2]))
     shared[:, :3] = apparent
     corrected, before = None, 1.0
-    # Scatter that calibration errors explain is not counted as noise.
+    # Scatter of the stars that calibration errors explain does not count as noise.
     for _ in range(2):
         corrected = correct(equations.information, equations.score, shared, before, described, counted)
         if corrected is None:
@@ -669,9 +682,9 @@ def _scatter(equations: StarEquations, scene: StreakScene) -> float:
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
     """Return the uncertainty (px) of the ends due to a point spread of another width than `sigma` px.
 
-    Without residuals at the ends, the point spread has the same width along and across the streaks and the
-    shape of the model. Residuals indicate another shape, or a vibration too fast to be resolved, which shifts
-    the apparent ends.
+    If the ends have no significant residuals, the point spread has the shape of the model and the same width
+    along and across the streaks. Residuals indicate another shape, or a vibration too fast to be resolved,
+    which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described

@@ -1,6 +1,6 @@
 """Pointing targets: the goals that a configuration or a command can give a satellite.
 
-A target is a plain value that configurations, packets and jobs carry; `attitude_law` makes its attitude law.
+A target is a plain value in configurations, packets and jobs. `attitude_law` computes its attitude law.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ _LENGTH = 1e-3
 class Goal(IntEnum):
     """The goals of pointing; the values are those of the command packet.
 
-    NADIR, VELOCITY and SUN take no numbers, INERTIAL a quaternion, GROUND latitude and longitude.
+    NADIR, VELOCITY and SUN take no numbers, INERTIAL takes a quaternion, and GROUND takes latitude and
+    longitude.
     """
 
     NADIR = 0
@@ -43,7 +44,8 @@ class Goal(IntEnum):
 
 
 NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
-"""Permitted counts of numbers of a goal, the largest last; goals that are not listed take none."""
+"""Permitted counts of numbers for each goal, the largest count last. Goals that are not listed take no
+numbers."""
 ROLLS = {
     Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
     Goal.OBJECT: "an object is followed with a free roll",
@@ -53,13 +55,13 @@ ROLLS = {
 
 @dataclass(frozen=True, slots=True)
 class PointingTarget:
-    """A goal with its numbers.
+    """A pointing goal with its numbers and its roll.
 
     Attributes:
         goal: what to point at.
-        numbers: INERTIAL: the attitude (4,), ICRS into body. GROUND: latitude and longitude, rad. OBJECT:
-            right ascension and declination, rad, of the field to search, or empty for the present field of
-            view. Otherwise empty.
+        numbers: arguments of the goal. INERTIAL has an attitude quaternion (4,), ICRS into body; GROUND has
+            latitude and longitude, rad; OBJECT has right ascension and declination, rad, of the field to
+            search, or no numbers for the present field of view. Other goals have no numbers.
         roll: rad about the pointing axis; None leaves it free. Some goals take no roll (`ROLLS`).
     """
 

@@ -1,16 +1,17 @@
 """The task of a slew with coils: motion, path in time, end conditions, exclusion cones and environment.
 
-State (7,): attitude and body rate; control (3,): the coils' dipole. With b = A(q) B and e = A(q) r:
+The state (7,) is attitude and body rate, the control (3,) the coils' dipole m. With the field b = A(q) B and
+    the direction of the position e = A(q) r in body axes, the motion is
 
     q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
 
-where d are the torques of `knightcube.astro.earth.disturbance`: one constant in body axes, and those of air
-and sunlight, c x A(q) v, which rotate with the body. The torque has no component along the field, so only
-some paths are feasible. All derivatives are exact: A(q) v is a quadratic form of q, with Davenport's matrix
-as its curvature.
+where d is the sum of the torques of `knightcube.astro.earth.disturbance`: a constant torque in body axes, and
+the torques c x A(q) v by air and sunlight, which depend on the attitude. The torque has no component along
+the field, so only some paths are feasible. All derivatives are exact: A(q) v is a quadratic form of q, with
+Davenport's matrix as its curvature.
 
-Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because scipy.interpolate would cost
-each process that flies or plans a slew 20 MiB for two formulas.
+Paths are cubic Hermite curves (de Boor 1978, ch. IV), evaluated here because scipy.interpolate would take 20
+MiB of memory in each process that flies or plans a slew.
 
 The end of a slew is an attitude, which gives three equations, or the direction of a boresight with a free
 roll, which gives two. The body rate at the end gives three more. All are quadratic in the quaternion. An
@@ -51,7 +52,8 @@ class SlewCraft:
         limit: (3,) A m^2, of each coil.
         weights: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
         residual: (3,) A m^2, the residual dipole of the satellite.
-        torque, air, light: (3,) N m, sizes of the disturbance torques: constant, by air, by sunlight.
+        torque, air, light: (3,) N m, sizes of the constant disturbance torque, of the torque by air, and of
+            that by sunlight.
     """
 
     inertia: FloatArray
@@ -74,7 +76,7 @@ class SlewEnvironment:
     Attributes:
         field: (n, 3) T.
         position: (n, 3) m.
-        pressures: of air and sunlight; None for neither.
+        pressures: pressures of air and sunlight; None without torques by air and sunlight.
     """
 
     field: FloatArray
@@ -88,7 +90,7 @@ class SlewEnvironment:
         return SlewEnvironment(self.field[which], self.position[which], pressed)
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
-        """Return the directions (n, 3) of the position, and 3 mu / r^3 (n,) 1/s^2."""
+        """Return unit vectors (n, 3) of the position, and the gravity gradients 3 mu / r^3 (n,), 1/s^2."""
         radius = np.linalg.norm(self.position, axis=1)
         return self.position / radius[:, None], 3.0 * GRAVITATIONAL_PARAMETER / radius**3
 
@@ -100,7 +102,7 @@ EnvironmentAt = Callable[[FloatArray], SlewEnvironment]
 def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the body components A(q) v (n, 3).
 
-    Off the unit sphere they grow with |q|^2.
+    If q is not a unit quaternion, they are proportional to |q|^2.
     """
     v, s = q[:, :3], q[:, 3:]
     inner = np.sum(v * vector, axis=1, keepdims=True)
@@ -109,7 +111,7 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the second derivative (n, 4, 4) of pull . A(q) v by q, twice Davenport's matrix."""
+    """Return the second derivative (n, 4, 4) of pull. A(q) v by q, which is twice Davenport's matrix."""
     curvature = np.empty((len(pull), 4, 4))
     outer = pull[:, :, None] * vector[:, None, :]
     inner = np.sum(pull * vector, axis=1)
@@ -127,7 +129,7 @@ class SlewDynamics:
     """
 
     def __init__(self, craft: SlewCraft, scale: float, unit: float, around: SlewEnvironment) -> None:
-        """Store the environment at the n times; e is scaled with the strength of the gravity gradient."""
+        """Store the environment at the n times, with e scaled by the strength of the gravity gradient."""
         self._residual = craft.residual / unit
         down, strength = around.gradient()
         vectors = np.stack(
@@ -263,7 +265,7 @@ class HermiteCubic:
         return np.asarray(mean + (1.0 - s) * (1.0 - 3.0 * s) * out + s * (3.0 * s - 2.0) * into)
 
     def _parts(self, times: FloatArray) -> tuple[FloatArray, ...]:
-        """Return per time: share of its span, length of the span, start value, step, and both slopes."""
+        """Return for each time the fraction of its span, and the span's length, start value, step and slopes."""
         at = np.asarray(times, dtype=float)
         before = np.clip(np.searchsorted(self.times, at, side="right") - 1, 0, len(self.times) - 2)
         span = (self.times[before + 1] - self.times[before])[:, None]
@@ -346,14 +348,14 @@ class Cone:
 class ConeConstraints:
     """Exclusion cones at n times as inequalities g >= 0.
 
-    g is the cosine of the limit minus the cosine of the angle between axis and direction, a quadratic form of
-    the attitude.
+    The value g is the cosine of the limit minus the cosine of the angle between body axis and direction. It
+    is a quadratic form of the attitude.
     """
 
     def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
-        """Add `margin` rad to the cones at `times` (n,) s, for the path between the times.
+        """Widen the cones by `margin` at `times` (n,) s, because the path between these times is not checked.
 
-        The margin is a scalar or (cones, n).
+        The margin, in rad, is a scalar or (cones, n).
         """
         angles = np.array([cone.angle for cone in cones]).reshape(-1, 1) + margin
         self._limits = np.cos(np.clip(angles, 0.0, np.pi))
@@ -387,7 +389,7 @@ class AttitudeEnd:
     def misses(self) -> tuple[FloatArray, FloatArray]:
         """Return linear part (3, 4) and quadratic part (3, 4, 4) of the attitude error as a function of q.
 
-        The error is the vector part of q times the inverse of the target, half the sine of the error angle.
+        The error is the vector part of the product of q and the inverse of the target.
         """
         v, s = self.quaternion[:3], self.quaternion[3]
         linear = np.concatenate([s * np.eye(3) + cross_matrices(v[None])[0], -v[:, None]], axis=1)
@@ -495,11 +497,13 @@ def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float)
 
 
 NODES = 24
-"""Intervals of the dipole. The heat is within 0.1 % of that on 48, the shortest time within 0.6 %."""
+"""Number of intervals of the dipole. The heat is within 0.1 % of the result with 48 intervals, the shortest
+time within 0.6 %."""
 NODES_RANGE = (8, 96)
 HORIZON_RANGE = (1.0, 2e4)
 _DEEP, _STILL = math.radians(5.0), 1e-4
-"""Depth (rad) inside a cone, and rate (rad/s) below which a target is at rest among the stars."""
+"""Depth (rad) inside a cone above which an end is refused, and rate (rad/s) below which an end counts as
+inertially fixed."""
 MINIMUM_TIME = math.inf
 """Time cost at which only the duration counts."""
 
@@ -568,7 +572,8 @@ def check(task: SlewTask) -> None:
             raise PlanningError(
                 f"the start lies {inside:.1f} deg inside the exclusion cone of the {cone.name}"
             )
-        # The cones move by some degrees during a slew. For an end deep inside no other horizon helps.
+        # The cones move by some degrees during a slew.
+        # An end deep inside a cone is inside it for every horizon.
         if isinstance(end, AttitudeEnd) and float(np.abs(end.rate).max()) < _STILL:
             clearance = cone.clearance(end.quaternion[None], np.array([task.horizon]))
             if float(clearance[0]) >= -_DEEP:

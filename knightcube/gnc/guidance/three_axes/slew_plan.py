@@ -1,11 +1,12 @@
 """The planner of three-axis slews with coils alone: minimum energy, minimum time, or a time cost.
 
-Only torques normal to the field exist, so a path is planned together with its dipoles: collocation of the
-whole motion and an interior point method (`slew_program`), from several initial guesses (`slew_search`). The
-path found is then corrected until an integrator reaches the same end. Collocation on 24 intervals solves the
-motion to some thousandths of a degree. Each interval is integrated in small steps from its first node, and
-its miss of the next node is removed with the factors of the last Newton step: multiple shooting by a chord
-method. Energy is the integral of the coils' heat, J. The planner is pure and deterministic.
+Coils make only torques normal to the field, so that a path is planned together with its dipoles. The whole
+motion is discretised by collocation and solved by an interior point method (`slew_program`), from several
+initial guesses (`slew_search`). The path found is then corrected until an integrator reaches the same end.
+Collocation on 24 intervals solves the motion to some thousandths of a degree. Each interval is integrated in
+small steps from its first node. The difference from the next node is removed with the factors of the last
+Newton step (multiple shooting by a chord method). Energy is the integral of the coils' heat, J. The planner
+is pure and deterministic.
 
 `plan_order` plans a slew in orbit from one pointing target to another that starts within a window. The energy
 of a slew depends on the direction of the field during the slew, by a factor of ten along an orbit. Coarse
@@ -70,7 +71,7 @@ closed and above which it cannot be closed."""
 def closed(
     craft: SlewCraft, unit: float, along: EnvironmentAt, program: SlewProgram, point: Iterate
 ) -> Trajectory:
-    """Return the trajectory near a solved `point` whose dipoles, integrated, lead through its states.
+    """Return the trajectory near a solved `point` whose integration gives the states of its nodes.
 
     `unit` A m^2 is the unit of the dipoles; `along` gives the environment. Raises PlanningError if the
     equations at the point are singular or the corrections do not converge.
@@ -116,17 +117,18 @@ def _integrated(motions: list[SlewDynamics], at: Trajectory, length: float) -> t
 
 
 _DENSE = 16
-"""Number of points between two of a path's nodes and midpoints where cones are checked."""
+"""Number of points at which cones are checked between two neighbouring nodes or midpoints of a path."""
 _ROOM = math.radians(0.005)
-"""Margin (rad) to a cone at those points; between them a path comes closer by less."""
+"""Margin (rad) to a cone at the checked points. Between two checked points, a path comes closer by less than
+this margin."""
 
 _OVER = 1.001
-"""Largest ratio of the flown dipoles to their limit."""
+"""Largest ratio of the flown dipoles to their limit in an accepted path."""
 _ASTRAY = 1.05
 """Assumed ratio of dipole to limit for a path along which the integration fails."""
 
 _ENDS = 9
-"""Number of horizons of a failed slew at whose ends cones are checked, for the message."""
+"""Number of horizons at whose ends cones are checked for the message about a slew without a path."""
 
 
 class SlewStatus(StrEnum):
@@ -145,7 +147,7 @@ class SlewPlan:
         status: whether the requested horizon was kept.
         horizon_asked, horizon: s.
         energy: J, heat of the coils.
-        peak: the largest dipole over its limit.
+        peak: largest ratio of a dipole to its limit.
         clearance: rad, smallest distance outside each cone, in the order of the task's cones.
         steps: Newton steps over all guesses.
     """
@@ -251,9 +253,9 @@ def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return the clearance (cones, 2 nodes) rad that a path lacks between each two points.
+    """Return the clearance (cones, 2 nodes), rad, that a path lacks between each two neighbouring points.
 
-    The required clearance is `_ROOM`, or that of the start or the end if smaller.
+    The required clearance is `_ROOM`, or the clearance of the start or of the end if that is smaller.
     """
     clear = _clearances(task, path)
     room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
@@ -266,9 +268,9 @@ LEAD = 2.0 * DIFFERENCE
 WINDOW_RANGE = (0.0, 2e4)
 """Range of a window, s."""
 _BEGINS = 12
-"""Number of parts of a window between which slews are started."""
+"""Number of equal parts into which a window is divided by the compared start times."""
 _COARSE = 12
-"""Intervals of the coarse slews by which start times are compared."""
+"""Number of collocation intervals of the coarse slews with which start times are compared."""
 _NO_ROLL: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -1,19 +1,21 @@
 """A slew as a nonlinear program: collocation of the motion, and a primal-dual interior point method.
 
-The equations are Hermite-Simpson collocation in its separated form, of the fourth order (Betts, Practical
-Methods for Optimal Control, 2010, 4.5). The dipole is linear on each interval, so that it keeps a limit
-everywhere if it keeps the limit at the nodes. States stand at nodes and midpoints.
+The motion is discretised by Hermite-Simpson collocation in its separated form, of fourth order (Betts,
+Practical Methods for Optimal Control, 2010, 4.5). The dipole is linear on each interval, so that it is within
+its limits at all times if it is within them at the nodes. The states are unknowns at nodes and midpoints.
 
-Each interval has the state (7) and the dipole (3) of its first node, the equation of its midpoint (7), the
-state of the midpoint (7) and the equation of its end (7). The equations of the start precede all intervals,
-those of the end follow them. Each equation thus involves its neighbours only, and LAPACK factors the band
-matrix. LAPACK is imported where it is used, because the control process names the job but does not run it.
+The vector of unknowns and multipliers has 31 elements per interval: the state (7) and the dipole (3) of the
+first node, the multipliers of the midpoint's equations (7), the state of the midpoint (7) and the multipliers
+of the equations at the end of the interval (7). The elements of the start conditions precede all intervals,
+and those of the end conditions follow them. Each equation involves only neighbouring elements, so that the
+matrix is banded, and LAPACK factors it. The functions that use LAPACK import it, because the control process
+imports the job but does not run it.
 
 The limits, as inequalities g >= 0, form one vector: the lower and upper limits of the dipoles (2, k + 1, 3),
 then the cones (cones, 2 k). The interior point method is that of Wachter and Biegler, Math. Program. 106
 (2006), with the curvature test of Chiang and Zavala (Math. Program. 2016) instead of a count of eigenvalues,
-and with second-order corrections. Without limits it is Newton's method. Far from a feasible point the
-curvature of the equations is omitted (Gauss-Newton), because it misleads the steps there.
+and with second-order corrections. Without limits, the method is Newton's method. Far from a feasible point,
+the curvature of the equations is omitted (Gauss-Newton), because it would lead to bad steps.
 """
 
 from __future__ import annotations
@@ -35,18 +37,19 @@ from knightcube.gnc.guidance.three_axes.slew_model import (
 )
 
 STEP = 31
-"""Unknowns of one interval."""
+"""Number of unknowns and multipliers of one interval."""
 WIDE = STEP + 10
-"""Unknowns in the equations of one interval: its own, and those of the next node."""
+"""Number of elements in the equations of one interval, including the state and the dipole of the next
+node."""
 EQUATIONS: IntArray = np.r_[10:17, 24:31]
-"""Indices of the equations of an interval among its unknowns."""
+"""Positions of an interval's 14 equation multipliers among its 31 unknowns and multipliers."""
 _BAND = 33
 _ROWS = 3 * _BAND + 1  # LAPACK's, with room for the pivots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BandLayout:
-    """The indices of the unknowns of a slew in the band matrix.
+    """Positions of states, dipoles and equations of a slew in the vector of unknowns and in the band matrix.
 
     Attributes:
         states: (2 k + 1, 7) at nodes and midpoints.
@@ -54,8 +57,9 @@ class BandLayout:
         equations: (k, 14).
         start: (7,).
         end: (ends,).
-        begins: (k + 1,) the first unknown of each interval, and of the last node.
-        places, entries: indices of the band filled by the blocks of the intervals, and of the block entries.
+        begins: (k + 1,) first element of each interval and of the last node.
+        places, entries: indices of the elements of the band that the intervals fill, and of the block
+            elements that fill them.
     """
 
     states: IntArray
@@ -73,11 +77,11 @@ class BandLayout:
         return int(self.end[-1]) + 1
 
     def band(self, blocks: FloatArray, tail: FloatArray) -> FloatArray:
-        """Return the band of the `blocks` (k, WIDE, WIDE) of the intervals and of the `tail`; modifies both.
+        """Return the band matrix of the interval `blocks` (k, WIDE, WIDE) and the `tail`, and modify both.
 
-        The tail holds the state and the dipole of the last node, and the equations of the end.
+        The tail contains the state and the dipole of the last node, and the equations of the end.
         """
-        # The block of the node shared by two intervals belongs to the second.
+        # The block of a node shared by two intervals is added to that of the second interval.
         blocks[1:, :10, :10] += blocks[:-1, STEP:, STEP:]
         tail[:10, :10] += blocks[-1, STEP:, STEP:]
         filled = np.zeros(self.size * _ROWS)
@@ -244,10 +248,10 @@ class Transcription:
         return LinearisedEquations(at, *self.remainders(at), jacobian, ending)
 
     def slope(self, linear: LinearisedEquations, multipliers: FloatArray) -> FloatArray:
-        """Return the derivative (size,) of the Lagrangian, and the residuals at the equations' indices.
+        """Return the derivative (size,) of the Lagrangian, with the residuals at the equations' positions.
 
-        The Lagrangian is the cost plus `multipliers` (size,) times the equations; only the multipliers at the
-        indices of the equations count.
+        The Lagrangian is the cost plus the `multipliers` times the equations. `multipliers` (size,) is read
+        only at the positions of the equations.
         """
         at, layout = linear.at, self.layout
         result = np.zeros(layout.size)
@@ -275,8 +279,8 @@ class Transcription:
     ) -> FloatArray:
         """Return the band matrix of the derivatives of `slope`.
 
-        `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are added to the curvature by states and by
-        dipoles: the parts of the barriers and of the convexification.
+        `state_part` (2 k + 1, 7, 7) and `dipole_part` (k + 1, 3) are added to the second derivatives by
+        states and by dipoles. They come from the barriers and from the convexification.
         """
         h = self._step
         bend = self._bend(linear, multipliers[self.layout.equations])
@@ -314,14 +318,17 @@ class Transcription:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlewLimits:
-    """The limits; `dipole` (3,) is in the unit of the motion, None for a slew without a dipole limit."""
+    """The dipole limits and the exclusion cones of a slew.
+
+    `dipole` (3,) is in the unit of the motion, None for a slew without a dipole limit.
+    """
 
     equations: Transcription
     dipole: FloatArray | None
     cones: ConeConstraints
 
     def values(self, at: Trajectory) -> FloatArray:
-        """Return the values g of all limits, which are negative where a limit is exceeded."""
+        """Return the values g of all limits. A negative value is a violated limit."""
         found: list[FloatArray] = [np.zeros(0)]
         if self.dipole is not None:
             found += [(at.dipoles + self.dipole).ravel(), (self.dipole - at.dipoles).ravel()]
@@ -353,9 +360,10 @@ class SlewLimits:
         return np.concatenate(found)
 
     def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the curvature added by the limits, by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
+        """Return second derivatives due to limits, by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
 
-        `stiff` weights the squares of the derivatives, `bent` the curvature of the limits.
+        `stiff` are the weights of the squared first derivatives of the limits, `bent` those of their second
+        derivatives.
         """
         dipoles, cones = self._parts(stiff, at)
         _, weights = self._parts(bent, at)
@@ -378,13 +386,14 @@ _TOLERANCE = 1e-6
 _TO_BOUNDARY = 0.995
 _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
-"""Number of halvings that are corrected, and corrections of each."""
+"""Number of step halvings with a second-order correction, and number of corrections per halving."""
 _HEAVIER = 1.2
 """Weight of the equations in the merit, as a multiple of the largest multiplier."""
 _FAR = 0.03
 """Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
-"""Least convexification per constraint violation (up to one): without it such a step is too long."""
+"""Minimum convexification per unit of constraint violation up to one, which prevents too long steps far from
+a feasible point."""
 _CONVEX = 1e-3, 1e4
 FIRST_BARRIER = 1e-3
 
@@ -397,7 +406,8 @@ class Iterate:
         linear: the equations linearised about its trajectory.
         multipliers: (size,) of the equations, at their indices.
         slack, dual: of every limit.
-        slope: (size,) of the Lagrangian without the part of the limits, with the residuals of the equations.
+        slope: (size,) derivative of the Lagrangian without the limits, with the residuals of the equations at
+            their positions.
     """
 
     linear: LinearisedEquations
@@ -438,8 +448,8 @@ class SlewProgram:
     def factors(self, point: Iterate) -> Factors:
         """Return the factors for the smallest change that reduces the residuals. Raises PlanningError.
 
-        They omit the curvature of the equations: with it a step to the other side of a flat optimum would
-        also be small.
+        The matrix omits the curvature of the equations. With the curvature, a step to the other side of a
+        flat optimum would also be small.
         """
         states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
         stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
@@ -452,7 +462,7 @@ class SlewProgram:
         return self._point(guess, multipliers, slack, barrier / slack)
 
     def lack(self, point: Iterate) -> tuple[float, float]:
-        """Return the sum of the constraint violations, and that of the residuals of the slacks."""
+        """Return the sum of the constraint violations and the sum of the residuals of the slacks."""
         off = self._limits.values(point.at) - point.slack
         return float(np.abs(point.slope[self._equal]).sum()), float(np.abs(off).sum())
 
@@ -498,7 +508,7 @@ class SlewProgram:
         limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
-        # The duals of the limits after a step of zero length.
+        # The duals of the limits for a step of zero length.
         toward = barrier / point.slack - stiff * off
         right = limits.pull(at, toward) - point.slope
         factors = Factors(band)
@@ -524,7 +534,8 @@ class SlewProgram:
             change = size * step.change
             for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
                 if correction:
-                    # Second-order correction: residuals by curvature are removed by the same factors.
+                    # The second-order correction removes the residuals due to curvature with the factors of
+                    # the Newton matrix.
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)
@@ -579,19 +590,19 @@ class NewtonRun:
 
     @property
     def lack(self) -> float:
-        """Constraint violation; zero once the barrier parameter has begun to fall."""
+        """The constraint violation, or zero after the barrier parameter has begun to decrease."""
         return 0.0 if 0.0 < self._barrier < self._first else self.missed
 
     @property
     def missed(self) -> float:
-        """Constraint violation."""
+        """The constraint violation at the newest iterate."""
         return sum(self.program.lack(self.point))
 
     def run(self, maximum: int) -> Iterate | None:
         """Return the optimum found within `maximum` more steps; None if none was found."""
         if self.is_over:
             return None
-        with np.errstate(over="ignore", invalid="ignore"):  # a step too long is shortened
+            # with np.errstate(over="ignore", invalid="ignore"): an overflow leads to a shorter step
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:

@@ -1,16 +1,16 @@
-"""The search for the path of a slew: guesses on a coarse grid, then paths within the limits, then refined.
+"""The search for the path of a slew: guesses on a coarse grid, paths within the limits, and refinement.
 
 Initial guesses are curves of the angular momentum. Coils make no torque along the field, so the derivative of
 the inertial momentum is normal to the field everywhere. This condition is linear: the momenta that reach the
-end are a fixed curve plus any sum of modes. The attitude follows from the momentum. A curve that ends in the
-target, keeps the cones and needs little heat has about a dozen unknowns and is found by least squares from
-many random starts at once. The gravity gradient and other torques are left to the planner. The random starts
-are the same in every call.
+end are a fixed curve plus any sum of modes. The attitude follows from the momentum. A curve that ends at the
+target, stays outside the cones and needs little heat has about a dozen unknowns. It is found by least squares
+from many random starts at once. The gravity gradient and other torques are left to the planner. The random
+starts are the same in every call.
 
 Without the dipole limit, a path that keeps the cones is found from most guesses in a dozen Newton steps. Its
 heat is a lower bound of the heat within the limit. A guess with large constraint violations after some steps
-is deferred, because most of these never converge. If the requested horizon does not suffice, or none of its
-guesses leads to a path, a longer slew is shortened by continuation.
+is deferred, because most such guesses never converge. If no path over the requested horizon is found, a
+longer slew is shortened by continuation.
 """
 
 from __future__ import annotations
@@ -51,15 +51,16 @@ from knightcube.gnc.guidance.three_axes.slew_program import (
 )
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
-"""Last barrier parameters: of a warm start, and of a path that is flown."""
+"""Last barrier parameters of a path for a warm start, and of a path that is flown."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Constraint violations below which an iterate is accepted before it is an optimum: as a warm start, and as a
-path to fly. Many runs converge slowly. The closing removes the residuals."""
+"""Constraint violations below which an iterate is accepted before it is optimal, as a warm start and as a
+path to fly. Many runs converge slowly. The final integration of the path removes the residuals."""
 _STEPS_FREE = 25
-"""Newton steps for a path without the dipole limit."""
+"""Maximum number of Newton steps for a path without the dipole limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
-"""Newton steps within the limits, in stages, and the violation after each stage beyond which the run is
-abandoned. Half of the runs that fail exceed the first bound, one in twenty of the others does."""
+"""Stages of a run within the limits: Newton steps, and the constraint violation after the stage above which
+the run is abandoned. Half of the failing runs exceed the first bound, but only one in twenty of the
+successful runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +109,7 @@ class SlewSolver:
         return equations.cost(found.at) * equations.scale * power / float(equations.weights @ self._limit**2)
 
     def peak(self, found: SolvedPath) -> float:
-        """Return the largest dipole of a path over its limit."""
+        """Return the largest ratio of a path's dipole to its limit."""
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: SolvedPath) -> bool:
@@ -161,7 +162,7 @@ class SlewSolver:
         multipliers: FloatArray | None,
         barriers: tuple[float, float],
     ) -> SolvedPath | None:
-        """Return the path within all limits from a trajectory; barriers fall from first to last."""
+        """Return the path within all limits from a trajectory, with barrier parameters from first to last."""
         limits = SlewLimits(equations, self.share * self._limit, self.kept(equations))
         descent = NewtonRun(SlewProgram(equations, limits), at, multipliers, *barriers)
         found = None
@@ -177,7 +178,7 @@ class SlewSolver:
     def found(self, descent: NewtonRun, maximum: int, enough: float = 0.0) -> SolvedPath | None:
         """Return the path found within `maximum` more steps; None if there is none.
 
-        An iterate whose constraint violation is less than `enough` is accepted although it is not an optimum.
+        An iterate whose constraint violation is below `enough` is accepted before it is optimal.
         """
         program, before = descent.program, descent.program.steps
         point = descent.run(maximum)
@@ -198,7 +199,7 @@ class SlewSolver:
 def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
     """Return a path transferred to the grid and the horizon of other equations.
 
-    A path slower by a ratio takes dipoles smaller by the square of the ratio.
+    The dipoles are scaled by the inverse square of the ratio of the horizons.
     """
     at, own = start.at, start.equations
     dipoles = at.dipoles * (own.scale / equations.scale) ** 2
@@ -212,23 +213,26 @@ def transferred(start: SolvedPath, equations: Transcription) -> Trajectory:
 
 
 _BEGINS, _SPREAD = 24, 0.4
-"""Number of random starts, and their standard deviation in torques of half a rotation."""
+"""Number of random starts, and their standard deviation in units of the torque of half a rotation."""
 _COSINES = 6
-"""Number of cosines of the torque in time, for each of three axes."""
+"""Number of cosine terms of the torque as a function of time, per axis."""
 _ROUNDS = 12
 _END, _CONE, _HEAT = 4.0, 2.0, 0.05
-"""Weights of the end error (rad), of the cosine inside a cone, and of the torque of half a rotation."""
+"""Weights of the end error (rad), of the depth inside a cone (as a cosine), and of the torque in units of
+half a rotation."""
 _ROOM = 0.03
 """Margin of a guess to a cone, as a cosine."""
 _DAMPED = 1.0
 _LONGEST_STEP = 4.0
-"""Longest step, in torques of half a rotation."""
+"""Largest step of the fit, in units of the torque of half a rotation."""
 _WEAK, _WEAK_END = 1e-3, 0.03
-"""Relative heat of modes, and relative gain of momentum directions, below which they are discarded."""
+"""Relative heat below which a mode is discarded, and relative gain below which a direction of the momentum is
+discarded."""
 _MISSED, _INSIDE_CONE = 0.1, 0.02
-"""End error (rad) and cosine inside a cone beyond which a guess is ordered after the others."""
+"""End error (rad) and depth inside a cone (as a cosine) above which a guess is tried after the other
+guesses."""
 _SAME = 0.1
-"""Relative difference below which two curves are the same."""
+"""Relative difference below which two momentum curves count as the same."""
 
 
 def guesses(
@@ -248,7 +252,7 @@ def guesses(
     fit = _MomentumFit(curves, craft, start, end, kept, scale)
     found = []
     for states in fit.found():
-        # The smallest dipoles for the component of the states' torque normal to the field.
+        # The dipoles are the smallest ones that make the required torque's component normal to the field.
         still = motion.flow(states, np.zeros((len(states), 3)))
         wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
         field = motion.field(states[:, :4])
@@ -259,11 +263,11 @@ def guesses(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MomentumCurves:
-    """Momenta at n times, kg m^2/s, ICRS.
+    """Curves of the angular momentum at n times, kg m^2/s, ICRS axes.
 
     Attributes:
-        base: (n, 3), a curve that reaches the end.
-        modes: (d, n, 3), in torques of half a rotation.
+        base: (n, 3) a curve that reaches the end of the slew.
+        modes: (d, n, 3) changes of the curve that keep its ends, in units of the torque of half a rotation.
     """
 
     base: FloatArray
@@ -305,7 +309,7 @@ def _momentum(craft: SlewCraft, q: FloatArray, rate: FloatArray) -> FloatArray:
 
 
 class _MomentumFit:
-    """Levenberg-Marquardt least squares of many sums of the modes at once."""
+    """A least-squares fit (Levenberg-Marquardt) of the mode amplitudes of many random starts at once."""
 
     def __init__(
         self,
@@ -397,23 +401,23 @@ def _unit(q: FloatArray) -> FloatArray:
 
 
 ENOUGH = 3
-"""Number of relaxed paths from which the best is taken."""
+"""Number of paths without the dipole limit from which the best one is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Factors on a horizon that does not suffice."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratios of successive horizons in the continuation to a shorter one, the first and the last: on the coarse
-grid, on the fine grid, and on the fine grid if the slew is only to be stretched."""
+"""First and last ratio of successive horizons in the continuation to a shorter horizon. The three pairs are
+for the coarse grid, for the fine grid, and for the fine grid of a slew that is only stretched."""
 _CROSSED = 1.3
-"""Factor on the depth of a path inside a cone between the points, by which the cone is widened there."""
+"""Ratio of the widening of a cone to the depth of a path inside this cone between two points."""
 _BEYOND = math.radians(0.02)
 """Additional widening of a cone, rad."""
 _BETWEEN = 16
 """Intervals of the intermediate grid, for paths that do not converge from the coarse to the fine grid."""
 _LOST, _EASED_STEP = 1.5, 1.03
-"""Ratio of the flown dipole to its limit beyond which a path is abandoned, and the factor on the horizon of a
-path beyond the limit."""
+"""Ratio of the flown dipole to its limit above which a path is abandoned, and factor by which the horizon of
+another path above the limit is lengthened."""
 _PEAK = 0.9
-"""Ratio of the dipole to its limit at which the continuation begins."""
+"""Ratio of the largest dipole to its limit at the horizon at which the continuation begins."""
 
 
 class HorizonContinuation:
@@ -422,10 +426,10 @@ class HorizonContinuation:
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
         """Start no further continuation step after `budget` of work."""
         self._task, self._solver, self._budget = task, solver, budget
-        self._lost: set[tuple[float, float, float]] = set()  # coarse paths without a fine one
+        # self._lost: set[tuple[float, float, float]] = set() coarse paths without a path on the fine grid
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
-        """Return the path within the limits on the fine grid, from a coarse path found without them."""
+        """Return the path within the limits on the fine grid, from a coarse path found without limits."""
         solver, nodes, time = self._solver, self._task.nodes, start.horizon
         if solver.is_kept(start):
             equations = solver.equations(time, nodes)
@@ -436,10 +440,10 @@ class HorizonContinuation:
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
     def shortened(self, relaxed: list[SolvedPath], shortest: float, time_cost: float) -> SolvedPath | None:
-        """Return the best path found by shortening the horizon as long as `time_cost` W makes that cheaper.
+        """Return the best path found by shortening the horizon as long as this reduces energy plus time cost.
 
-        Continuation starts where a relaxed path just keeps the dipole limit, with the path that needs the
-        least time for that.
+        The continuation starts from the relaxed path that needs the shortest horizon to keep the dipole
+        limit, at this horizon.
         """
         best: SolvedPath | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
@@ -483,8 +487,8 @@ class HorizonContinuation:
     def eased(self, found: SolvedPath, peak: float) -> SolvedPath | None:
         """Return a path near one whose flown dipoles are `peak` times their limit; None if there is none.
 
-        The path uses a smaller share of the limit. If no such path exists or the horizon is free, it takes
-        longer.
+        The new path uses a smaller share of the dipole limit. If no such path exists or the horizon is free,
+        the new path has a longer horizon.
         """
         task, solver, time = self._task, self._solver, found.horizon
         if peak > _LOST:
@@ -563,23 +567,23 @@ class HorizonContinuation:
 
 
 GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
-"""Intervals and budget of the successive searches. The budget is the work, Newton steps times intervals,
-after which no further guess is tried. A thousand take about a tenth of a second. On ten intervals, paths
-around cones differ too much from those on the fine grid."""
+"""Number of intervals and budget of each successive search. The budget is the work, Newton steps times
+intervals, after which no further guess is tried. A work of 1,000 takes about 0.1 s. On ten intervals, paths
+around cones differ too much from paths on the fine grid."""
 _WALKS = 1.8
-"""Factor on the budget of a search, after which continuation ends with the best path so far."""
+"""Work, relative to the budget of a search, after which the continuation ends with the best path so far."""
 _MAXIMUM_TRIED = 16
 """Largest number of guesses over one horizon."""
 _LOOK = 8
-"""Newton steps of every guess before its violation is judged."""
+"""Number of Newton steps of every guess before its constraint violation is compared with the limit."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
-"""Further Newton steps of a guess, in stages, and the violation above which it is deferred instead. Four of
-five guesses that lead to a path have a violation below 1.5 after eight steps, three of four that do not have
-more (320 guesses, seed 41 of the bench `orbit_slews`)."""
+"""Further stages of a guess: Newton steps, and the constraint violation before the stage above which the
+guess is deferred. After eight steps, four of five successful guesses have a violation below 1.5, and three of
+four unsuccessful guesses have a larger one (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _STEPS_WITHOUT_PATH = 120
 """Newton steps without a path after which the other guesses over a horizon are deferred."""
 _WIDENED = 4
-"""Largest number of times that cones are widened or dipoles reduced for one path."""
+"""Maximum number of times that cones are widened or dipoles reduced for one path."""
 
 
 class SlewSearch:
@@ -634,7 +638,7 @@ class SlewSearch:
     def _rungs(self) -> Iterator[Iterator[list[SolvedPath]]]:
         """Yield relaxed paths over the requested horizon, over longer ones, and from deferred guesses.
 
-        The longer a slew, the more the field rotates during it, and the closer a guess is to a path.
+        Longer slews converge more often, because the field rotates more during the slew.
         """
         deferred: list[NewtonRun] = []
         for longer in LONGER:
