@@ -1,31 +1,33 @@
-"""Detumbling of a free satellite by its magnetometer, with gyro and attitude where they are known.
+"""Detumbling of a free satellite with its magnetometer, and with gyro and attitude if they are known.
 
-The field of the coils swamps the magnetometer, so the coils pause: off to settle, off to measure, then on.
-From the samples of the pauses a filter estimates the full body rate and the rotation of the field among the
-stars (`knightcube.gnc.estimation.field_rate`). A gyro gives the rate along the field at once. The momentum
-plan uses the field expected ahead: that of the orbit if the attitude is known, else the measured field,
-rotated at its present speed. Unlike B-dot, the law cannot get stuck with the spin along the field: the plan
-holds the momentum along the field until the field has rotated. A single sample starts nothing. The coils stay
-off until `TRUSTED` samples in a row agree with the prediction of the filter and the standard deviation of the
-rate across the field is below `BOUNDED`; until then no pause is needed. They wait again if no sample was
-accepted for `SILENT_PERIODS` periods, because a restarted sensor may deliver fields of which none is usable.
+The field of the coils disturbs the magnetometer. The coils are therefore switched off periodically, first to
+let the field settle, then to measure it. From the samples of the pauses a filter estimates the full body rate
+and the rotation of the field among the stars (`knightcube.gnc.estimation.field_rate`). A gyro gives the rate
+along the field at once. The momentum plan uses the field expected ahead: that of the orbit if the attitude is
+known, else the measured field, rotated at its present speed. In contrast to B-dot control, a spin along the
+field is removed too: the plan waits until the field has rotated. The coils stay off until `TRUSTED` samples
+in a row agree with the prediction of the filter and the standard deviation of the rate across the field is
+below `BOUNDED`; until then no pause is needed. The coils are switched off again if no sample was accepted for
+`SILENT_PERIODS` periods, because all fields of a restarted sensor may be unusable.
 
-The momentum plan stops the body in the least time with the predicted field. In inertial axes the angular
-momentum obeys h' = m x B, without the body's inertia and attitude. By Pontryagin's principle the dipole of
-least time has the length L of its limit and the direction of -B x y with one constant vector y. A time T
-suffices for all but a rest r of the momentum exactly if, for every y,
+The momentum plan stops the body in the minimum time with the predicted field. In inertial axes the angular
+momentum obeys h' = m x B, without the body's inertia and attitude. By Pontryagin's principle, the dipole of
+minimum time has the maximum strength L and the direction of -B x y, with one constant vector y. A time T
+suffices to reduce the momentum to at most r exactly if, for every y,
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-so T is the least time at which the worst y satisfies it, and that y is the plan. The worst y has A(y) y along
-h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that
-equation (iteratively reweighted least squares). A field that keeps its direction cannot remove the momentum
-along itself: the plan then adds momentum across it, which the rotation of the field converts. Without a rest,
-the last momentum along a slowly rotating field would take all of the time.
+The minimum time is the smallest T at which the worst y satisfies this inequality, and this y is the plan. For
+the worst y, A(y) y is parallel to h, where A is the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|. It
+is found by iteration of this equation (iteratively reweighted least squares). A field of constant direction
+cannot remove the momentum along itself. The plan then adds momentum across the field, which the later
+rotation of the field makes removable. The plan leaves a residual momentum r, because removing the last
+momentum along a slowly rotating field would take most of the time.
 
-In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
-that: at the bound no dipole is commanded that makes the body faster. A bound at the initial rate costs time,
-because such a spin is then stopped only after the field has rotated by a right angle.
+The minimum-time plan first accelerates a body that spins along the field, about an axis across the field.
+`gentle` and `spin_up` bound the rate: at the bound, no dipole is commanded that increases the rate. A bound
+at the initial rate takes more time, because such a spin is then stopped only after the field has rotated by a
+right angle.
 """
 
 from __future__ import annotations
@@ -44,14 +46,15 @@ from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSetti
 
 ITERATIONS = 12
 LIMIT_GAIN = 1.4
-"""Mean strength of three coils over the limit of one, in a rotating body; if all were saturated, 1.5."""
+"""Mean strength of the dipole of three coils in a rotating body, relative to the limit of one coil. If all
+coils were saturated, it would be 1.5."""
 STEEP = 12.0
-"""Multiple of the mean of |B x y| at which a coil reaches its limit. The least time saturates all coils, but
-noise in B would switch them where B x y is small."""
+"""Ratio of |B x y| to its mean at which a coil reaches its limit. The minimum-time plan saturates all coils,
+but noise in B would then switch the coils back and forth if B x y is small."""
 FLAT = 0.02
 """Floor of |B x y| relative to its largest value, which keeps the weights finite."""
 FINENESS = 60
-"""The horizon is found to within one part in this number."""
+"""Number of steps in which the horizon of a plan is searched."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,8 +77,9 @@ def momentum_plan(
     """Return the plan that removes `momentum` (3,) N m s except `rest` N m s in the least time.
 
     `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the inertial axes of the
-    momentum; `limit` A m^2 is of each coil. If all times do not suffice, the plan removes as much as possible
-    and its horizon is their span. Raises UsageError for a field of fewer than three instants.
+    momentum, and `limit` is the limit of each coil in A m^2. If the span of the times does not suffice, the
+    plan removes as much momentum as possible, and its horizon is this span. Raises UsageError for a field of
+    fewer than three instants.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
@@ -102,7 +106,7 @@ def momentum_plan(
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
     """Return the dipole (3,) A m^2 of a plan in a field (3,) T, body axes, each coil clipped at `limit`.
 
-    Clipping one coil does not affect the others, because each coil removes momentum by itself.
+    Each coil is clipped separately, because each coil removes momentum independently of the others.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
 
@@ -112,9 +116,11 @@ def without_speed_up(
 ) -> FloatArray:
     """Return the dipole (3,) without the part whose torque makes a body faster.
 
-    `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No coil gets more than the largest had.
+    `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No component exceeds the largest component
+    of the given dipole.
     """
-    grows = cross_product(field, inverse @ rate)  # of |rate|^2 / 2 by A m^2
+    # The derivative of d(|rate|^2 / 2)/dt by the dipole.
+    grows = cross_product(field, inverse @ rate)
     gained, square = float(dipole @ grows), float(grows @ grows)
     if gained <= 0.0 or square == 0.0:
         return dipole
@@ -147,9 +153,10 @@ def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     wanted = field / math.sqrt(float(field @ field))
     middle = first + wanted
     square = float(middle @ middle)
-    if square < 1.0:  # more than 120 deg: such a prediction is not corrected
+    if square < 1.0:  # more than 120 deg: the prediction is not corrected
         return fields
-    # Two reflections: across the middle, which swaps the two, and back across `wanted`.
+    # The rotation is the product of two half turns, about the middle of both directions and about the final
+    # one.
     halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
     back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
     return np.asarray(fields @ (back @ halves).T)
@@ -161,9 +168,9 @@ class _FieldPreview:
 
     Attributes:
         field: (n, 3) T.
-        effect: (n, 3, 3) on the momentum.
+        effect: (n, 3, 3) weighted matrices B^2 I - B B^T, whose sum is the effect on the momentum.
         reach: A m^2, strength of the dipole.
-        rest: N m s, momentum that may remain.
+        rest: N m s, residual momentum of the plan.
     """
 
     field: FloatArray
@@ -172,19 +179,19 @@ class _FieldPreview:
     rest: float
 
     def across(self, y: FloatArray, count: int) -> FloatArray:
-        """Return |B x y| (count,), bounded away from zero."""
+        """Return |B x y| at the first `count` instants, with a positive lower bound."""
         found = np.cross(self.field[:count], y)
         across = np.sqrt(np.einsum("ni,ni->n", found, found))
         strength = math.sqrt(float(self.field[0] @ self.field[0]))
         return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
 
     def matrix(self, y: FloatArray, count: int) -> FloatArray:
-        """Return A(y) (3, 3) for `count` instants and a unit vector y."""
+        """Return A(y) (3, 3) of the module's docstring for `count` instants and a unit vector y."""
         weight = self.reach / self.across(y, count)
         return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
 
     def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
-        """Return the unit vector (3,) whose momentum takes longest to remove, for `count` instants."""
+        """Return the unit vector y (3,) for which the first `count` instants remove least of the momentum."""
         y = guess
         for _ in range(ITERATIONS):
             found = np.linalg.solve(self.matrix(y, count), momentum)
@@ -202,13 +209,15 @@ OLDEST_NS = 100_000_000
 """Largest age (ns) of a sample relative to the last command; its field is propagated with the body's rate."""
 INSTANTS = 150
 DENSER = 1.5
-"""Exponent of the spacing of the instants: of 1,500 s the first step is a second, the last 15."""
+"""Exponent of the spacing of the instants. In a horizon of 1,500 s, the first step is 1 s and the last step
+15 s."""
 LEFT = 0.7
-"""Fraction of a slow body's momentum that a plan may leave."""
+"""Residual momentum of a plan, as a fraction of the momentum of a slow body."""
 FEW, SOON = 4.0, 5.0
 """Momentum below FEW x LEFT, with at most LEFT along the field, is removed within SOON seconds."""
 KNOWN = 2e-3
-"""Standard deviation (rad/s) of the rate's worst axis below which the speed bound is set."""
+"""Standard deviation (rad/s) of the least certain component of the rate, below which the bound of the rate is
+set."""
 _SECOND = 1e-9
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
@@ -218,12 +227,12 @@ class FieldDetumblerSettings:
     """Settings of the field detumbler.
 
     Attributes:
-        limit: A m^2 of each coil.
-        horizon: s of field prediction; a quarter of an orbit.
-        replan: s, between plans.
-        gentle: rad/s; a body slower than this at the start is never made faster than its initial rate.
-        spin_up: multiple of its initial rate that a faster body may reach.
-        slow: rad/s; a body slower than this is detumbled.
+        limit: A m^2, dipole limit of each coil.
+        horizon: s, duration of the field prediction, a quarter of an orbit.
+        replan: s, time between plans.
+        gentle: rad/s, initial rate below which the detumbler never increases the rate above the initial rate.
+        spin_up: largest ratio of the rate to the initial rate, for initial rates above `gentle`.
+        slow: rad/s, rate below which a body counts as detumbled.
     """
 
     limit: float
@@ -247,7 +256,7 @@ class FieldDetumblerSettings:
 
 
 class FieldDetumbler:
-    """Runs the pauses: takes magnetometer samples and returns the dipole of each cycle, in order of time."""
+    """The detumbler: accepts magnetometer samples from coil pauses and computes the dipole of each cycle."""
 
     def __init__(
         self,
@@ -264,7 +273,7 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        # The residual momentum may lie along any axis.
+        # The residual momentum may lie along any axis, so that a mean moment of inertia is used.
         moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
         self._rest = LEFT * braking.slow * moment
         self.begin(0)
@@ -278,7 +287,7 @@ class FieldDetumbler:
         self._planned_rotation = _NO_DIPOLE
         self._agreed = 0
         self._bounded = False
-        self._driven_ns = now_ns  # until now another mode may have driven the coils
+        self._driven_ns = now_ns  # another mode may have driven the coils before
         self._accepted_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
@@ -322,7 +331,7 @@ class FieldDetumbler:
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is unknown."""
         schedule = self._schedule
-        if self._filter.started:  # before that, time passes from sample to sample
+        if self._filter.started:  # before the start, only samples advance the filter
             self._advance(max(now_ns, self._time_ns))
         if self.trusted and now_ns - self._accepted_ns > SILENT_PERIODS * schedule.period_ns:
             self._distrust()
@@ -333,7 +342,7 @@ class FieldDetumbler:
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
-        """Report a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        """Set the dipole (3,), A m^2, that acts instead of the commanded dipole until the next command."""
         if self._dipole.any() or dipole.any():
             self._driven_ns = self._commanded_ns
         self._dipole = dipole
@@ -362,11 +371,11 @@ class FieldDetumbler:
 
     @property
     def restarts(self) -> int:
-        """Number of filter restarts after contradicting samples, as by a spin too fast for the sampling."""
+        """Number of filter restarts after contradicting samples, which a fast spin may cause."""
         return self._filter.restarts
 
     def _distrust(self) -> None:
-        """Switch the coils off until samples agree."""
+        """Switch the coils off until enough magnetometer samples agree with the prediction of the filter."""
         self._agreed, self._bounded = 0, False
         self._plan = None
 

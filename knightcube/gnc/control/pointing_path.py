@@ -1,22 +1,22 @@
-"""The path of pointing: the optimal motion of a body from its attitude into its attitude law, by LQ sweeps.
+"""The optimal motion of a body from its attitude into its attitude law, by linear-quadratic sweeps.
 
 The errors x are the small rotation and the rate error of the body relative to a motion, in the motion's axes.
 With the field b(t) expected in these axes,
 
     turn' = rate - w_r x turn,    J rate' = ([J w_r x] - [w_r x] J) rate + G turn + m x b - f,
 
-where G is the stiffness of the gravity gradient and f the torque that the motion needs and that no other
-source provides. Riccati's equation is integrated backwards with its affine part s, cost-to-go
-x^T S x / 2 + s^T x (Psiaki 2001, J. Guid. Control Dyn. 24(2), with the preview added). The dipole is
-m = -(K x + k), held over a step. Each affine part has columns of its own, and k is linear in them. There may
-be controls besides the dipole.
+where G is the stiffness of the gravity gradient and f the torque that the motion requires in addition to the
+modelled torques. Riccati's equation is integrated backwards for the cost-to-go x^T S x / 2 + s^T x (Psiaki
+2001, J. Guid. Control Dyn. 24(2); the affine part s, a preview, is added here). The dipole m = -(K x + k) is
+held over a step. The affine parts are columns, one for each source, and k is linear in them. Other controls
+than the dipole are possible.
 
-The path minimises one criterion, rotation error relative to the law plus dipole, over the field and the
-torques expected, with the full motion of the body and the limit of its coils. It is found by iterative
+The path minimises the squared rotation error relative to the law plus the squared dipole, in the predicted
+field and torques. It obeys the full equations of motion and the limit of the coils. It is found by iterative
 linear-quadratic sweeps (Li & Todorov 2004, ICINCO; Tassa, Erez & Todorov 2012, IROS). Each iteration
-linearises about the last motion and simulates the result. Coils make no torque along the field, so motions
-that begin far off the law would tumble. The first sweeps therefore allow such a torque, at a cost that rises
-until the torque vanishes.
+linearises about the last motion and simulates the result. Coils make no torque along the field, so that
+motions starting far from the law would tumble. The first sweeps therefore allow a torque along the field, at
+a cost that is increased until the torque vanishes.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class LinearErrorModel:
         transition: (n, 6, 6).
         by_control: (n, 6, controls); from `linearised` per A m^2 of each coil.
         by_torque: (n, 6, 3), per N m.
-        missing: (n, 3) N m, f: the torque of the motion not provided by gravity.
+        missing: (n, 3) N m, the torque f of the module's docstring, which the modelled torques do not
+            provide.
         field: (n, 3) T in the motion's axes.
     """
 
@@ -99,8 +100,8 @@ def linearised(
     """Return the linear model of the errors about references.
 
     `field` (n, 3) T and `position` (n, 3) m are in ICRS axes. `dipole` (n, 3) A m^2 is held in body axes, so
-    that an error rotates the field that acts on it. Each of `pressed` is a constant vector (3,) of the body,
-    N m, and a direction (n, 3) in ICRS axes with which it makes a torque.
+    that an error rotates the field that acts on it. Each element of `pressed` is a constant vector (3,) of
+    the body, N m, and a direction (n, 3) in ICRS axes; their cross product is a torque.
     """
     rate, inverse = references.rate, np.linalg.inv(inertia)
     slopes, shown, up = acceleration_slopes(
@@ -194,40 +195,40 @@ def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
 
 
 RISES = (4.0, 2.0, 10.0)
-"""Factors between successive costs of a torque along the field, tried in turn until a path settles. They lead
-to different optima."""
+"""Ratios between successive costs of a torque along the field. They lead to different optima and are tried in
+turn until a path settles."""
 DEAR, PROHIBITIVE = 1e4, 1e6
-"""Costs of a torque along the field as multiples of the same torque across it: the end of the rise, and the
-last one."""
+"""Costs of a torque along the field, relative to the cost of the same torque across the field. DEAR ends the
+increase, and PROHIBITIVE is the cost of the last sweeps."""
 SETTLED = math.radians(20.0)
 """Largest angle (rad) from the law in the second half of a settled path."""
 SWEEPS = 8
 """Largest number of sweeps at one cost of a torque along the field. The best motion is flown, converged or
 not."""
 SAVED = (0.05, 2e-3)
-"""Relative saving below which a sweep is the last one at its cost of a torque along the field, and at the
-last such cost."""
+"""Relative improvement below which the sweeps at one cost of a torque along the field end. The second value
+is for the last cost."""
 NEAR = math.radians(10.0)
-"""Largest angle (rad) from the law of a motion that needs no torque along the field to start with."""
+"""Largest angle (rad) from the law of a motion whose first sweeps need no torque along the field."""
 EXCESS = 3e-5
-"""Excess (rad/s) over the largest rate that costs as much as the rotation that costs one."""
+"""Excess (rad/s) over the largest rate that has a cost of one."""
 SHARES = (1.0, 0.4, 0.15)
-"""Fractions of a sweep's change, tried in turn."""
+"""Fractions of the change by a sweep that are tried in turn."""
 RUN_AWAY = 100.0
 """Rate (rad/s) beyond which a diverging motion is not propagated further."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathConditions:
-    """The law and the predicted environment at the n + 1 instants of a path.
+    """The commanded motion and the predicted environment at the n + 1 instants of a path.
 
     Attributes:
-        wanted: the law.
+        wanted: motion that the attitude law commands.
         field, position: (n + 1, 3) T and m, ICRS.
-        pressures: shapes of the torques.
-        sizes: (9,) N m of the torques.
+        pressures: pressures of air and sunlight, with which the torques vary.
+        sizes: (9,) N m, sizes of the disturbance torques.
         inertia, inverse: (3, 3) kg m^2, and its inverse.
-        limit: A m^2 of each coil.
+        limit: A m^2, dipole limit of each coil.
     """
 
     wanted: AttitudeReferences
@@ -276,7 +277,7 @@ class PathConditions:
     ) -> FloatArray:
         """Return the acceleration (3,) at an attitude (4,) after instant k under a control (4,)."""
         seen = self.around[k] @ attitude_matrix(quaternion).T
-        # Plain floats: several times as fast as arrays of three.
+        # Python floats are several times as fast as arrays of three elements.
         (bx, by, bz), (px, py, pz), (ax, ay, az), (lx, ly, lz) = seen.tolist()
         mx, my, mz, along = control.tolist()
         wx, wy, wz = rate.tolist()
@@ -308,15 +309,15 @@ class PathConditions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathCriterion:
-    """The cost of a step.
+    """The terms of the cost of a step of a path.
 
     Attributes:
-        state: (6, 6), of rotation and rate errors relative to the law.
-        dipole: of each axis.
-        end: the cost-to-go of the law after the path. Its first column belongs to the law and the expected
-            torques, the others to each size of the torques.
-        shape: (n + 1, 3, sizes) of the torques in the law's axes.
-        fastest: rad/s; a faster rate has a high cost, `EXCESS`.
+        state: (6, 6) weights of rotation and rate errors relative to the law.
+        dipole: weight of the squared dipole of each axis.
+        end: cost-to-go of following the law after the path. The first column is for the law and the expected
+            torques, each further column for one size of the torques.
+        shape: (n + 1, 3, sizes) torques of unit size, in the axes of the law.
+        fastest: rad/s, rate above which the cost increases steeply, see `EXCESS`.
     """
 
     state: FloatArray
@@ -347,7 +348,7 @@ class PlannedMotion:
 class MotionGains:
     """Gains K (n, 4, 6) about a motion, and the affine part k (n, 4, columns).
 
-    The first column of k improves the motion, the others belong to each size of the torques.
+    The first column of k improves the motion, and each further column is for one size of the torques.
     """
 
     gain: FloatArray
@@ -383,7 +384,7 @@ def best_path(
 def _first(expected: PathConditions, rest: PlannedMotion, gains: MotionGains) -> PlannedMotion:
     """Return the motion that the sweeps start with.
 
-    It is propagated with the given gains, or without control if it diverges under them: the torque along the
+    It is propagated with the given gains, or without control if it diverges with them. The torque along the
     field has no limit, so that far from `rest` the gains may rotate the body by several revolutions in a
     step.
     """
@@ -419,7 +420,8 @@ def propagate(
 ) -> PlannedMotion | None:
     """Return the motion from the same start with a fraction `share` of the computed change, and feedback.
 
-    None if it diverges: far from `motion` the torques along the field, which have no limit, drive it away.
+    Returns None if the motion diverges. Far from `motion`, the unlimited torques along the field can cause
+    this.
     """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
@@ -448,7 +450,7 @@ def _swept(
 ) -> MotionGains:
     """Return the gains about a motion.
 
-    A `given` motion takes torques that its controls do not make.
+    A `given` motion need not be the result of its controls.
     """
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
@@ -501,7 +503,7 @@ def _cost(
 
 
 def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return slope (n, 3) and curvature (n, 3, 3) of the cost of rates (n, 3) beyond the largest."""
+    """Return slope (n, 3) and curvature (n, 3, 3) of the cost of rates (n, 3) above `fastest`, rad/s."""
     speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
     along = rate / speed[:, None]
     excess, weight = np.maximum(speed - fastest, 0.0), step / EXCESS**2

@@ -1,17 +1,17 @@
 """The table of the pointing law: the best motion over the revolution ahead, and gains along it.
 
-The motion is found by multiple shooting. It is improved by linear-quadratic steps about itself, each as long
-as it improves a merit function: the cost plus the weighted defects (Nocedal & Wright 2006, Numerical
-Optimization, algorithm 18.3). Unlike the sweeps of `pointing_path`, the intermediate motions need not be
-feasible: the state to which the equations of motion propagate each instant is compared with the next instant,
-and the next step removes the defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not
-grow along a revolution, in which a body that coils cannot hold about the field rotates far about its pointing
-axis. A step takes 0.07 ms per instant. It is propagated by the midpoint rule, and the derivative is
-that of the discrete step: the derivative of the continuous motion would lead a body that rotates by degrees
-in a step to motions that no step improves.
+The motion is found by multiple shooting, from linear-quadratic steps. Each step is shortened until it
+improves a merit function, the cost plus the weighted defects (Nocedal & Wright 2006, Numerical Optimization,
+algorithm 18.3). In contrast to the sweeps of `pointing_path`, the intermediate motions need not be feasible:
+the state to which the equations of motion propagate each instant is compared with the next instant, and the
+next step removes the defects (Bock & Plitt 1984, IFAC 9th World Congress). Errors therefore do not grow along
+a revolution. This matters, because coils make no torque about the field, and the body may rotate far about
+its pointing axis. A step takes 0.07 ms per instant. The motion is propagated by the midpoint rule, and the
+derivatives are those of the discrete step. If a body rotates by degrees in a step, derivatives of the
+continuous motion would end at motions that no step improves.
 
-If no such motion is found, or the coils do not suffice for it, the table holds the best path of
-`pointing_path`. Beyond the end of that path the law itself is the path: a sweep over a revolution of preview
+If no such motion is found, or the coils do not suffice for it, the table contains the best path of
+`pointing_path`. After the end of this path the body follows the law; a sweep over a revolution of preview
 gives the cost of an error at the end.
 """
 
@@ -126,7 +126,7 @@ def _rotation_jacobian(vector: FloatArray) -> FloatArray:
 
 
 STEPS = 40
-"""Largest number of steps."""
+"""Maximum number of steps of multiple shooting."""
 FARTHEST = math.radians(30.0)
 """Largest rotation (rad) by a step at any instant; a longer step is scaled as a whole."""
 HALVES = 6
@@ -134,11 +134,11 @@ HALVES = 6
 DEARER = 1.2
 """Weight of the defects in the merit, as a multiple of the largest sensitivity of the cost to a defect."""
 DONE = math.radians(0.05)
-"""Rotation (rad) below which a step is the last one. A step that saves less than SAVED of the merit is the
-last one, too."""
+"""Largest rotation (rad) by a step after which the iteration ends. It also ends if a step improves the merit
+by less than the fraction SAVED."""
 SAVED = 1e-4
 ENOUGH = 0.01
-"""Weighted defects of an acceptable motion, relative to its cost. A cost of one is negligible."""
+"""Largest weighted defects of an acceptable motion, relative to its cost plus one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,12 +146,12 @@ class _ShootingStep:
     """A full step of multiple shooting.
 
     Attributes:
-        change: (n + 1, 6) of rotation and rate.
+        change: (n + 1, 6) change of rotation and rate.
         control: (n, 3) change of the dipole.
-        gains: about the motion.
-        linear: the model about the motion.
-        rotated: the largest rotation by the step, rad.
-        sensitivity: (6,) the largest derivative of the cost by a defect at an instant.
+        gains: gains about the motion.
+        linear: linear model about the motion.
+        rotated: largest rotation by the step at any instant, rad.
+        sensitivity: (6,) largest derivative of the cost by a defect at any instant.
     """
 
     change: FloatArray
@@ -197,7 +197,10 @@ def best_course(
 
 @dataclass(eq=False)
 class _Merit:
-    """The merit of a motion: `state` (6, 6) and `dipole` cost a step, `dear` (6,) weights the defects."""
+    """The merit function of a motion.
+
+    `state` (6, 6) and `dipole` weight the errors and the dipole of a step, and `dear` (6,) the defects.
+    """
 
     expected: PathConditions
     state: FloatArray
@@ -277,20 +280,22 @@ def _moved(motion: PlannedMotion, change: FloatArray, control: FloatArray) -> Pl
 
 
 LEAST_PART = 1.0 / 3.0
-"""Fraction of a table: the last table is kept rather than replaced by a shorter flyable part."""
+"""Minimum fraction of a table that may be flown alone; the previous table is kept if the flyable part is
+shorter."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
-    """Weights of the errors: each attribute is the value that costs one.
+    """Weights of the errors. Each attribute is the value of an error that has a cost of one.
 
     Attributes:
-        turn: rad, of each axis.
-        rate: rad/s, of each axis.
-        dipole: A m^2, of each axis.
-        fastest: rad/s, largest rate on the way into the law; a faster one has a high cost
+        turn: rad, rotation error about each axis.
+        rate: rad/s, rate error of each axis.
+        dipole: A m^2, dipole of each axis.
+        fastest: rad/s, rate above which the cost increases steeply, while the body approaches the law
             (`pointing_path.EXCESS`).
-        roll: rad about the unit vector `axis` (3,), if that rotation costs less than others.
+        roll: rad, rotation error about the unit vector `axis` (3,), if this rotation has a smaller weight
+            than others.
     """
 
     turn: float
@@ -306,12 +311,13 @@ class PointingTable:
     """A path and gains at n equally spaced instants.
 
     Attributes:
-        path: the motion that is flown, n + 1 instants.
-        wanted: the law, n + 1 instants.
-        dipole: (n, 3) A m^2 of the path, held until the next instant.
-        gain: (n, 3, 6), K: A m^2 per rad and per rad/s.
-        torque_part: (n, 3, sizes): A m^2 per size of the disturbance beyond `sizes`.
-        sizes: (sizes,) N m of the disturbance that the path was planned with.
+        path: planned motion of the body, n + 1 instants.
+        wanted: motion that the attitude law commands, n + 1 instants.
+        dipole: (n, 3) A m^2, feedforward dipole of the path, held until the next instant.
+        gain: (n, 3, 6) feedback gains K, in A m^2 per rad and per rad/s.
+        torque_part: (n, 3, sizes) A m^2/(N m), change of the dipole per change of the disturbance sizes from
+            `sizes`.
+        sizes: (sizes,) N m, sizes of the disturbance torques with which the path was planned.
         slew: the slew that the path begins with, if any; its times count from the start of the path.
     """
 
@@ -329,7 +335,7 @@ class PointingTable:
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part before the body reaches `fastest` rad/s; None if shorter than `LEAST_PART`.
+        """Return the part before the body reaches `fastest` rad/s, None if it is shorter than `LEAST_PART`.
 
         A slew is flown as a whole or not at all.
         """
@@ -352,15 +358,15 @@ class PointingTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointingPreview:
-    """The law and the predicted environment at the instants (m,) of `wanted`: path and preview.
+    """The commanded motion and the predicted environment at the m instants of path and preview.
 
     Attributes:
         wanted: the law.
         initial: a motion (n + 1,) from the body's attitude and rate into the law; it need not be feasible
             with coils.
         field, position: (m, 3) T and m, ICRS.
-        pressures: (m,) shapes of the torques.
-        sizes: (9,) N m, the torques estimated now.
+        pressures: (m,) pressures of air and sunlight.
+        sizes: (9,) N m, present estimates of the disturbance sizes.
     """
 
     wanted: AttitudeReferences
@@ -376,8 +382,8 @@ def pointing_table(
 ) -> PointingTable:
     """Return the table from the start of `ahead.initial` to its end.
 
-    `inertia` (3, 3) kg m^2; `limit` A m^2 of each coil. The preview should last a revolution. Raises
-    UsageError for times that are not equally spaced.
+    `inertia` (3, 3) is in kg m^2, and `limit` is the dipole limit of each coil in A m^2. The preview should
+    last a revolution. Raises UsageError for times that are not equally spaced.
     """
     steps = np.diff(ahead.wanted.times)
     count = len(ahead.initial.times) - 1
@@ -405,7 +411,7 @@ def pointing_table(
 
 
 def step_costs(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
-    """Return the costs of a step of `dt` s: (6, 6) of rotation and rate, and of each axis of the dipole."""
+    """Return the weights of a step of `dt` s: (6, 6) of rotation and rate errors, and one of the dipole."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
     if weights.roll is not None and weights.axis is not None:
         state[:3, :3] -= dt * (weights.turn**-2.0 - weights.roll**-2.0) * np.outer(weights.axis, weights.axis)
@@ -420,7 +426,10 @@ def _beyond(
     dipole: float,
     shape: FloatArray,
 ) -> CostToGo:
-    """Return the cost-to-go of the law from instant `begin` on; column 0 holds the expected torques."""
+    """Return the cost-to-go of following the law from instant `begin` on.
+
+    Column 0 is for the expected torques.
+    """
     air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
     pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]
     field, position = ahead.field[begin:], ahead.position[begin:]

@@ -602,7 +602,7 @@ class NewtonRun:
         """Return the optimum found within `maximum` more steps; None if none was found."""
         if self.is_over:
             return None
-            # with np.errstate(over="ignore", invalid="ignore"): an overflow leads to a shorter step
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow leads to a shorter step
             return self._run(maximum)
 
     def _run(self, maximum: int) -> Iterate | None:

@@ -426,7 +426,8 @@ class HorizonContinuation:
     def __init__(self, task: SlewTask, solver: SlewSolver, budget: float) -> None:
         """Start no further continuation step after `budget` of work."""
         self._task, self._solver, self._budget = task, solver, budget
-        # self._lost: set[tuple[float, float, float]] = set() coarse paths without a path on the fine grid
+        # Coarse paths from which no path on the fine grid was found.
+        self._lost: set[tuple[float, float, float]] = set()
 
     def within(self, start: SolvedPath) -> SolvedPath | None:
         """Return the path within the limits on the fine grid, from a coarse path found without limits."""
