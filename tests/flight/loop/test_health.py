@@ -6,11 +6,23 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
 from flight.loop import facts
-from flight.loop.health import Board, ClockWatch, ResourceMonitor, ResourceSample
+from flight.loop.facts import EventLog
+from flight.loop.health import (
+    Board,
+    ClockWatch,
+    GroupsAndWorkers,
+    PerformanceObserver,
+    ResourceMonitor,
+    ResourceSample,
+    WorkerWatch,
+    failing,
+)
 from flight.schema.sections import Health
 from tests.flight.loop.records import EventRecord
 
@@ -148,3 +160,179 @@ def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_noth
     assert math.isnan(nothing.cpu)
     assert math.isnan(nothing.temperature)
     assert math.isnan(nothing.disk_free)
+
+
+def grown(count: int, window: float = 30.0) -> float:
+    """Return the slope of memory that grows 5 kB/s after `count` samples, 5 s apart, without a warm-up."""
+    monitor = ResourceMonitor(Health(look_period=5.0, warm_up=0.0, slope_window=window))
+    for k in range(count):
+        monitor.ingest(sample(5.0 * k, proportional=150 * MIB + 5e3 * 5.0 * k))
+    return monitor.state.memory_slope
+
+
+def test_a_slope_needs_eight_samples_and_its_window() -> None:
+    assert math.isnan(grown(7))
+    assert grown(8) == pytest.approx(5e3)
+    assert math.isnan(grown(8, 35.1))
+    assert grown(8, 35.0) == pytest.approx(5e3)
+
+
+def test_an_hour_of_samples_is_kept() -> None:
+    """Memory that was constant for an hour and then grew by 1 MiB in an hour shows the growth alone."""
+    monitor = ResourceMonitor(Health(look_period=60.0, warm_up=0.0, slope_window=600.0))
+    for k in range(121):
+        monitor.ingest(sample(60.0 * k, proportional=150 * MIB + MIB * max(0.0, (k - 60) / 60.0)))
+    assert monitor.state.memory_slope * 3600.0 == pytest.approx(MIB, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "over"),
+    [
+        ("cpu", 0.7, 0.71),
+        ("proportional", 1e9, 1.001e9),
+        ("disk_free", 2e8, 1.99e8),
+        ("temperature", 80.0, 80.1),
+    ],
+)
+def test_a_value_at_its_limit_is_allowed(name: str, at: float, over: float) -> None:
+    for value, reported in ((at, False), (over, True)):
+        samples = [sample(5.0 * k, **{name: 5.0 * k * value if name == "cpu" else value}) for k in range(6)]
+        _, record = watched(samples)
+        assert bool(record.names) is reported
+
+
+def test_the_share_of_the_processor_is_that_between_two_samples() -> None:
+    monitor = ResourceMonitor(SETTINGS)
+    monitor.ingest(sample(0.0, cpu=1.0))
+    assert math.isnan(monitor.state.cpu_share)
+    monitor.ingest(sample(4.0, cpu=3.0))
+    assert monitor.state.cpu_share == 0.5
+    monitor.ingest(sample(4.0, cpu=3.0))
+    assert math.isnan(monitor.state.cpu_share)
+
+
+@pytest.mark.parametrize(("step_ns", "seen"), [(500_000_000, False), (500_000_001, True)])
+def test_a_step_of_more_than_half_a_second_is_reported(step_ns: int, seen: bool) -> None:
+    clocks = TwoClocks()
+    watch = ClockWatch(clocks)  # type: ignore[arg-type]  # of a clock it asks the time only
+    assert watch.look() is None
+    clocks.wall_ns -= step_ns
+    assert (watch.look() is not None) is seen
+    assert watch.steps == int(seen)
+
+
+def group(name: str, period_ns: int = 25_000_000) -> Any:
+    """Return a rate group as far as health asks it."""
+    return SimpleNamespace(
+        name=name, period_ns=period_ns, completed=0, cycles=7, slips=2, overruns=1,
+        mean_execution_ns=3_000_000.0, max_execution_ns=9_000_000,
+    )  # fmt: skip
+
+
+class Group:
+    """A hashable rate group."""
+
+    def __init__(self, name: str, period_ns: int) -> None:
+        self.name, self.period_ns, self.completed = name, period_ns, 0
+
+
+SECOND = 1_000_000_000
+
+
+@pytest.mark.parametrize(("period_ns", "limit_ns"), [(25_000_000, 2 * SECOND), (SECOND, 3 * SECOND)])
+def test_a_group_is_stalled_after_three_periods_and_two_seconds(period_ns: int, limit_ns: int) -> None:
+    one = Group("control", period_ns)
+    watch = GroupsAndWorkers([cast(Any, one)], [])
+    watch.begin(5)
+    assert watch.stalled(5 + limit_ns) == []
+    assert watch.stalled(6 + limit_ns) == ["control"]
+    one.completed = 1
+    assert watch.stalled(10 * SECOND) == []
+    assert watch.stalled(10 * SECOND + limit_ns) == []
+    assert watch.stalled(10 * SECOND + limit_ns + 1) == ["control"]
+
+
+def test_a_worker_is_stalled_while_its_job_runs_beyond_the_limit() -> None:
+    since: list[int | None] = [None]
+    watch = GroupsAndWorkers([], [WorkerWatch("planner", lambda: since[0], 3 * SECOND)])
+    assert watch.stalled(100 * SECOND) == []
+    since[0] = 100 * SECOND
+    assert watch.stalled(103 * SECOND) == []
+    assert watch.stalled(103 * SECOND + 1) == ["planner"]
+
+
+def test_a_job_on_a_ticker_fails_when_it_raises_or_stands_still() -> None:
+    def ticker(served_ns: int, error: str = "", period_ns: int = SECOND) -> Any:
+        return SimpleNamespace(name="log", served_ns=served_ns, error=error, period_ns=period_ns)
+
+    now = 10 * SECOND
+    assert failing([ticker(now - 3 * SECOND)], now) == []
+    assert failing([ticker(now - 3 * SECOND - 1)], now) == ["log: stands still for 3.0 s"]
+    assert failing([ticker(now - 2 * SECOND, period_ns=1)], now) == []
+    assert failing([ticker(now - 2 * SECOND - 1, period_ns=1)], now) == ["log: stands still for 2.0 s"]
+    assert failing([ticker(now, "disk full"), ticker(now)], now) == ["log: disk full"]
+
+
+class Observed:
+    """The observer of performance with records of what it does."""
+
+    def __init__(self) -> None:
+        self.offs = 0
+        self.times: list[tuple[str, dict[str, Any]]] = []
+        self.events: list[tuple[str, str]] = []
+        recorder = SimpleNamespace(time=lambda packet, _, **values: self.times.append((packet.name, values)))
+        log = EventLog(lambda kind, _, held, text: self.events.append((kind.name, text)), throttle_ns=0)
+        services = SimpleNamespace(clock=SimpleNamespace(now_ns=lambda: 9), recorder=recorder, events=log)
+        self.observer = PerformanceObserver(cast(Any, SimpleNamespace(off=self._off)), cast(Any, services))
+
+    def _off(self) -> None:
+        self.offs += 1
+
+
+def test_only_the_cycles_of_control_are_recorded_with_lateness_and_duration() -> None:
+    seen = Observed()
+    cycle = cast(Any, SimpleNamespace(slot=4, start_ns=1_000_300_000, due_ns=1_000_000_000))
+    seen.observer.ran(group("health"), cycle, 5)
+    assert seen.times == []
+    seen.observer.ran(group("control"), cycle, 2_000_000)
+    assert seen.times == [
+        ("cycle_timing", {"cycle": 4, "lateness": pytest.approx(3e-4), "execution": pytest.approx(2e-3)})
+    ]
+
+
+def test_only_the_slips_of_control_are_events() -> None:
+    seen = Observed()
+    seen.observer.slipped(group("health"), 3)
+    assert seen.events == []
+    seen.observer.slipped(group("control"), 3)
+    assert seen.events == [("cycle-slip", "control: 3 slots skipped, 2 since start")]
+
+
+def test_a_failure_of_control_zeroes_the_coils_and_any_failure_is_an_event() -> None:
+    seen = Observed()
+    for name, offs in (("health", 0), ("control", 1)):
+        try:
+            raise ValueError("no number")
+        except ValueError as error:
+            seen.observer.failed(group(name), error)
+        assert seen.offs == offs
+        assert seen.events[-1][0] == "task-failed"
+        assert seen.events[-1][1].startswith(f"{name}: ValueError: no number (test_a_failure_of_control")
+
+
+def test_the_statistics_of_groups_and_jobs_are_in_seconds() -> None:
+    seen = Observed()
+    seen.observer.group(group("health", SECOND), 0)
+    seen.observer.job(
+        cast(Any, SimpleNamespace(worker="vision", execution_ns=SECOND // 4, outcome="done")), 0
+    )
+    assert seen.times == [
+        (
+            "rate_group",
+            {
+                "name": "health", "period": 1.0, "cycles": 7, "slips": 2, "overruns": 1,
+                "mean": pytest.approx(3e-3), "max": pytest.approx(9e-3),
+            },
+        ),
+        ("job_timing", {"name": "vision", "execution": 0.25, "outcome": "done"}),
+    ]  # fmt: skip
