@@ -60,7 +60,7 @@ def test_a_command_is_answered_once_and_mode_tries_the_flight(
     assert state.due == due
 
 
-def test_what_is_no_command_is_not_answered(tmp_path: Path) -> None:
+def test_only_commands_are_answered(tmp_path: Path) -> None:
     state = safe_state.SafeState(safe_state.Tries(str(tmp_path), 0.0), 0.0)
     ping = packed(Ping(7))
     answer = state.answer(ping, 1.0)

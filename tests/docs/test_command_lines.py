@@ -79,7 +79,7 @@ def test_every_mark_names_a_test_or_gives_a_reason() -> None:
             assert len(block.reason) > 10, f"{where}: the reason is missing"
 
 
-def test_a_block_without_a_language_is_no_hiding_place_for_commands() -> None:
+def test_commands_in_a_block_without_a_language_are_found() -> None:
     for block in blocks():
         if block.language in {"", "text", "bash", "shell"}:
             assert not re.search(r"^\s*(\$ |python |make |sudo )", block.text, re.MULTILINE), (

@@ -35,7 +35,7 @@ def test_a_page_that_loads_from_another_host_is_found(tmp_path: Path) -> None:
     assert len(problems_of(tmp_path)) == 3
 
 
-def test_links_to_follow_are_no_problem(tmp_path: Path) -> None:
+def test_links_to_follow_are_not_reported(tmp_path: Path) -> None:
     page = '<a href="https://elsewhere.example/">there</a><link rel="stylesheet" href="assets/own.css">'
     (tmp_path / "a.html").write_text(page, encoding="utf-8")
     assert problems_of(tmp_path) == []

@@ -255,7 +255,7 @@ def test_a_camera_that_is_off_is_reported_and_the_flight_goes_on(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("max_age", "lost"), [(14.0, False), (7.0, True)])
-def test_a_frame_that_comes_late_is_no_fresh_one(tmp_path: Path, max_age: float, lost: bool) -> None:
+def test_a_frame_that_comes_late_is_not_accepted_as_fresh(tmp_path: Path, max_age: float, lost: bool) -> None:
     def prepare(rigged: Rigged) -> None:
         setattr(rigged.lock.hardware.camera, "late_ns", 9_000_000_000)  # noqa: B010 - it may be None
 

@@ -39,7 +39,7 @@ def board(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Files]:
 
 @settings(max_examples=50)
 @given(chance=chances())
-def test_a_whole_release_flies_in_place_of_a_damaged_one(board: tuple[Path, Files], chance: Random) -> None:
+def test_a_whole_release_flies_instead_of_a_damaged_one(board: tuple[Path, Files], chance: Random) -> None:
     place, written = board
     chooser = script("releases")
 

@@ -131,7 +131,7 @@ def test_a_board_whose_configuration_is_wrong_ends_with_status_2(board: list[str
     assert main(board) == 2
 
 
-def test_an_error_of_the_disk_at_the_end_of_a_boards_flight_is_no_mistake_of_the_users(
+def test_a_disk_error_at_the_end_of_a_boards_flight_is_not_reported_as_wrong_use(
     board: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def end(request: RunRequest, _: object) -> None:

@@ -173,7 +173,7 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
     assert not place.exists()
 
 
-def test_whoever_is_no_peer_or_sends_no_command_takes_no_place_in_the_queue(place: Path) -> None:
+def test_only_commands_of_a_peer_take_a_place_in_the_queue(place: Path) -> None:
     """More datagrams than any queue holds, from a stranger's address and from a peer's."""
     ping = CommandPacker().pack(Ping(5), 1)
     channels = [open_udp("127.0.0.1:0", [IPv4Network("127.0.0.9"), IPv4Network("127.1.0.0/16")])]

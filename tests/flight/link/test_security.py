@@ -184,7 +184,7 @@ def test_the_last_counter_is_2_to_the_63_less_one_both_ways(sky: Vault, ground: 
 
 
 @pytest.mark.timeout(30)
-def test_a_fifo_or_an_endless_file_in_place_of_a_copy_is_a_lost_copy(sky: Vault, tmp_path: Path) -> None:
+def test_a_fifo_or_an_endless_file_instead_of_a_copy_is_a_lost_copy(sky: Vault, tmp_path: Path) -> None:
     first, second = (tmp_path / "sky" / f"spi-1.{copy}" for copy in COPIES)
     first.unlink()
     os.mkfifo(first)

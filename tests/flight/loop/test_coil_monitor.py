@@ -86,7 +86,7 @@ def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> 
     assert carried[:, 2].max() == 0.0
 
 
-def test_a_brake_that_is_no_cure_is_taken_back() -> None:
+def test_braking_that_does_not_help_is_ended() -> None:
     """Too much current that does not fall: a wrong monitor, or a leg stuck low under a brake."""
     leg = StuckLeg(0.04)
     at_rest = Supplied(0.148, -0.002, 0.002, (0, 1, 2), False)
@@ -152,7 +152,7 @@ def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() ->
     assert seen.watch.braked == (True, False, False)
 
 
-def test_to_look_at_rest_only_is_no_suspicion() -> None:
+def test_a_check_at_rest_does_not_raise_suspicion() -> None:
     seen = observe(windows, 20.0)
     assert seen.found == []
     assert seen.suspicious == 0

@@ -57,7 +57,7 @@ def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list
     return believed, wrong
 
 
-def test_a_sound_coil_is_not_taken_for_a_broken_one_where_a_guardian_held_it_at_zero() -> None:
+def test_a_sound_coil_that_a_guardian_held_at_zero_is_not_reported_as_broken() -> None:
     gains, wrong = _fly(driver_lets_go=False, informed=True)
     assert wrong == 0
     assert len(gains) > 20

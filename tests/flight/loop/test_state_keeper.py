@@ -227,7 +227,7 @@ def test_without_a_folder_nothing_is_kept() -> None:
         assert open_state(simulated(None), {}, ManualClock(), stack) is None
 
 
-def test_a_device_that_does_not_answer_is_no_crash(tmp_path: Path) -> None:
+def test_a_device_that_does_not_answer_is_not_counted_as_a_crash(tmp_path: Path) -> None:
     def end() -> None:
         with ExitStack() as stack:
             open_state(simulated(tmp_path), {}, ManualClock(), stack)
@@ -238,7 +238,7 @@ def test_a_device_that_does_not_answer_is_no_crash(tmp_path: Path) -> None:
     assert not stored(tmp_path).running
 
 
-def test_an_exception_that_passes_is_no_clean_end(tmp_path: Path) -> None:
+def test_an_exception_that_ends_the_flight_is_not_a_clean_end(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "state"
 
     def crash() -> None:
@@ -256,7 +256,7 @@ def test_an_exception_that_passes_is_no_clean_end(tmp_path: Path) -> None:
     assert not stored(folder).running
 
 
-def test_a_folder_that_cannot_be_made_is_no_reason_not_to_fly(tmp_path: Path) -> None:
+def test_a_flight_starts_although_its_folder_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with ExitStack() as stack:
         keeper = open_state(simulated(tmp_path / "file" / "state"), {}, ManualClock(), stack)

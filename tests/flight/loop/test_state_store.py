@@ -163,7 +163,7 @@ def _socket(path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", [os.mkfifo, _socket, _sparse])
-def test_what_is_no_file_or_too_large_is_damage_that_the_next_write_mends(
+def test_a_copy_that_is_too_large_or_not_a_file_is_damage_that_the_next_write_mends(
     tmp_path: Path, place: Callable[[Path], None]
 ) -> None:
     StateStore(tmp_path, Reports()).store(state_of(1))

@@ -83,7 +83,7 @@ def test_a_value_that_is_not_a_number_arrives() -> None:
     ],
     ids=["function", "class", "object", "deep", "objects", "texts"],
 )
-def test_what_is_no_value_is_not_sent(value: Any) -> None:
+def test_values_of_other_classes_are_not_sent(value: Any) -> None:
     with pytest.raises(FlightError, match="a worker cannot send"):
         pack_values(value, slab())
 
@@ -105,7 +105,7 @@ HARMFUL: tuple[Any, ...] = (
 
 
 @pytest.mark.parametrize("tree", HARMFUL, ids=repr)
-def test_bytes_that_are_no_value_of_ours_are_refused(tree: Any) -> None:
+def test_bytes_that_do_not_encode_a_permitted_value_are_refused(tree: Any) -> None:
     body = msgspec.msgpack.encode(tree)
     head = (8).to_bytes(8, "little")
     slab()[:8] = b"\xff" * 8

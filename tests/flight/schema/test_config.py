@@ -232,7 +232,7 @@ def test_a_damaged_configuration_is_valid_or_refused_clearly(place: int, letter:
         ("!!python/object:os.system x", "demo:1: is not YAML"),
     ],
 )
-def test_text_that_is_no_plain_tree_is_refused_with_its_line(text: str, complaint: str) -> None:
+def test_text_that_is_not_a_plain_tree_is_refused_with_its_line(text: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=f"^{complaint}") as caught:
         reader.parse(text, "demo")
     assert "\n" not in str(caught.value)

@@ -151,7 +151,7 @@ def test_export_writes_a_table_for_each_kind_of_packet(tmp_path: Path) -> None:
     assert {"control.csv", "imu.csv", "truth.csv", "event.csv"} <= set(files)
 
 
-def test_a_file_whose_name_is_no_text_is_named_all_the_same(
+def test_a_file_whose_name_is_not_valid_text_is_named_all_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     raw = io.BytesIO()

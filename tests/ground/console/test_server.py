@@ -351,7 +351,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         ("slew", "0.1", "a command is"),
     ],
 )
-def test_values_that_are_no_command_are_never_sent(
+def test_values_that_do_not_form_a_command_are_never_sent(
     folder: Path, name: str, values: Any, complaint: str
 ) -> None:
     status, answer = commanded(folder, name, values, lambda packet: pytest.fail("sent"))

@@ -84,7 +84,9 @@ def test_a_run_beside_itself_differs_in_nothing(pair: tuple[Path, Path]) -> None
     assert "The configurations are the same" in format_comparison(compared)
 
 
-def test_a_configuration_that_cannot_be_read_is_no_obstacle(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_runs_are_compared_although_a_configuration_cannot_be_read(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
     bare = make_run(tmp_path / "bare", Recipe(5.0, 5.0, 5.0, 10.0, identity=False, commands=False))
     done = command("report", bare, pair[1])
     assert done.returncode == 0, done.stderr
@@ -105,7 +107,7 @@ def test_both_are_drawn_over_each_other_where_a_folder_is_given(
     assert min(blue, orange) > 500
 
 
-def test_what_is_no_run_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_folder_that_does_not_hold_a_run_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
     done = command("report", pair[0], tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 

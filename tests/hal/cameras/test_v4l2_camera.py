@@ -295,7 +295,7 @@ def test_an_input_output_error_that_passes_costs_no_reopening(
     video.camera.close()
 
 
-def test_a_name_cut_inside_a_character_is_no_crash(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_name_cut_inside_a_character_is_accepted(kernel: IoctlCamera, clock: ManualClock) -> None:
     """The fields are of 32 bytes: a name that is longer ends wherever they end."""
     kernel.card = "Caméra de précision à l'été, é".encode()[:31]
     kernel.knobs[v4l2.GAIN].name = b"Verst\xc3"
@@ -337,7 +337,7 @@ def test_no_such_camera_names_the_cure(tmp_path: Path, kernel: IoctlCamera, cloc
         video_rig(kernel, clock, path=str(tmp_path / "nothing"))
 
 
-def test_what_is_no_video_device_is_refused(tmp_path: Path, clock: ManualClock) -> None:
+def test_a_path_that_is_not_a_video_device_is_refused(tmp_path: Path, clock: ManualClock) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"")
     kernel = IoctlCamera(tmp_path, clock.now_ns)  # which the binding does not see: it asks the real kernel

@@ -79,6 +79,6 @@ def test_a_duty_of_a_half_is_half_of_the_supply() -> None:
     assert counts_for(1.7 / 23.0, STEP, 4096) == (2048, False)
 
 
-def test_nan_is_no_current() -> None:
+def test_nan_is_refused_as_a_current() -> None:
     with pytest.raises(ValueError, match="NaN"):
         counts_for(math.nan, STEP, 4096)

@@ -59,7 +59,7 @@ def test_a_good_frame_is_found_behind_any_noise_in_pieces_of_any_size(
 
 
 @given(st.integers(0, 99), st.integers(1, 255))
-def test_one_wrong_byte_is_never_taken_for_a_frame(at: int, mask: int) -> None:
+def test_a_frame_with_one_wrong_byte_is_never_accepted(at: int, mask: int) -> None:
     sound = frame(NAV_PVT, PVT.packed())
     broken = bytearray(sound)
     broken[at] ^= mask

@@ -40,7 +40,7 @@ def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatc
     assert asked == [(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 50) for thread in (0, 77)]
 
 
-def test_locked_memory_is_seen_by_the_kernel_or_refused_in_words() -> None:
+def test_the_kernel_reports_locked_memory_or_the_refusal_is_explained() -> None:
     """Locking on fault leaves untouched address space out: a gigabyte that is only reserved costs nothing."""
     script = (
         "import mmap; from hal.buses import linux_process\n"

@@ -63,7 +63,9 @@ def test_a_chip_that_does_not_answer_is_one_line_and_status_1(
     assert capsys.readouterr().err == f"smbus_byte: {device}, address 0x40: no acknowledge\n"
 
 
-def test_a_file_that_is_no_adapter_is_status_1(device: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_not_an_adapter_gives_status_1(
+    device: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert smbus_byte.main([device, "0x40", "0xfd", "0x10"]) == 1
     assert "ioctl" in capsys.readouterr().err
 

@@ -140,7 +140,7 @@ def test_commands_are_those_that_the_vendors_kit_sends(
         b"$VNRRG,8\xff*4B",
     ],
 )
-def test_what_is_no_sentence_is_none(line: bytes) -> None:
+def test_a_line_that_is_not_a_sentence_gives_none(line: bytes) -> None:
     assert parse(line) is None
 
 

@@ -159,7 +159,7 @@ def test_noise_that_leaves_readings_starts_no_recovery(bench: BenchLine) -> None
     assert bench.driver.recoveries == 0
 
 
-def test_values_that_never_change_are_no_readings(bench: BenchLine) -> None:
+def test_values_that_never_change_are_not_accepted_as_readings(bench: BenchLine) -> None:
     kept: list[Vn100Sample] = []
 
     def same(measured: Vn100Sample) -> Vn100Sample:

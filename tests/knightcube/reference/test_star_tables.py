@@ -65,7 +65,7 @@ def test_no_keys_have_empty_ranges_and_infinite_ends_hold_all_keys() -> None:
     assert (start[0], stop[0]) == (0, 3)
 
 
-def test_keys_out_of_order_and_ends_that_are_no_numbers_are_refused() -> None:
+def test_keys_out_of_order_and_ends_that_are_not_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="ascending"):
         star_tables.build_k_vector(np.array([2.0, 1.0]))
     with pytest.raises(ValueError, match="finite"):

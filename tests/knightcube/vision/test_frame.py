@@ -61,7 +61,7 @@ def test_a_frame_that_blocks_do_not_divide_is_covered() -> None:
     np.testing.assert_allclose(level, 9.0, rtol=1e-6)
 
 
-def test_dead_overexposed_and_living_frames_are_told_apart() -> None:
+def test_dead_overexposed_and_living_frames_are_distinguished() -> None:
     rng = np.random.default_rng(3)
     dead = np.zeros((256, 256), dtype=np.uint16)
     dead[10, 20] = 4000

@@ -161,7 +161,7 @@ def test_a_job_and_what_it_found_pass_between_processes() -> None:
     _assert_right(found.solution, _frame(0.0).attitude)
 
 
-def test_an_index_that_is_missing_is_told_with_its_cure(tmp_path: Path) -> None:
+def test_an_index_that_is_missing_is_reported_with_its_cure(tmp_path: Path) -> None:
     job = _job(_frame(0.0), LikelihoodSettings())
     tracker = replace(_TRACKER, index=tmp_path / "sky.index")
     with pytest.raises(InputError, match=r"startracker\.index\.build"):

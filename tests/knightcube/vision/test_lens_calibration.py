@@ -110,7 +110,7 @@ def test_without_noise_the_lens_is_exact(noise: float) -> None:
     assert found.rms_after < 5e-7
 
 
-def test_which_matches_were_wrong_is_told() -> None:
+def test_the_wrong_matches_are_reported() -> None:
     rng = np.random.default_rng(84)
     truth = _lens(rng, _begun())
     frames, _ = _frames(rng, truth, 5, 30)

@@ -73,7 +73,7 @@ def test_an_error_on_the_emulated_bus_is_the_errno_of_the_kernel(serve: Serve) -
     assert caught.value.errno == errno.EREMOTEIO
 
 
-def test_an_answer_that_came_too_late_is_not_taken_for_the_next_ones(serve: Serve) -> None:
+def test_an_answer_that_came_too_late_is_not_accepted_for_the_next_request(serve: Serve) -> None:
     def answer(request: list[Any]) -> list[Any]:
         if request[0] == 1:
             return []

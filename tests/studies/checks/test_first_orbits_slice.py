@@ -33,7 +33,7 @@ def test_half_a_minute_is_refused_with_the_distances_that_it_allows() -> None:
     assert "the arc of 30 s is too short: the distance is" in result["refused"]
 
 
-def test_what_no_gravity_moves_so_is_no_orbit() -> None:
+def test_a_motion_that_gravity_cannot_cause_is_not_accepted_as_an_orbit() -> None:
     times = np.arange(0.0, 240.0, 20.0)
     angle = 0.02 * times + 2e-5 * times**2
     directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(times))], axis=1)

@@ -109,7 +109,7 @@ def test_one_line_is_changed(source: str, expected: set[str]) -> None:
         "a = (b <\n     c)",
     ],
 )
-def test_no_behaviour_is_no_mutant(source: str) -> None:
+def test_a_change_without_an_effect_is_not_a_mutant(source: str) -> None:
     """Annotations, text, imports and changes over several lines give no mutant."""
     assert not changes(source)
 

@@ -42,7 +42,7 @@ def flown(fault: str, mode: str, folder: Path) -> Run:
     return fly(config, folder, section=world_for(mode, 3, (entry,)))
 
 
-def test_a_receiver_that_repeats_its_fix_is_told_and_the_body_points_on(tmp_path: Path) -> None:
+def test_a_receiver_that_repeats_its_fix_is_reported_and_the_body_points_on(tmp_path: Path) -> None:
     run = flown("gps: stuck", "sun", tmp_path)
     found = judgement.judge(run, CATALOGUE["gps: stuck"], "sun", AT, AT + SPAN)
     assert found["event"] == "gps-refused"
@@ -120,7 +120,7 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     assert found["beyond_s"] == 0.0
 
 
-def test_the_brake_goes_on_by_a_unit_that_began_anew_at_another_phase(
+def test_braking_goes_on_with_a_unit_that_restarted_at_another_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Number 0 of seed 4: its samples came a millisecond before the commands.

@@ -21,5 +21,5 @@ def test_a_rate_that_changes_by_up_to_twice_its_mean_is_found_within_its_covaria
     assert all(result["nees"] is None for result in results[4:])
 
 
-def test_a_turn_that_reverses_is_not_taken_for_one_from_rest() -> None:
+def test_a_turn_that_reverses_is_not_reported_as_one_from_rest() -> None:
     assert run(Case("folded", (7, 49, 1), dict(FOLDED)))["nees"] is None

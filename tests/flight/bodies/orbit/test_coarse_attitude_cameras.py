@@ -161,7 +161,7 @@ def test_the_strings_own_sun_is_not_fed_twice() -> None:
     assert craft.look(found) == (True, False)
 
 
-def test_the_worker_is_told_what_is_known_in_body_axes() -> None:
+def test_the_worker_gets_what_is_known_in_body_axes() -> None:
     craft = Still(6)
     craft.rest(3)
     frame = Frame(1, craft.now_ns - SECOND_NS, 0, craft.now_ns, np.zeros((64, 64), np.uint8))

@@ -158,7 +158,7 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
     assert flown.error() == pytest.approx(0.1, abs=5e-3)
 
 
-def test_attitudes_that_are_no_numbers_never_begin_it_again() -> None:
+def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
     """As a vision worker that fails may send them: the control task then failed for good."""
     flown = acquired()
     for _ in range(2 * REFUSALS_TO_RESTART):

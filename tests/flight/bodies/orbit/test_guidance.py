@@ -78,7 +78,7 @@ def submitted(
     return jobs
 
 
-def test_a_path_that_leaves_its_target_for_a_time_is_no_reason_for_a_slew(
+def test_a_path_that_leaves_its_target_for_a_time_does_not_start_a_slew(
     table: Any, paths: PointingPaths
 ) -> None:
     before = planned(paths, NADIR, 0).slew

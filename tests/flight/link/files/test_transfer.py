@@ -164,7 +164,7 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
     assert [one.condition for one in answers if isinstance(one, Finished)] == [condition]
 
 
-def test_bytes_beyond_the_end_that_came_before_the_metadata_are_no_part_of_the_file(tmp_path: Path) -> None:
+def test_bytes_beyond_the_end_that_came_before_the_metadata_are_left_out_of_the_file(tmp_path: Path) -> None:
     """CCSDS 727.0-B-5, 4.6.1.2: a file size error, whichever came first."""
     pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
     end = pair.ends[SATELLITE]

@@ -38,7 +38,7 @@ def test_udp_telemetry_goes_to_authentic_senders_for_a_minute_and_to_nobody_else
     line.close()
 
 
-def test_a_sender_that_is_no_peer_is_not_listened_to() -> None:
+def test_datagrams_of_a_sender_other_than_the_peer_are_ignored() -> None:
     line = UdpLine("127.0.0.1:0", peers=ELSEWHERE)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(FRAME, ("127.0.0.1", line.port))

@@ -111,7 +111,7 @@ def test_a_full_disk_takes_the_oldest_runs_but_not_the_last(
     assert names(tmp_path) == ["run-000004", "run-000005"]
 
 
-def test_a_disk_that_takes_nothing_is_no_reason_not_to_fly(
+def test_a_flight_starts_although_the_disk_stores_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def mkdir(*_: object, **__: object) -> None:

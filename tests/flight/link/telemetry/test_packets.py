@@ -132,7 +132,7 @@ def test_a_text_is_cut_between_characters_and_made_valid() -> None:
     assert to_text(decode(raw)["event"][0]["text"]) == "lone ?"
 
 
-def test_a_number_is_no_text() -> None:
+def test_a_number_cannot_be_packed_as_text() -> None:
     with pytest.raises(TelemetryError, match="name = 3 cannot be stored as S32"):
         Packer().pack(EVENT, 0, code=1, severity=0, suppressed=0, name=3, text="")
 

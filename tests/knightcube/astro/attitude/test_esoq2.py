@@ -141,7 +141,7 @@ def test_directions_on_one_line_fix_no_attitude() -> None:
         _solve(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
 
 
-def test_what_is_no_direction_or_no_error_is_refused() -> None:
+def test_invalid_directions_and_errors_are_refused() -> None:
     good, sigma = np.eye(3), np.full(3, 1e-5)
     for observed in (2.0 * good, np.where(good == 1.0, np.nan, good)):
         with pytest.raises(AttitudeError, match="unit length"):

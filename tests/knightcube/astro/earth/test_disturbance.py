@@ -43,7 +43,7 @@ def test_a_torque_seen_at_one_attitude_tells_those_at_all_others(name: str) -> N
     assert missed[1] > 2.0 * missed[0]
 
 
-def test_areas_are_one_in_the_mean_also_of_a_body_that_is_no_box() -> None:
+def test_areas_are_one_in_the_mean_also_of_a_body_other_than_a_box() -> None:
     for moments in ([1.0, 1.0, 1.0], [0.0066, 0.0333, 0.0333], [1.0, 1.0, 2.5]):
         areas = box_areas(np.diag(moments))
         assert areas.sum() == pytest.approx(2.0), "the mean share of a side is half its area"

@@ -106,7 +106,7 @@ def test_an_old_fix_and_one_within_the_earth_are_refused() -> None:
         GpsFix(DATE, np.array([np.nan, 0.0, 0.0]), np.zeros(3))
 
 
-def test_lines_that_are_no_elements_are_refused() -> None:
+def test_lines_that_are_not_elements_are_refused() -> None:
     with pytest.raises(UsageError, match="69 columns"):
         TwoLineElements(FIRST[:-3], SECOND)
     with pytest.raises(UsageError, match="checksum 4, the sum of its columns gives 3"):

@@ -77,7 +77,7 @@ def test_the_cylinder_is_as_wide_as_the_earth() -> None:
         assert sunlit_share(_behind(depth, EARTH_RADIUS + 10.0), SUN, "cylindrical") > 0.0
 
 
-def test_cone_and_cylinder_agree_but_for_the_penumbra() -> None:
+def test_cone_and_cylinder_agree_outside_the_penumbra() -> None:
     """Of a sphere of 7078 km it covers 0.42 %: a ring 28.5 km wide, 6378 km about the shadow's axis."""
     rng = np.random.default_rng(4)
     positions = rng.normal(size=(20_000, 3))

@@ -117,7 +117,7 @@ def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused()
     np.testing.assert_array_equal(found.quaternion, before)
 
 
-def test_the_magnetometer_s_bias_is_told_from_the_attitude_by_the_stars() -> None:
+def test_the_stars_separate_the_magnetometer_s_bias_from_the_attitude() -> None:
     found, q, _ = fly(60, 5)
     bias = np.array([2e-7, -1e-7, 3e-7])
     here = around(60.0)

@@ -93,7 +93,7 @@ def started(craft: Craft, settings: FreeFilterSettings) -> FreeFilter:
     return found
 
 
-def test_a_turn_of_the_principal_axes_is_no_bias_of_the_gyros() -> None:
+def test_a_rotation_of_the_principal_axes_is_not_estimated_as_a_gyro_bias() -> None:
     craft = Craft(AXES_TURN, np.array([0.14, 0.06, -0.05]), 1)
     found = started(craft, FreeFilterSettings())
     fly(craft, found, 90, np.zeros(3), 0.0)

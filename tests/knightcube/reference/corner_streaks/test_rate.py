@@ -145,7 +145,7 @@ def test_below_twenty_pixels_it_says_too_short(length: float) -> None:
     assert result.length == pytest.approx(length, abs=4.0)
 
 
-def test_black_saturated_and_starless_frames_are_told() -> None:
+def test_black_saturated_and_starless_frames_are_reported() -> None:
     shape = (512, 512)
     noise = np.rint(np.random.default_rng(8).normal(150.0, 12.0, shape)).astype(np.uint16)
     for pixels, status in (

@@ -116,7 +116,7 @@ def test_streaks_of_no_sky_are_refused_and_their_rate_stays() -> None:
     assert found is strewn
 
 
-def test_no_streak_is_no_star() -> None:
+def test_without_streaks_the_stars_are_not_named() -> None:
     solution, _ = _solve(StreakResult(StreakStatus.TOO_FEW, 0, _EXPOSURE))
     assert solution.status is SolveStatus.NO_STARS
 
@@ -208,7 +208,7 @@ def test_the_error_in_pixels_is_that_of_3_29() -> None:
     assert error_in_pixels(np.deg2rad(0.01), 1024, _FIELD) == pytest.approx(0.512)
 
 
-def test_a_turn_about_the_boresight_is_no_error_across_it() -> None:
+def test_a_turn_about_the_boresight_does_not_count_as_an_error_across_it() -> None:
     truth = normalise(np.array([0.1, 0.4, -0.2, 0.9]))
     for turn, across in (([0.0, 0.0, 1e-3], 0.0), ([6e-4, 8e-4, 0.0], 1e-3), ([0.0, 0.0, 0.0], 0.0)):
         estimate = multiply(from_rotation_vector(np.array(turn)), truth)

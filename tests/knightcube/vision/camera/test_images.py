@@ -158,7 +158,7 @@ def test_a_bitmap_is_read(tmp_path: Path) -> None:
     assert np.array_equal(read_image(tmp_path / "a.bmp"), EIGHT)
 
 
-def test_a_negative_is_refused_rather_than_taken_for_a_picture(tmp_path: Path) -> None:
+def test_an_image_stored_as_a_negative_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tif"
     path.write_bytes(_tiff(SIXTEEN, "<", photometric=0))
     with pytest.raises(UsageError, match="zero is white"):
@@ -172,7 +172,7 @@ def test_pixels_of_another_kind_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"GIF89a nothing", b"SIMPLE", bytes(5000)])
-def test_a_file_that_is_no_image_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_an_image_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
     with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS") as caught:
@@ -316,7 +316,7 @@ def test_the_array_is_the_machines_own_and_row_0_the_files_first() -> None:
     assert image[0].tolist() == [0, 1, 2]
 
 
-def test_a_third_axis_of_one_plane_is_no_matter() -> None:
+def test_a_third_axis_of_one_plane_is_accepted() -> None:
     image = primary_image(fits_file(PIXELS.astype(">i2"), 16, NAXIS=3, NAXIS3=1), "x.fits")
     assert image.shape == (2, 3)
 
@@ -343,7 +343,7 @@ def test_what_is_not_read_is_said_in_one_line(cards: dict[str, object], says: st
     assert "\n" not in str(caught.value)
 
 
-def test_a_blank_value_that_no_pixel_has_is_no_matter() -> None:
+def test_a_blank_value_that_no_pixel_has_is_accepted() -> None:
     assert primary_image(fits_file(PIXELS.astype(">i2"), 16, BLANK=-32768), "x.fits").shape == (2, 3)
 
 

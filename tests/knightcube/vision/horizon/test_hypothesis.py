@@ -31,7 +31,7 @@ def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> N
     assert view.length == pytest.approx(100.0 * np.pi, rel=1e-3)
 
 
-def test_edges_all_along_a_limb_are_no_chance_and_a_tenth_of_them_are() -> None:
+def test_edges_all_along_a_limb_are_not_due_to_chance_and_a_tenth_of_them_may_be() -> None:
     limb, generator = LimbInView(500.0, 40.0, 40.0), np.random.default_rng(1)
     others = generator.uniform(-200.0, 200.0, 100)
     assert log10_chance(limb, generator.normal(0.0, 0.1, 40), others, CAMERA, 2) < -50.0
@@ -44,7 +44,7 @@ def test_edges_all_along_a_limb_are_no_chance_and_a_tenth_of_them_are() -> None:
     assert known < crowded
 
 
-def test_points_that_the_lens_does_not_image_are_no_limb() -> None:
+def test_points_that_the_lens_does_not_image_are_not_part_of_a_limb() -> None:
     points = np.full((8, 2), np.nan)
     view = limb_in_view(points, np.zeros(8, dtype=bool), np.ones(8, dtype=bool), (10.0, 10.0))
     assert view == LimbInView(0.0, 0.0, 0.0)

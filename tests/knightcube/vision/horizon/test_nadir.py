@@ -180,7 +180,7 @@ def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
     assert found.nadir is None
 
 
-def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_told() -> None:
+def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> None:
     """The paper's uniqueness problem (Fig. 14), made perfect: either rim may be limb, the other shadow."""
     scene = limb_scene(1000e3, zenith=np.array([1.0, 0.2, 0.3]), sun=np.array([1.0, 0.3, 0.2]), dip=0.25)
     frame = render(MODEL, scene, np.random.default_rng(4))
@@ -194,7 +194,7 @@ def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_told() -> None:
     assert np.degrees(np.arccos(np.minimum(1.0, nearest))).max() < 0.5
 
 
-def test_the_terminator_is_told_from_the_limb() -> None:
+def test_the_terminator_is_distinguished_from_the_limb() -> None:
     """A crescent: the inner edge is as bright and as round as the outer, and stays out of the fit."""
     generator = np.random.default_rng(31)
     scene = random_scene(generator, MODEL, "terminator", (1200e3, 1800e3))

@@ -276,7 +276,7 @@ def test_frames_without_an_object_have_none() -> None:
         (10.0, -4.0, 4.6),
     ],
 )
-def test_overlapping_streaks_of_two_stars_are_no_object(
+def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
     along: float, across: float, magnitude: float
 ) -> None:
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
@@ -328,7 +328,7 @@ def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: f
     np.testing.assert_allclose(found.endpoints, [place, place], atol=0.3)
 
 
-def test_a_bright_star_whose_core_is_saturated_is_no_object() -> None:
+def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() -> None:
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, _PLACE[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 0.5), _ROTATION, 1.0)
@@ -336,7 +336,7 @@ def test_a_bright_star_whose_core_is_saturated_is_no_object() -> None:
     assert report.objects == ()
 
 
-def test_a_piece_of_a_faint_star_is_no_object() -> None:
+def test_a_piece_of_a_faint_star_is_not_reported_as_an_object() -> None:
     """At the limit of segmentation a streak falls into pieces; their light is a star's."""
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, 5.5)
     faint = np.concatenate([directions, _PLACE[None]])

@@ -74,7 +74,7 @@ def test_an_object_beside_a_catalogue_star_is_sighted_where_it_is(
     assert len(sighted.points) == 1
 
 
-def test_stars_alone_are_no_objects() -> None:
+def test_stars_alone_are_not_reported_as_objects() -> None:
     far = Shot(np.array([-900.0, -900.0]), np.zeros(2), 4.0, np.zeros(3))
     sighted = far.found().objects
     assert sighted is not None
@@ -83,8 +83,8 @@ def test_stars_alone_are_no_objects() -> None:
 
 @pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize(("turn", "magnitude"), [(0.0, -1.0), (0.02, 2.0)])
-def test_a_bright_satellite_is_no_star(turn: float, magnitude: float, knows: bool) -> None:
-    """Not to the identification, tracked or lost in space, nor to the refit with the catalogue."""
+def test_a_bright_satellite_is_not_named_as_a_star(turn: float, magnitude: float, knows: bool) -> None:
+    """Neither the identification, tracked or lost in space, nor the refit with the catalogue names it."""
     place, motion = np.array([203.3, 301.8]), np.array([2.5, 1.0])
     shot = Shot(place, motion, magnitude, np.array([0.0, turn, 0.0]), knows)
     found = shot.found()

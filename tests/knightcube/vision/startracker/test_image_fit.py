@@ -136,7 +136,7 @@ def test_stars_in_one_direction_fix_no_attitude() -> None:
         _fit(points, np.tile(np.eye(2), (3, 1, 1)), _reference(points))
 
 
-def test_stars_that_belong_elsewhere_are_no_attitude() -> None:
+def test_stars_that_belong_elsewhere_do_not_give_an_attitude() -> None:
     """Two stars a right angle apart where the image shows them together: no turn brings them there."""
     points = np.array([[500.0, 500.0], [520.0, 500.0]])
     reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])

@@ -128,7 +128,7 @@ def test_a_file_gives_back_what_was_saved_and_the_same_stars_make_the_same_bytes
 
 
 @pytest.mark.parametrize("place", [12, 200, -1])
-def test_a_flipped_bit_is_told_with_its_cure(stored: Path, tmp_path: Path, place: int) -> None:
+def test_a_flipped_bit_is_reported_with_its_cure(stored: Path, tmp_path: Path, place: int) -> None:
     damaged = bytearray(stored.read_bytes())
     damaged[place] ^= 1
     path = tmp_path / "damaged.index"

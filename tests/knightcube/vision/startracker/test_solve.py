@@ -118,7 +118,7 @@ def test_a_wrong_prior_costs_time_but_no_truth() -> None:
     assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
 
 
-def test_an_attitude_far_from_its_prior_is_not_taken_for_the_one_there() -> None:
+def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
     """The brightest place is 1.2 px off, by a star beside it: four agree on a roll of 30 prior sigmas."""
     camera, sigma = Pinhole.from_field_of_view(512, 512, float(np.radians(20.0))), 1e-4
     prior = np.array([-0.40584763582055994, 0.7184116261147981, 0.029066639845090374, 0.5642052484779536])
@@ -146,7 +146,7 @@ def test_noise_alone_shows_no_star() -> None:
     assert found.reason
 
 
-def test_points_that_are_no_stars_are_refused_with_the_reason() -> None:
+def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
     """A real frame's points, moved about at random: the same light, another sky."""
     rng = np.random.default_rng(17)
     pixels = rng.normal(100.0, 10.0, (1024, 1024))

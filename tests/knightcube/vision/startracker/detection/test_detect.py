@@ -175,7 +175,7 @@ def test_a_bright_corner_full_of_leaves_does_not_drown_the_stars() -> None:
     assert np.count_nonzero((found.points > 390.0).all(axis=1)) <= 8
 
 
-def test_a_saturated_moon_is_no_star() -> None:
+def test_a_saturated_moon_is_not_detected_as_a_star() -> None:
     frame = sky(np.random.default_rng(2), (512, 512))
     row, column = np.indices(frame.shape)
     frame[np.hypot(row - 250, column - 300) < 30.0] = 65_535.0
@@ -198,7 +198,7 @@ def test_a_sky_cut_off_at_zero_gives_no_flood_of_false_stars() -> None:
     assert len(detect(frame).stars()) <= 3
 
 
-def test_frames_of_points_and_of_streaks_are_told_apart() -> None:
+def test_frames_of_points_and_of_streaks_are_distinguished() -> None:
     assert survey(real_sky(1, 1.2, 0.001, 0.2).pixels).shape.kind is FrameKind.POINTS
     streaked = survey(real_sky(1, 1.2, 40.0, 0.2).pixels).shape
     assert streaked.kind is FrameKind.STREAKS
@@ -231,7 +231,7 @@ def test_no_more_stars_than_asked_for_are_returned() -> None:
         np.zeros((50, 50), dtype=bool),
     ],
 )
-def test_what_is_no_frame_is_refused(frame: Image) -> None:
+def test_an_array_that_is_not_a_frame_is_refused(frame: Image) -> None:
     with pytest.raises(ValueError, match="frame"):
         detect(frame)
 

@@ -103,7 +103,7 @@ def test_surfaces_agree_with_the_background_s_own_map() -> None:
     assert down @ across == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_plateau_is_taken_for_saturation_and_a_dim_frame_s_last_count_is_not() -> None:
+def test_a_plateau_counts_as_saturation_and_a_dim_frame_s_last_count_does_not() -> None:
     rng = np.random.default_rng(5)
     dim = rng.poisson(3.0, (200, 200)).astype(np.uint8)
     sky = measure_sky(dim)
