@@ -1,8 +1,8 @@
 """The body seam: the interface between the loop and the body that it flies.
 
-The loop uses attitudes, rates and dipoles. A body defines the form of targets, how a path to a target is
-planned and tracked, and its own packets. `flight.bodies` holds the bodies; a third party's `BodyKind` is
-named in the configuration as `module:object`.
+A body is a kind of vehicle. The loop itself uses only attitudes, rates and dipoles. The body defines the form
+of its targets, how a path to a target is planned and tracked, and its own packets. `flight.bodies` contains
+the bodies. The configuration names the `BodyKind` of another package as `module:object`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 COMMANDED = 1000
 """Number of the first commanded slew."""
 KEPT = -1
-"""Number of an attitude that is only held; no packet has it."""
+"""Number of a target that holds the present attitude; packets never contain this number."""
 
 
 class Reference(Protocol):
@@ -39,27 +39,27 @@ class Reference(Protocol):
 
     @property
     def quaternion(self) -> FloatArray:
-        """(4,) reference frame into body."""
+        """Attitude quaternion (4,), reference frame into body axes."""
 
     @property
     def body_rate(self) -> FloatArray:
-        """(3,) rad/s, body axes."""
+        """Angular rate (3,) rad/s, body axes."""
 
 
 class TargetLaw(Protocol):
-    """The attitude to be reached over time, in a body's own form."""
+    """The wanted attitude as a function of time; each kind of body has its own implementation."""
 
     @property
     def text(self) -> str:
-        """The law as text, for events."""
+        """Description of the target, for events."""
 
     def quaternion(self, now_ns: int) -> FloatArray:
-        """Return the attitude (4,) to be reached at `now_ns`, reference into body."""
+        """Return the wanted attitude (4,) at `now_ns`, reference frame into body axes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """An attitude law with its number in packets: that of a step, COMMANDED and up, or KEPT."""
+    """A target with its number in packets: the number of a configured step, COMMANDED or higher, or KEPT."""
 
     index: int
     law: TargetLaw
@@ -67,7 +67,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilCommand:
-    """A tracker's command: the dipole (3,) A m^2, and the currents (3,) A that make it."""
+    """A tracker's command: the dipole (3,) A m^2, and the currents (3,) A that produce it."""
 
     dipole: FloatArray
     currents: FloatArray
@@ -75,7 +75,7 @@ class CoilCommand:
 
 
 class SteeringState(IntEnum):
-    """The use of the coils; the values are those of the control packet."""
+    """The use of the coils; the values are the numbers in the control packet."""
 
     OFF = 0
     FOLLOWING = 1
@@ -88,10 +88,10 @@ class Steered:
     """The result of steering in one cycle.
 
     Attributes:
-        reference: the body's `Reference` now; None without a path.
-        dipole: (3,) A m^2, commanded.
-        currents: (3,) A, sent to the driver after reallocation and with the coil monitor's probe; zero after
-            a fault of this cycle that switched the coils off.
+        reference: the reference motion at this time; None without a path.
+        dipole: commanded dipole (3,) A m^2.
+        currents: currents (3,) A that were sent to the driver, after reallocation and including the probe of
+            the coil monitor. They are zero if a fault in this cycle switched the coils off.
     """
 
     state: SteeringState
@@ -106,9 +106,10 @@ class ControlOutput:
     """The results of one control cycle.
 
     Attributes:
-        estimate: measured, or propagated by the model alone; None without an estimate.
+        estimate: state estimate, from measurements or propagated by the model alone; None without an
+            estimate.
         target: target in force; None before the first target.
-        written: coil command on the wire at the end of the cycle.
+        written: coil command that the PWM chip holds at the end of the cycle.
     """
 
     cycle: Cycle
@@ -128,8 +129,8 @@ class ReadingAgreement:
     """How a reading of the inertial unit agrees with the estimate.
 
     Attributes:
-        holds: whether at least a part agrees, so that the estimate counts as measured.
-        objection: the part that does not agree, as text; empty if all parts agree.
+        holds: whether at least one quantity of the reading agrees, so that the estimate counts as measured.
+        objection: the quantity that does not agree, as text; empty if all quantities agree.
     """
 
     holds: bool
@@ -149,7 +150,7 @@ class Filter(Protocol):
 
     @property
     def doubts_commands(self) -> bool:
-        """Whether the body does not move as commanded, so that the coil currents are unknown."""
+        """Whether the motion of the body contradicts the commands, so that the coil currents are unknown."""
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
         """Record the coil currents (3,) A in force from `time_ns` on, and whether they are known."""
@@ -158,10 +159,10 @@ class Filter(Protocol):
         """Treat the currents recorded since a time as unknown."""
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times; `applied` is called with whether each passed the gate."""
+        """Apply measurements of past times; `applied` is called with whether each passed its gate."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Continue with late measurements by at most `most` steps, or to the end."""
+        """Apply at most `most` of the measurements that `measure_late` queued, or all of them."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself does not change."""
@@ -174,52 +175,52 @@ class Filter(Protocol):
 
 
 class ReadingFeed(Protocol):
-    """Gives the filter the quantities of a reading that this body uses."""
+    """Passes those quantities of a reading that this kind of body uses to the filter."""
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
-        """Start the filter from a reading, or apply it."""
+        """Start the filter from a reading, or apply the reading to a running filter."""
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start a filter without an estimate from a star fix; return whether it started."""
+        """Start a filter that has no estimate from a star fix; return whether the filter started."""
 
 
 class WindowedLaw(Protocol):
-    """Drives the coils by magnetometer and gyro alone, in windows with a pause of the coils."""
+    """A control law that uses magnetometer and gyro only, in windows that begin with the coils off."""
 
     def begin(self, now_ns: int) -> None:
-        """Begin with no knowledge of the field."""
+        """Begin without knowledge of the magnetic field."""
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
         """Accept a field (3,) T and a gyro's rate (3,) rad/s measured at `time_ns`.
 
-        Ignored unless the coils were off and settled.
+        The sample is ignored unless the coils were off and their field had decayed.
         """
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now, which is zero while the field is measured or the rate is unknown."""
 
     def sent(self, currents: FloatArray) -> None:
-        """Accept the currents (3,) A that were sent, which differ from the command if a coil is excluded."""
+        """Accept the currents (3,) A that were sent. They differ from the command if a coil is excluded."""
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes now; None before it is known."""
+        """Return the present magnetic field (3,) T in body axes; None before it is known."""
 
 
 class Tracker(Protocol):
-    """Computes a command from estimate and reference, once in a control cycle."""
+    """Computes a coil command from estimate and reference motion, once in each control cycle."""
 
     def command(self, estimate: Estimate, reference: Any) -> CoilCommand:
-        """Return the command that keeps the body on the reference."""
+        """Return the command that keeps the body on the reference motion."""
 
     def reset(self) -> None:
-        """Discard integrated errors after a time with the coils off or without an estimate."""
+        """Reset the integrated errors after an interval with the coils off or without an estimate."""
 
 
 class FlownPaths(Protocol):
     """The path being flown."""
 
     def sample(self, now_ns: int) -> Any | None:
-        """Return the `Reference` now; None without a path."""
+        """Return the reference motion at this time; None without a path."""
 
     def is_following(self, now_ns: int) -> bool:
         """Return whether a path is being followed, rather than its end held."""
@@ -232,19 +233,19 @@ class FlownPaths(Protocol):
 
 
 class Planner(Protocol):
-    """Requests paths from the worker and offers them to guidance."""
+    """Requests paths from the planner worker and passes them to guidance."""
 
     def busy_since_ns(self) -> int | None:
-        """Return when the worker began its plan (ns); None while it is idle."""
+        """Return the time (ns) at which the worker began the present plan; None while the worker is idle."""
 
     def aim(self, target: Target, now_ns: int) -> None:
         """Set a new target, and request a plan for it at once."""
 
     def request(self, now_ns: int) -> None:
-        """Request a plan, which is made once there is an estimate and the worker is free."""
+        """Request a plan, which starts as soon as there is an estimate and the worker is idle."""
 
     def resume(self, now_ns: int) -> None:
-        """Request the rest of a path after a time without control."""
+        """Request a path for the remaining time to the target after an interval without control."""
 
     def replan(self, cycle: Cycle) -> None:
         """Request the periodic plan: the task of the replanning rate group."""
@@ -253,23 +254,23 @@ class Planner(Protocol):
         """Submit the requested job to the worker."""
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Offer the worker's plan to guidance."""
+        """Pass the worker's plan to guidance."""
 
     def counts(self) -> tuple[int, int]:
-        """Return the numbers of plans accepted and refused since the start."""
+        """Return how many plans were accepted and how many were refused since the start."""
 
 
 class BodyTargets(Protocol):
-    """The body's targets, and the distance from them."""
+    """The targets of a body, and the angle between body and target."""
 
     def configured(self, mission_time_ns: int) -> Target:
-        """Return the configured target in force at a mission time."""
+        """Return the configured target at a mission time."""
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of a command, in this body's form. Raises UsageError if it cannot be flown."""
+        """Return the target that a command describes. Raises UsageError if this body cannot fly to it."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
-        """Hold the present attitude, as closely as the body can; return it as a target."""
+        """Return a target that holds the present attitude, or the nearest attitude that can be held."""
 
     def can_hold(self, estimate: Estimate) -> bool:
         """Return whether the coils could hold the present attitude."""
@@ -281,11 +282,11 @@ class BodyTargets(Protocol):
         """Return the angle between body and target, rad."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle (rad) to the attitude that is due; None while none is due."""
+        """Return the angle (rad) to the attitude that is due now; None while no attitude is due."""
 
 
 class BodyView(Protocol):
-    """The body's own packets and texts."""
+    """The packets and texts that a kind of body adds."""
 
     def record_cycle(self, output: ControlOutput) -> None:
         """Record the body's own packet of a control cycle."""
@@ -311,10 +312,10 @@ class HorizonCameraUse(Protocol):
         """Whether frames are needed often, because the attitude is poorly known."""
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
-        """Return the worker's job for frames by their cameras' numbers."""
+        """Return the worker's job for frames, given by the number of their camera."""
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Accept Sun and nadir of a time; return whether each was used."""
+        """Accept the directions of Sun and nadir at a time; return for each whether it was used."""
 
 
 class BodyEstimation(Protocol):
@@ -341,7 +342,7 @@ class BodyEstimation(Protocol):
         """Return the magnetic field (3,) T in body axes at an estimate, for the reallocation of currents."""
 
     def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the body's white angular acceleration, body axes."""
+        """Return the spectral density (3, 3) rad^2/s^3 of the white angular acceleration, body axes."""
 
     def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
         """Return the parameters from which the next boot starts."""
@@ -358,7 +359,7 @@ class BodyEstimation(Protocol):
     def velocity(self, time_ns: int) -> FloatArray | None:
         """Return the velocity (3,) m/s about the Sun, reference axes, for the aberration of starlight.
 
-        None if the configured velocity holds.
+        The result is None if the configured velocity is to be used.
         """
         return None
 
@@ -367,7 +368,7 @@ class BodyEstimation(Protocol):
         return False
 
     def accept_sun(self, reading: StringReading) -> str | None:
-        """Accept a reading of the solar cells; return its fault, else an empty text; None if not judged."""
+        """Accept a reading of the solar cells; return its fault or an empty text; None if not checked."""
         return None
 
 
@@ -377,10 +378,10 @@ class BodyControl(Protocol):
     A body inherits from this class. The defaults are those of a body that follows no objects.
 
     Attributes:
-        modes: the modes that this body has.
-        dipole_per_ampere: n A of each coil, m^2.
+        modes: the modes that exist for this body.
+        dipole_per_ampere: turns times area of each coil, m^2.
         free_axis: (3,) the only axis about which the body can rotate; None for a free body.
-        detumbling: the law of detumbling.
+        detumbling: the control law for detumbling.
         sun_acquisition: turns the body to the Sun without an attitude, in SAFE; None if the body cannot.
     """
 
@@ -399,7 +400,7 @@ class BodyControl(Protocol):
         return False
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Accept the confirmed tracks of objects after each frame that was searched."""
+        """Accept the confirmed tracks of objects, after each frame that was searched for objects."""
         return
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
@@ -412,7 +413,7 @@ class FlightBody:
     """A body ready to fly.
 
     Attributes:
-        streak_estimator: the estimator that `camera.estimator` names, if it is not the usual one.
+        streak_estimator: the estimator that `camera.estimator` names; None for the default estimator.
     """
 
     estimation: BodyEstimation
@@ -426,8 +427,8 @@ class BodyKind:
     """A kind of body.
 
     Attributes:
-        plan: function of the planner worker, from a job to a plan; None without a planner.
-        make: builds the body of a configuration, with the parameters that an earlier boot learned.
+        plan: function that the planner worker runs, from a job to a plan; None without a planner.
+        make: builds the body from a configuration and the parameters that an earlier boot learned.
     """
 
     plan: Callable[[Any], Any] | None

@@ -36,7 +36,7 @@ class RunLabel:
 
 @dataclass(frozen=True, slots=True)
 class FlightProgress:
-    """Times in s, currents (3,) in A; `attitude` is the body's text of target and attitude."""
+    """Progress of a flight: times (s), currents (3,) A, and `attitude`, a text with target and attitude."""
 
     mission_time: float
     duration: float
@@ -56,14 +56,14 @@ class FlightEnding:
 
     Attributes:
         mission_time: s.
-        cycles: control cycles that were run to their end.
+        cycles: number of completed control cycles.
         mode: label of the mode.
-        alarms: names of the facts that held.
+        alarms: names of the active facts.
         faults: number of each event of severity fault, including events that the throttle held back.
-        warnings: the same for severity warning.
+        warnings: number of each event of severity warning, including events that the throttle held back.
         coils_left_out: axes of excluded coils.
-        coils_at_zero: whether the driver's last write, acknowledged by the chip, was zero.
-        coil_error: why the last write failed; empty if it succeeded.
+        coils_at_zero: whether the last command that the PWM chip acknowledged was zero current.
+        coil_error: why the last write to the PWM chip failed; empty if it succeeded.
     """
 
     mission_time: float = 0.0
@@ -87,12 +87,12 @@ def nothing() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Supervisors:
-    """The parts around the loop.
+    """The services that supervise the loop.
 
     Attributes:
-        beat: the guardian's heartbeat, called after each control cycle without an error.
-        keeper: stores the state that outlives the process; None if no state is stored.
-        board: reads processor, memory, disk and temperature; None in lock-step.
+        beat: sends the guardian's heartbeat; called after each control cycle without an error.
+        keeper: stores the state that the next boot needs; None if no state is stored.
+        board: reads processor load, memory, free disk space and temperature; None in lock-step simulation.
     """
 
     beat: Callable[[], None] = nothing
@@ -101,7 +101,7 @@ class Supervisors:
 
 
 class FlightLoop:
-    """One flight: from the release at mission time zero to the end of the configured duration."""
+    """One flight, from the release of the body at mission time zero to the end of the configured duration."""
 
     def __init__(
         self, config: Config, body: FlightBody, tasks: LoopTasks, services: Services, supervisors: Supervisors
@@ -121,7 +121,7 @@ class FlightLoop:
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
-        # In lock-step, jobs run in the calling thread: their time is not a cycle's execution time.
+        # In lock-step simulation jobs run in the calling thread. The execution time of a cycle excludes them.
         jobs = services.jobs
         self._executive = CyclicExecutive(
             services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
@@ -129,16 +129,16 @@ class FlightLoop:
 
     @property
     def restart(self) -> str:
-        """Why the process must be restarted after this flight; empty if it need not."""
+        """Why the process must be restarted after this flight; empty if no restart is needed."""
         return self._tasks.modes.restart
 
     def stop(self, reason: str) -> None:
-        """End the flight after the running cycle. Safe from a signal handler."""
+        """End the flight after the running cycle. A signal handler may call this method."""
         self._stop_reason = reason
         self._executive.stop()
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Keep an event from before the flight, to be reported at its start."""
+        """Store an event that occurred before the flight; it is reported when the flight starts."""
         self._notes.append((kind, text))
 
     def watch(self, progress: Callable[[FlightProgress], None]) -> None:
@@ -146,7 +146,7 @@ class FlightLoop:
         self._show = progress
 
     def run(self, epoch_ns: int, label: RunLabel) -> str:
-        """Fly from `epoch_ns` on; return why the flight ended. The coils are at zero on return or error."""
+        """Fly from `epoch_ns` on; return why the flight ended. The coils are off on return or error."""
         services = self._services
         self._begin(epoch_ns, label)
         try:
@@ -264,7 +264,7 @@ class FlightLoop:
         self._show(progress)
 
     def _keep_state(self, now_ns: int) -> None:
-        """Give the state that outlives the process to its keeper, and report its events; no disk access."""
+        """Pass the state for the next boot to its keeper, and report the keeper's events; no disk access."""
         keeper = self._supervisors.keeper
         if keeper is None:
             return

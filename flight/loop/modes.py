@@ -33,7 +33,7 @@ from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarg
 
 
 class Trigger(Enum):
-    """An occurrence that may change the mode: end of the boot, command, reaction, or achievement."""
+    """A trigger of the mode table: end of the boot, command, reaction to an event, or a goal reached."""
 
     START_SAFE = "start in safe"
     START_DETUMBLE = "start in detumble"
@@ -74,7 +74,7 @@ COMMANDS = {
     Mode.SUN: Trigger.COMMAND_SUN,
     Mode.POINT: Trigger.COMMAND_POINT,
 }
-"""The trigger of a command for each mode; BOOT and ACQUIRE cannot be commanded."""
+"""The trigger that a command of each mode causes; BOOT and ACQUIRE cannot be commanded."""
 
 KNOWN = {Mode.SUN: Trigger.KNOWN_SUN, Mode.POINT: Trigger.KNOWN_POINT}
 """The trigger that ends the acquisition, for each mode that may follow."""
@@ -99,7 +99,7 @@ _USUAL: Row = {
     Trigger.REACT_SAFE: Mode.SAFE,
     Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
 }
-"""The answers of a mode that steers the body, before its exceptions."""
+"""Default answers of a mode that steers the body; the table overrides some of them."""
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
@@ -109,7 +109,7 @@ TRANSITIONS: Table = {
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: TriggerAnswer.STAY,
     },
-    Mode.SAFE: {  # left by command only; the way to pointing leads through the acquisition
+    Mode.SAFE: {  # the body leaves SAFE only by command; a command to point first starts the acquisition
         **_USUAL,
         Trigger.COMMAND_SUN: Mode.ACQUIRE,
         Trigger.COMMAND_POINT: Mode.ACQUIRE,
@@ -191,11 +191,11 @@ class ModeMachine:
         self.since_ns = 0
 
     def answer(self, trigger: Trigger) -> Mode | TriggerAnswer:
-        """Return the mode to which `trigger` would lead now, or why the mode would stay."""
+        """Return the mode to which `trigger` would lead now, or the answer that keeps the mode."""
         return self._table[self.mode][trigger]
 
     def fire(self, trigger: Trigger, now_ns: int) -> ModeChange | None:
-        """Follow the table; return the change, None when the mode stays or the trigger is refused."""
+        """Apply a trigger; return the change, or None if the mode stays or the trigger is refused."""
         after = self.answer(trigger)
         if isinstance(after, TriggerAnswer):
             return None
@@ -225,12 +225,12 @@ class HoldTimer:
         return now_ns - self._since_ns >= self._needed_ns
 
     def reset(self) -> None:
-        """Restart the measurement of the time."""
+        """Restart the timer."""
         self._since_ns = None
 
 
 class AttitudeWatch:
-    """Finds the triggers between acquisition and pointing, and decides when SAFE detumbles the body.
+    """Finds the triggers that lead from acquisition to pointing, and decides when SAFE detumbles the body.
 
     Attributes:
         follows: the mode that follows the acquisition; None if the body stays in ACQUIRE.
@@ -277,9 +277,10 @@ class AttitudeWatch:
         acquire_sun: Callable[[int], None],
         now_ns: int,
     ) -> None:
-        """Detumble a body in SAFE that turns fast until it is slow; otherwise turn it to the Sun.
+        """In SAFE, detumble a body that rotates fast until it is slow; otherwise turn the body to the Sun.
 
-        Both are off while `barred` by a latched fault. `detumble` or `acquire_sun` is called when it begins.
+        Neither is done while a latched fault forbids it (`barred`). `detumble` or `acquire_sun` is called
+        when detumbling or Sun acquisition begins.
         """
         if self.detumbles:
             self.detumbles = not (barred or self._slow.update(rate < self._low, now_ns))
@@ -312,7 +313,7 @@ class PointingWatch:
         self._off.reset()
 
     def watch_rate(self, rate: float, now_ns: int) -> None:
-        """Update TUMBLING from a rate, rad/s, not negative."""
+        """Update the fact TUMBLING from the magnitude of the body rate (rad/s)."""
         limit = self._settings.tumble_rate
         self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
 
@@ -339,7 +340,7 @@ SAFING_REACTIONS = {
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction has an effect: all, for a reaction that changes no mode."""
+    """Return the modes in which a reaction has an effect: all modes, if it changes no mode."""
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)
@@ -351,7 +352,7 @@ class ModeSettings:
     """Bounds of the modes.
 
     Attributes:
-        low_rate, low_for: rad/s and s: a rate below `low_rate` for `low_for` ends detumbling.
+        low_rate, low_for: detumbling ends when the rate has been below `low_rate` (rad/s) for `low_for` (s).
         stop: ends the flight after the running cycle, with a reason.
     """
 
@@ -362,9 +363,10 @@ class ModeSettings:
 
 
 class ModeControl:
-    """Owns the state machine, and the targets that are not configured.
+    """Owns the state machine, and the targets that commands set.
 
-    Longer than 200 lines because commands, reactions and achievements all act on the one mode and its target.
+    The class is longer than 200 lines because commands, reactions and reached goals all change the same mode
+    and target.
 
     Attributes:
         restart: why the process must be restarted; empty if it need not.

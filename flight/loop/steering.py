@@ -1,9 +1,9 @@
-"""Steering: from the estimate and the path to a coil command; zero without a trusted estimate.
+"""Steering: computes the coil command from the estimate and the path; zero without a trusted estimate.
 
-The coil drive excludes failed axes and reallocates the current of the others to preserve the torque
-direction. Written commands are compared with the supply current and the body's motion
-(`flight.loop.coil_monitor`). A verdict becomes a fact, the fact an event, and the event's reaction
-excludes the axis.
+The coil drive excludes failed axes and reallocates the current among the remaining axes so that the torque
+direction is preserved. Commands that were sent to the driver are compared with the supply current and the
+body's motion (`flight.loop.coil_monitor`). A verdict on an axis raises a fact. The fact raises an event,
+whose reaction excludes the axis.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _BROKEN = (facts.COIL_X_BROKEN, facts.COIL_Y_BROKEN, facts.COIL_Z_BROKEN)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilDriveSettings:
-    """The coils.
+    """Properties of the coils.
 
     Attributes:
-        dipole_per_ampere: n A of each, m^2.
-        limits: (3,) A.
-        free_axis: (3,) the only axis about which the body can turn; None for a free body.
+        dipole_per_ampere: turns times area of each coil, m^2.
+        limits: (3,) largest current of each coil, A.
+        free_axis: (3,) unit vector of the only axis about which the body can rotate; None for a free body.
     """
 
     dipole_per_ampere: float
@@ -48,7 +48,7 @@ class CoilDrive:
     """Commands the coils and monitors their response.
 
     Attributes:
-        command: (3,) A, sent to the driver in this cycle.
+        command: currents (3,) A that were sent to the driver in this cycle.
         available: (3,) bool, the axes in use.
     """
 
@@ -72,28 +72,28 @@ class CoilDrive:
         self.command: FloatArray = np.zeros(3)
 
     def state(self) -> CoilState:
-        """Return the command on the wire."""
+        """Return the command that the PWM chip holds now."""
         return self._coils.state()
 
     def off(self) -> None:
-        """Switch all coils off at the driver, at the flight's end."""
+        """Switch all coils off at the end of the flight."""
         self._coils.off()
 
     def fault(self) -> str:
-        """Return why the PWM chip takes no commands; empty if it takes them."""
+        """Return why the PWM chip does not accept commands; empty if it accepts them."""
         return self._coils.state().error
 
     @property
     def is_suspect(self) -> bool:
-        """Whether a coil without a verdict may carry another current than its command."""
+        """Whether the current of a coil without a verdict may differ from its command."""
         return self._watch.doubts_currents
 
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
     ) -> None:
-        """Compare the command on the wire with the supply current and the motion, once a cycle.
+        """Compare the command in force with the supply current and the motion, once in each control cycle.
 
-        If the currents since the last cycle are not `known`, the evidence so far is discarded.
+        If the coil currents since the last cycle are not `known`, all earlier evidence is discarded.
         """
         watch = self._watch
         if in_force.written_ns >= 0:
@@ -114,15 +114,15 @@ class CoilDrive:
         self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
     def adopt(self, modes: Modes) -> None:
-        """Go on with other bounds of the modes."""
+        """Replace the bounds of the modes."""
         self._watch.tumble_rate = modes.tumble_rate
 
     def isolate(self) -> None:
-        """Exclude the axes that have a verdict: the reaction to `coil-broken`."""
+        """Exclude the axes that have a verdict. This is the reaction to the event `coil-broken`."""
         self.available = self._watch.available
 
     def trust(self, now_ns: int) -> None:
-        """Use all axes again, by command; a lasting fault will be found again."""
+        """Use all axes again, on command. A lasting fault will be detected again."""
         for axis in range(3):
             self._watch.forget(axis)
         self._verdicts = 0
@@ -130,10 +130,11 @@ class CoilDrive:
         self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
-        """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
+        """Command currents (3,) A. For reallocation, `field` returns the field (3,) T in body axes."""
         usable = self.available & ~self._watch.resting
         if not all(usable.tolist()) and currents.any():
-            # The usable axes make the torque of all, or their part of it while the field is unknown.
+            # The usable axes produce the torque that all axes were commanded to produce. While the field is
+            # unknown, each usable axis keeps its own current.
             known, settings = field(), self._settings
             if known is None:
                 currents = np.where(usable, currents, 0.0)
@@ -181,9 +182,10 @@ class Steering:
         self._facts = services.facts
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
-        """Follow or hold in this cycle; `estimate` is None unless measured.
+        """Follow the path or hold its end; `estimate` is None unless it is based on measurements.
 
-        `ever_started` is whether there was an estimate before, so that None means a loss of control.
+        `ever_started` is whether there was an estimate before. An estimate of None then means a loss of
+        control.
         """
         control = self._body.control
         reference = control.paths.sample(now_ns)
@@ -218,7 +220,10 @@ class Steering:
         return self._run_law(self._body.control.detumbling, readings, current, now_ns)
 
     def acquire_sun(self, readings: Sequence[ImuReading], current: bool, now_ns: int) -> Steered:
-        """Turn to the Sun in this cycle, without an attitude; rest if the body has no Sun acquisition."""
+        """Turn the body to the Sun without an attitude.
+
+        Without Sun acquisition, zero current is commanded.
+        """
         acquisition = self._body.control.sun_acquisition
         if acquisition is None:
             return self.rest(now_ns)
@@ -227,7 +232,7 @@ class Steering:
     def _run_law(
         self, law: WindowedLaw, readings: Sequence[ImuReading], current: bool, now_ns: int
     ) -> Steered:
-        """Command the coils by a law that needs no estimate."""
+        """Command the coils by a control law that needs no estimate."""
         for reading in readings:
             law.sample(reading.time_ns, reading.field, reading.rate)
         text = "braking again" if current else "no reading fresh enough to brake by: coils to zero"
@@ -265,7 +270,7 @@ class Steering:
         dipole: FloatArray,
         saturated: bool = False,
     ) -> Steered:
-        """Check the PWM chip, which may switch the coils off; return the currents commanded in the end."""
+        """Check the PWM chip, whose fault switches the coils off; return the final commanded currents."""
         error = self._drive.fault()
         text = error or "the PWM chip takes commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)

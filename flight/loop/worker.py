@@ -1,20 +1,20 @@
 """A worker process, and the messages between the control process and its workers.
 
-The runner starts a worker as `python -m flight.loop.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD PARENT CORES`.
-The worker serves one function until its socket closes. The function's module may define `prepare`, which is
-called before the first job, for imports that only the worker needs. The kernel kills the process when its
-parent's thread ends, so no worker outlives its flight.
+The job runner starts a worker as `python -m flight.loop.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD PARENT
+CORES`. The worker serves one function until its socket closes. The function's module may define `prepare`,
+which is called before the first job, for imports that only the worker needs. The kernel kills the process
+when its parent's thread ends, so no worker outlives its flight.
 
-A message is a value whose large arrays lie in shared memory. A worker trusts the control process and
-unpickles its messages. The worker's answer is read as plain values: it may build dataclasses, enumerations
-and arrays of numbers, and call or import nothing. A worker whose memory is damaged can send a wrong value,
-but never run code in the control process or end it. Answers are not pickled, because numpy's unpickling ends
-the process on some damaged messages.
+Large arrays of a message are passed in shared memory. A worker trusts the control process and unpickles its
+messages. The control process decodes the worker's answer as plain values: decoding may construct dataclasses,
+enumerations and arrays of numbers, but does not call or import anything else. A worker whose memory is
+damaged can send a wrong value, but cannot run code in the control process or crash it. Answers are not
+pickled, because numpy crashes while it unpickles some damaged messages.
 
-Plain values are MessagePack, read by msgspec. Numbers, texts, bytes and None are themselves; everything else
-is a list that begins with a tag. Arrays of numbers lie in buffers beside the bytes, which name type and
-shape. Dataclasses, named tuples and enumerations are built only of modules that are loaded, and without a
-call of their own code.
+Plain values are encoded as MessagePack by msgspec. Numbers, texts, bytes and None are encoded directly; every
+other value is a list that begins with a tag. The content of an array of numbers is in a separate buffer; the
+MessagePack bytes state its type and shape. Only dataclasses, named tuples and enumerations of modules that
+are already imported are constructed, without a call of their own code.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MOST_DIMENSIONS = 32
 
 
 def encode_values(value: Any) -> tuple[bytes, list[Array]]:
-    """Return the bytes of a value, and its arrays beside them. Raises FlightError for other types."""
+    """Return the bytes of a value, and its arrays separately. Raises FlightError for an unsupported type."""
     arrays: list[Array] = []
     tree = _tree(value, arrays)
     try:
@@ -62,7 +62,7 @@ def encode_values(value: Any) -> tuple[bytes, list[Array]]:
 
 
 def decode_values(data: bytes, buffers: Sequence[bytearray]) -> Any:
-    """Undo `encode_values`, each array a view of its buffer. Damage raises an exception of any kind."""
+    """Decode a result of `encode_values`; arrays are views. Damaged data raise any exception."""
     return _Reader(buffers).made(msgspec.msgpack.decode(data))
 
 
@@ -94,7 +94,7 @@ def _tree_of_class(value: Any, name: str, arrays: list[Array]) -> list[Any]:
 
 
 class _Reader:
-    """Makes the value of a tree, whose arrays take the buffers one by one."""
+    """Decodes a value from plain lists and scalars; each array uses the next buffer."""
 
     def __init__(self, buffers: Sequence[bytearray]) -> None:
         self._buffers = iter(buffers)
@@ -125,7 +125,7 @@ class _Reader:
 
 
 def _array(dtype: str, shape: list[Any], buffer: bytearray) -> Array:
-    """Return an array of numbers that fills its buffer, and may be written to."""
+    """Return a writable array of numbers whose size equals that of its buffer."""
     if dtype not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
         raise FlightError(f"no array has type {dtype[:20]!r} and {len(shape)} dimensions")
     if not all(type(length) is int and length >= 0 for length in shape):
@@ -176,16 +176,16 @@ def _field_names(kind: Any) -> tuple[str, ...] | None:
 
 
 SLAB_BYTES = 64 * 1024 * 1024
-"""Shared memory for a job's arrays: only address space until used."""
+"""Size (bytes) of the shared memory for a job's arrays; unused pages take no memory."""
 LONGEST_BYTES = 16 * 1024 * 1024
-"""A message without its arrays that claims to be longer is damaged."""
+"""Largest length (bytes) of a message without its arrays; a greater length indicates damage."""
 
 _HEADER = struct.Struct("<QQI")
-"""Lengths of the arrays' sizes and of the body, and the CRC-32 of both."""
+"""Header of a message: length of the list of array sizes, length of the body, and the CRC-32 of both."""
 
 
 def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
-    """Pickle a value: its large buffers go into the slab, the rest is returned with its length in front.
+    """Pickle a value; copy its large buffers into the slab, and return the rest after its length.
 
     Raises FlightError if the slab is too small.
     """
@@ -195,31 +195,31 @@ def pack_trusted(value: Any, slab: mmap.mmap) -> bytes:
 
 
 def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
-    """Undo `pack_trusted` of a process that is trusted, copying the buffers out of the slab."""
+    """Unpickle a message of a trusted process, with copies of its buffers from the slab."""
     body, buffers = _parts(message, slab)
     return pickle.loads(body, buffers=buffers)
 
 
 def pack_values(value: Any, slab: mmap.mmap) -> bytes:
-    """Pack a value for a reader that does not trust the sender. Raises FlightError for other types."""
+    """Pack a value for a receiver that does not trust the sender. Raises FlightError for other types."""
     body, arrays = encode_values(value)
     return _framed(body, [array.reshape(-1).view("u1").data for array in arrays], slab)
 
 
 def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
-    """Undo `pack_values` of a worker. Raises FlightError for damage."""
+    """Return the value of a message of a worker, made by `pack_values`. Raises FlightError for damage."""
     try:
         return decode_values(*_parts(message, slab))
     except FlightError:
         raise
-    except Exception as error:  # a damaged stream fails in any way
+    except Exception as error:  # damaged data can raise any exception
         raise FlightError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message that `data` begins with, None before the header is complete.
+    """Return the length of the message at the start of `data`; None while its header is incomplete.
 
-    Raises FlightError for a length that no message has.
+    Raises FlightError for a length outside the permitted range.
     """
     if len(data) < _HEADER.size:
         return None
@@ -269,12 +269,12 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             del received[:length]
             line.sendall(_answer(function, argument, slab))
             del argument
-            # After the result was sent, so that nothing waits for this.
+            # Memory is returned after the result was sent, so that the result is not delayed.
             give_back()
 
 
 def _answer(function: Any, argument: Any, slab: mmap.mmap) -> bytes:
-    """Return the message of a job's result, or of its failure if the result cannot be sent."""
+    """Return a message with a job's result, or with an error if the result cannot be encoded."""
     outcome = _run(function, argument)
     try:
         return pack_values(outcome, slab)
@@ -299,18 +299,19 @@ def end_with(parent: int) -> None:
 
 
 def give_back() -> None:
-    """Return the heap's free memory to the kernel: tens of MB after a frame, in about 2 ms."""
+    """Return the free memory of the heap to the kernel: tens of MB after a frame; takes about 2 ms."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def lean_numpy() -> None:
-    """Keep scipy from importing parts of numpy that no job uses: 11 MiB and 0.2 s of each process.
+    """Prevent scipy from importing unused parts of numpy, which saves 11 MiB and 0.2 s in each process.
 
-    scipy copies all that numpy lists, and so imports its masked arrays, its test support and its reader of
-    Fortran (scipy/_lib/array_api_compat). Call before scipy's import; the parts are no longer listed, but
-    still there for a module that names them. With another numpy this has no effect.
+    scipy (scipy/_lib/array_api_compat) copies every name that numpy lists, and so imports numpy's masked
+    arrays, test support and Fortran reader. This function must be called before scipy is imported. It removes
+    these modules from numpy's list of names; they can still be imported explicitly. With another version of
+    numpy it has no effect.
     """
     np.__all__ = [name for name in np.__all__ if name not in _SELDOM]
     lazy = getattr(np, "__numpy_submodules__", None)
@@ -319,7 +320,7 @@ def lean_numpy() -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Import the function, then serve."""
+    """Import the worker's function, then serve jobs until the socket closes."""
     function_name, socket_fd, memory_fd, parent, cores = arguments
     end_with(int(parent))
     module, _, name = function_name.partition(":")
