@@ -162,7 +162,7 @@ class Filter(Protocol):
         """Apply measurements of past times; `applied` is called with whether each passed its gate."""
 
     def catch_up(self, most: int | None = None) -> None:
-        """Apply at most `most` of the measurements that `measure_late` queued, or all of them."""
+        """Apply up to `most` of the measurements after a late measurement again, or all of them."""
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself does not change."""

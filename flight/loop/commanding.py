@@ -1,10 +1,11 @@
-"""Commanding: executes commands from channels and from the time line, and answers them.
+"""Commanding: executes and answers commands that arrive on channels or are due on the time line.
 
 The dispatcher is one of the named containment boundaries: no command can end the loop.
 
-The table of parameters is replaced as a whole by a command, and kept for the next boots. A table is checked
-before it is flown: its ranges, then the schema's bounds. If a flight ends uncleanly within `PROVEN_NS` of a
-load, the next boot flies the table before (`flight.loop.state`).
+A command replaces the table of parameters as a whole; the new table is stored for the next boots. Before a
+table takes effect, its values are checked against their ranges and against the bounds of the schema. If a
+flight ends uncleanly within `PROVEN_NS` after a load, the next boot uses the previous table
+(`flight.loop.state`).
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ from flight.schema.sections import CommandStep, Config, Health, Modes
 S = TypeVar("S", Modes, Health)
 
 PROVEN_NS = 60_000_000_000
-"""Flight time (ns) after which a loaded table stays even if the flight ends uncleanly."""
+"""Flight time (ns) after which a loaded table is kept even if the flight ends uncleanly."""
 
 
 class OnboardParameters:
@@ -66,7 +67,7 @@ class OnboardParameters:
         keeper: StateKeeper | None,
         services: Services,
     ) -> None:
-        """Start with the configuration's values, or with a table that the `keeper` has.
+        """Start with the values of the configuration, or with the table that the `keeper` has stored.
 
         `adopt_modes` and `adopt_health` replace the limits of the tasks that use them.
         """
@@ -81,10 +82,14 @@ class OnboardParameters:
         self._loaded_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Apply the stored table, if this version and configuration accept it; record the table in force."""
+        """Apply the stored table if this software version and configuration accept it.
+
+        Record the active table.
+        """
         self._loaded_ns = now_ns
         if kept := self._table.values:
-            # Another version of the software may have added or removed keys; the configuration fills them.
+            # Another version of the software may have added or removed keys: missing keys take the value of
+            # the configuration.
             table = {key: kept.get(key, value) for key, value in self._configured.items()}
             if problem := problem_of(table) or self._adopt(table):
                 self._table = msgspec.structs.replace(self._table, values={}, proven=True)
@@ -92,12 +97,15 @@ class OnboardParameters:
         self.dump(now_ns)
 
     def run(self, now_ns: int) -> None:
-        """Mark a table that has flown for `PROVEN_NS` as proven."""
+        """Mark a table that has been in use for `PROVEN_NS` as proven."""
         if not self._table.proven and now_ns - self._loaded_ns >= PROVEN_NS:
             self._keep(msgspec.structs.replace(self._table, proven=True))
 
     def load(self, values: Mapping[str, float], replaced: int, now_ns: int) -> str:
-        """Replace the table whose CRC is `replaced`; return why the new table is refused, else ""."""
+        """Replace the table whose CRC is `replaced`.
+
+        Return why the new table is refused, or an empty text.
+        """
         if replaced != self._crc:
             return f"the table that flies is {self._crc:08x}, not {replaced:08x}: dump it and look again"
         before = self._table.values if self._table.proven else self._table.before
@@ -111,7 +119,7 @@ class OnboardParameters:
         return ""
 
     def dump(self, now_ns: int) -> None:
-        """Record the table."""
+        """Record the active table as a packet."""
         named = {
             field.name: self._values[key] for field, key in zip(PARAMETER_FIELDS, PARAMETER_KEYS, strict=True)
         }
@@ -133,7 +141,7 @@ class OnboardParameters:
             self._keeper.note_table(table)
 
     def _adopt(self, values: Mapping[str, float]) -> str:
-        """Give a table to all tasks that use it; return why the schema refuses it, else ""."""
+        """Pass a table to all tasks that use it; return why the schema refuses it, or an empty text."""
         try:
             modes = _section(self._config.modes, "modes", values)
             health = _section(self._config.health, "health", values)
@@ -152,7 +160,10 @@ def _value(config: Config, key: str) -> Any:
 
 
 def _section(section: S, name: str, values: Mapping[str, float]) -> S:
-    """Return a section of the configuration with the values of a table. Raises ValidationError."""
+    """Return a section of the configuration with the values of a table.
+
+    Raises ValidationError for invalid values.
+    """
     changes = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
     return msgspec.convert({**msgspec.to_builtins(section), **changes}, type(section))
 
@@ -210,7 +221,10 @@ class CommandTask:
                 channel.answer(answer, sender)
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
-        """Execute a datagram; return the fields of the answer, and whether it is a command packet."""
+        """Execute a datagram.
+
+        Return the fields of the answer, and whether the datagram is a command packet.
+        """
         command: Command | None = None
         problem = ""
         well_formed = True
@@ -226,7 +240,7 @@ class CommandTask:
         return self._conclude(source, command, problem, now_ns), well_formed
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
-        """Execute a command if it has no `problem`; report and record the result."""
+        """Execute a command unless a `problem` was found; report and record the result."""
         self._count += 1
         if command is not None and not problem:
             try:
@@ -250,7 +264,7 @@ class CommandTask:
         return fields
 
     def _obey(self, command: Command, now_ns: int) -> str:
-        """Execute a command; return why it is refused, else ""."""
+        """Execute a command; return why it is refused, or an empty text."""
         problem = ""
         match command:
             case Ping():
@@ -279,7 +293,7 @@ class CommandTask:
 
 
 def command_of(step: CommandStep) -> Command:
-    """Return the command of a step of a time line. Raises CommandError unless the step has one command."""
+    """Return the command of a time line step. Raises CommandError unless the step has exactly one command."""
     found: list[Command] = []
     if step.mode is not None:
         found.append(ChangeMode(Mode.named(step.mode)))

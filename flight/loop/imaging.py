@@ -1,7 +1,7 @@
-"""Imaging: triggers the star camera, passes frames to the vision worker and results to navigation.
+"""Imaging: triggers the star camera, passes its frames to the vision worker, and the results to navigation.
 
-The star camera is checked by sequence number, pixels and age of its frames, and by whether the stars match
-the catalogue. The objects that vision detects are tracked from frame to frame.
+The star camera is monitored by the sequence number, pixels and age of its frames, and by whether the detected
+stars match the catalogue. The objects that vision detects are tracked from frame to frame.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import FrameMotion, StreakStatus
 
 _LEAST_PRIOR_SIGMA = 5e-4
-"""Uncertainty (rad) of the mounting between the star camera and the inertial unit."""
+"""Standard deviation (rad) of the alignment between star camera and inertial unit."""
 _COURSE_NODES = 17
 """Number of times in an exposure at which the rate is sampled."""
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
@@ -64,19 +64,22 @@ class ImagingSettings:
 
     Attributes:
         exposures: exposure time as a function of the rate.
-        fine_rest_ns: minimum time between exposures while the attitude is fine and no object is searched for.
-        seeks: returns whether an object is searched for.
-        calm: returns the first time, from a time on, at which an exposure of a length meets no coil step.
-        late_ns: age after the exposure from which a frame is late.
+        fine_rest_ns: minimum time (ns) between exposures while the attitude knowledge is FINE and no object
+            is searched for.
+        seeks: function that returns whether an object is searched for.
+        calm: function of a time and an exposure time; returns the first time from then on at which the coil
+            currents are constant for the whole exposure.
+        late_ns: delay (ns) of a frame after its exposure from which the frame counts as late.
         max_rate: body rate (rad/s) above which there is no exposure.
-        slow_ns: processing time from which vision is slow.
-        mounting: (4,) body axes to camera axes.
-        angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
-            acceleration at a time.
+        slow_ns: processing time (ns) of a frame from which vision is reported as slow.
+        mounting: quaternion (4,) from body axes to camera axes.
+        angular_acceleration_psd: function of time; returns the power spectral density (3, 3), rad^2/s^3, of
+            the body's white angular acceleration.
         objects: settings of the search for objects; None without a search.
-        kept: storage of frames; None if frames are not kept.
-        velocity: returns the velocity (3,) m/s about the Sun at a time; None: the velocity in `tracker`.
-        knowledge: returns how well the attitude is known now.
+        kept: storage of frames; None if frames are not stored.
+        velocity: function of time; returns the velocity (3,), m/s, relative to the Sun, or None if the
+            velocity in `tracker` is to be used.
+        knowledge: function that returns the present quality of the attitude estimate.
     """
 
     camera: CameraModel
@@ -99,7 +102,7 @@ class ImagingSettings:
 
 
 class FrameMeasurer:
-    """Builds jobs from frames, and measurements from the worker's results."""
+    """Makes worker jobs from frames, and measurements from the results of these jobs."""
 
     def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
         self._settings = settings
@@ -109,8 +112,8 @@ class FrameMeasurer:
     def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
         """Return the worker's job for a frame.
 
-        `last_checksum` is the checksum of the previous frame, to detect a repetition. `spare` is whether
-        there is time to search for objects.
+        `last_checksum` is the checksum of the previous frame, by which a repeated frame is detected. `spare`
+        is whether there is time to search for objects.
         """
         past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
         tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
@@ -118,7 +121,8 @@ class FrameMeasurer:
             tracker = replace(tracker, solve=replace(tracker.solve, velocity=velocity))
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
-            # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
+            # A change of the rate shifts the stars from their positions at mid-exposure. Without an estimate
+            # of the acceleration it is fitted to the pixels.
             estimator = replace(estimator, rate_model="accelerating")
         return FrameJob(
             frame.pixels,
@@ -133,7 +137,7 @@ class FrameMeasurer:
         )
 
     def exposure_ns(self, now_ns: int) -> int:
-        """Return the exposure time (ns) from now on, by the estimated rate across the boresight."""
+        """Return the exposure time (ns) for the next frames, from the estimated rate across the boresight."""
         exposures, estimate = self._settings.exposures, self._navigation.estimate(now_ns)
         if estimate is None:
             return round(exposures.usual * SECOND_NS)
@@ -141,7 +145,7 @@ class FrameMeasurer:
         return round(exposures.at(math.hypot(x, y)) * SECOND_NS)
 
     def _priors(self, frame: Frame, past: Estimate | None) -> tuple[RatePrior | None, AttitudePrior | None]:
-        """Return the priors of rate and attitude, camera axes, from the estimate `past` at mid-exposure."""
+        """Return the prior rate and attitude in camera axes, from the estimate `past` at mid-exposure."""
         if past is None:
             return None, None
         rate_sigma = math.sqrt(max(float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1]), 0.0))
@@ -162,7 +166,10 @@ class FrameMeasurer:
         return RatePrior(self._body_to_camera @ past.rate, rate_sigma, course), attitude
 
     def mean_rate(self, frame: Frame, motion: FrameMotion) -> MeanRateMeasurement | None:
-        """Return the mean body rate over the exposure; None without a rate or an estimate at its start."""
+        """Return the mean body rate over the exposure.
+
+        None without a rate, or without an estimate at its start.
+        """
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
             return None
@@ -179,14 +186,14 @@ class FrameMeasurer:
         return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
 
     def rate_in_body(self, found: FrameMotion | None) -> tuple[FloatArray, FloatArray]:
-        """Return rate and covariance in body axes; NaN without a rate."""
+        """Return the rate (3,) and its covariance (3, 3) in body axes; NaN without a rate."""
         if found is None or found.rate is None or found.covariance is None:
             return _NAN
         turn = self._body_to_camera.T
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
     def _off_middle(self, frame: Frame, motion: FrameMotion) -> FloatArray:
-        """Return the covariance (3, 3) rad^2 of the stars' attitude relative to that of mid-exposure."""
+        """Return the covariance (3, 3), rad^2, of the star fix relative to the attitude at mid-exposure."""
         turns = np.zeros((len(NODES), 3))
         middle = self._navigation.past(middle_ns(frame))
         if middle is not None:
@@ -205,19 +212,19 @@ def middle_ns(frame: Frame) -> int:
 
 
 _MANY_STARS = 12
-"""A frame with at least this many unmatched detections does not show the sky: its pixels are invalid."""
+"""Number of unmatched detections from which a frame counts as invalid, because it does not show the sky."""
 _NAMED_ELSEWHERE = {
     StreakStatus.TOO_SHORT,  # no motion
     StreakStatus.BLACK,
     StreakStatus.SATURATED,
     StreakStatus.FROZEN,
 }
-"""States of a frame without motion, or with a separate event."""
+"""Results for which `unused` reports no event: a body at rest, or a frame with another event."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
 class FrameReport:
-    """Records frames; `accepted` counts the rates from streaks that entered the estimate."""
+    """Records frames. `accepted` is the number of rates from streaks that the filter accepted."""
 
     def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
         self._measurer = measurer
@@ -237,7 +244,7 @@ class FrameReport:
         self.record(frame, motion.status.value, motion, now_ns, accepted)
 
     def unused(self, frame: Frame, found: FrameFound, now_ns: int) -> None:
-        """Report a frame of a moving body that gave neither rate nor attitude."""
+        """Report a frame of a rotating body that gave neither rate nor attitude."""
         if found.motion.status in _NAMED_ELSEWHERE:
             return
         stars = f", stars {found.solution.status.value}" if found.solution is not None else ""
@@ -252,7 +259,7 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record the attitude from the stars; `accepted` is None when not offered to the filter."""
+        """Record the attitude from the stars; `accepted` is None if it was not passed to the filter."""
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)
@@ -306,25 +313,25 @@ def is_strange(solution: FrameSolution | None) -> bool:
 
 
 def _packed(c: FloatArray) -> list[float]:
-    """Return xx yy zz xy xz yz of a symmetric matrix (3, 3)."""
+    """Return the elements xx, yy, zz, xy, xz, yz of a symmetric matrix (3, 3)."""
     return [float(c[0, 0]), float(c[1, 1]), float(c[2, 2]), float(c[0, 1]), float(c[0, 2]), float(c[1, 2])]
 
 
 _ROWS = 32
 _FRAMES = 4
-"""Number of a driver's frame buffers."""
+"""Number of frame buffers of a camera driver."""
 _LEAST_CHANGES = 0.125
-"""Fraction of neighbouring pixels that differ in a row with noise."""
+"""Minimum fraction of neighbouring pixels that differ, in a row that has noise."""
 
 
 class RepeatedRows:
-    """Detects rows of earlier frames by checksums of some rows of the last frames."""
+    """Detects rows that were copied from earlier frames, by checksums of some rows of the last frames."""
 
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def look(self, pixels: Image) -> int:
-        """Return how many sampled rows of a frame (rows, columns) are copies from an earlier frame.
+        """Return how many of the sampled rows of a frame (rows, columns) are copies from an earlier frame.
 
         The number is 0 for an intact frame, and for a frame whose rows are all copies.
         """
@@ -349,7 +356,7 @@ class ObjectTracks:
         self._events = services.events
 
     def ingest(self, sequence: int, middle_ns: int, sighted: MeasuredObjects, now_ns: int) -> None:
-        """Accept the sightings of frame number `sequence` with mid-exposure at `middle_ns`."""
+        """Accept the detected objects of frame number `sequence`, whose mid-exposure is at `middle_ns`."""
         x, y = np.reshape(sighted.points, (-1, 2)).T
         self._recorder.record(
             SIGHTINGS,
@@ -419,7 +426,7 @@ WORKER = "vision"
 
 
 class Imaging:
-    """Triggers the star camera, monitors it, and owns the frame in process."""
+    """Triggers and monitors the star camera, and owns the frame that is being processed."""
 
     def __init__(
         self,
@@ -444,8 +451,8 @@ class Imaging:
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
-        self._ordered: tuple[int, int] | None = None  # the begin and the length, ns, of an exposure to come
-        self._due_ns: int | None = None  # time at which the frame of the oldest open trigger is due
+        self._ordered: tuple[int, int] | None = None  # start and duration (ns) of an ordered exposure
+        self._due_ns: int | None = None  # time (ns) at which the frame of the oldest trigger is due
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
@@ -453,11 +460,11 @@ class Imaging:
         self._spare = True  # whether the last frame left time to search for objects
 
     def counts(self) -> tuple[int, int]:
-        """Return the numbers of frames, and of rates from streaks that the estimate used."""
+        """Return the number of frames, and the number of rates from streaks that the filter accepted."""
         return self._frames, self._report.accepted
 
     def busy_since_ns(self) -> int | None:
-        """Return when the processing of the present frame began (ns); None without a frame in process."""
+        """Return the time (ns) at which the worker received the present frame; None while it is idle."""
         return None if self._frame is None else self._busy_since_ns
 
     def begin(self, time_ns: int) -> None:
@@ -465,11 +472,11 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Order an exposure: the task of the camera's rate group.
+        """Order an exposure. This is the task of the camera's rate group.
 
-        There is no exposure while the body turns too fast, and seldom one while the attitude is fine. The
-        exposure begins at a time for which the coil currents do not change within it, so that the rate is
-        nearly constant.
+        No exposure is made while the body rotates too fast. While the attitude is known finely, exposures are
+        less frequent. An exposure starts at a time at which the coil currents stay constant until its end, so
+        that the rate is nearly constant.
         """
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
@@ -495,7 +502,7 @@ class Imaging:
             self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
             return
         if self._due_ns is None:
-            # A free-running camera first completes the exposure in progress.
+            # A free-running camera first completes its present exposure.
             self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
 
     def serve(self, now_ns: int) -> None:
@@ -522,7 +529,7 @@ class Imaging:
             self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
         self._due_ns = None
-        # Frame age is measured from exposure, not arrival.
+        # The age of a frame counts from its exposure, not from its arrival.
         self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
         age_ns = now_ns - self._last_frame_ns
         late = age_ns > self._settings.max_age_ns

@@ -1,7 +1,8 @@
-"""Navigation: passes readings of inertial unit, GPS receiver and solar cells to the body; monitors them.
+"""Navigation: passes readings of inertial unit, GPS receiver and solar cells to the filter; monitors them.
 
-The inertial unit's line is monitored for silence (no bytes), corruption (bytes without valid packets) and
-implausible values. Rates from streaks and attitudes from stars enter the estimate at their own times.
+The serial line of the inertial unit is monitored for silence (no bytes), corruption (bytes without valid
+packets) and implausible values. Rates from streaks and attitudes from stars update the estimate at the time
+of their measurement.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ from knightcube.gnc.estimation.estimate import Estimate
 from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
-"""Number of measurements that a cycle applies again, in a few ms; a second of them takes a few cycles."""
+"""Number of measurements that one cycle applies again (a few ms).
+
+A second of measurements takes a few cycles.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +45,10 @@ class NavigationSettings:
     """Age limits of the inertial unit's readings.
 
     Attributes:
-        max_age_ns: age limit of a reading by which the coils are driven.
-        coast_ns: longest propagation of the estimate without a measurement, for telemetry only.
-        period_ns: period of the control cycle, for which a commanded current flows at least.
+        max_age_ns: age limit (ns) of a reading that is used to drive the coils.
+        coast_ns: longest propagation (ns) of the estimate without a measurement; such an estimate is used for
+            telemetry only.
+        period_ns: period (ns) of the control cycle; a commanded current flows for at least this time.
     """
 
     max_age_ns: int
@@ -52,7 +57,7 @@ class NavigationSettings:
 
 
 class Navigation:
-    """Owns the filter, and monitors the inertial unit's line."""
+    """Owns the filter, and monitors the serial line of the inertial unit."""
 
     def __init__(
         self, unit: InertialUnit, estimation: BodyEstimation, settings: NavigationSettings, services: Services
@@ -66,7 +71,7 @@ class Navigation:
         self._facts = services.facts
         self._streams = services.streams
         self._since_ns = 0
-        self._received_ns = 0  # the newest reading, and the newest that agreed with the estimate
+        self._received_ns = 0  # newest reading, and newest that agreed with the estimate (ns)
         self._agreed_ns = 0
         self._link = unit.link()
         self._bytes_since_ns = 0
@@ -81,11 +86,11 @@ class Navigation:
         self._link = self._unit.link()
 
     def link(self) -> ImuLink:
-        """Return the counters of the inertial unit's line."""
+        """Return the counters of the inertial unit's serial line."""
         return self._link
 
     def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
-        """Give the coil currents to the filter, and which of them are known."""
+        """Pass the coil currents to the filter, and whether they are known."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
@@ -113,14 +118,14 @@ class Navigation:
         return readings
 
     def is_current(self, now_ns: int) -> bool:
-        """Return whether the coils may be driven by readings alone until the next cycle."""
+        """Return whether readings are recent enough to drive the coils until the next cycle."""
         return self._is_fresh(self._received_ns, now_ns)
 
     def is_measured(self, now_ns: int) -> bool:
-        """Return whether the coils may be driven by the estimate until the next cycle.
+        """Return whether the estimate is recent enough to drive the coils until the next cycle.
 
-        The newest reading that agreed with the estimate must be within the age limit until then. An estimate
-        propagated by the model alone is recorded, but not used for steering.
+        The newest reading that agreed with the estimate must stay within its age limit until the next cycle.
+        An estimate that was propagated by the model alone is recorded, but not used for steering.
         """
         return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
 
@@ -128,8 +133,12 @@ class Navigation:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
     def estimate(self, now_ns: int) -> Estimate | None:
-        """Return the estimate for now, measured or propagated by the model; None when there is none."""
-        # Over a long silence, propagation would cost more with every cycle, for an estimate of no use.
+        """Return the present estimate, from measurements or propagated by the model.
+
+        None without an estimate.
+        """
+        # During a long silence the propagation would take longer in every cycle, and its result would be too
+        # inaccurate to be used.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
         return self._filter.at(now_ns)
@@ -143,7 +152,10 @@ class Navigation:
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def begin_from(self, attitude: AttitudeMeasurement) -> bool:
-        """Offer an attitude from the stars to a filter without an estimate; return whether it started."""
+        """Start a filter that has no estimate from an attitude by the stars.
+
+        Return whether the filter started.
+        """
         return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
@@ -202,7 +214,7 @@ class Navigation:
 
 
 CLOCK_OFF_NS = SECOND_NS
-"""Largest difference (ns) of the wall clock from the receiver's time."""
+"""Largest permitted difference (ns) between the wall clock and the time of the GPS receiver."""
 
 
 class Positioning:
@@ -215,7 +227,7 @@ class Positioning:
         max_age_ns: int,
         services: Services,
     ) -> None:
-        """`accept` returns whether the body uses a fix; `max_age_ns` without a fix means a lost receiver."""
+        """`accept` returns whether the body uses a fix. A receiver without a fix for `max_age_ns` is lost."""
         self._receiver = receiver
         self._accept = accept
         self._max_age_ns = max_age_ns
@@ -242,7 +254,7 @@ class Positioning:
             self._streams.note("gps", reading.time_ns)
             if self._accept(reading):
                 self._fixed_ns = reading.time_ns
-                # The position before the first fix depends on the wall clock.
+                # Before the first fix, the computed position depends on the wall clock.
                 off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
                 text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
                 self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)
