@@ -5,8 +5,10 @@ Nadir of several cameras: one limb through all their points, and a coarse one wh
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from knightcube.reference.horizon import fit_circle
 from knightcube.vision.camera.images import read_image
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.horizon.edges import find_edges
+from knightcube.vision.horizon.hypothesis import Hypothesis, examine
 from knightcube.vision.horizon.illumination import coarse_nadir, image_brightness
 from knightcube.vision.horizon.limb import UNIT_DEPTH_HEIGHT, limb_light
 from knightcube.vision.horizon.nadir import (
@@ -403,3 +406,87 @@ def test_dark_pictures_give_no_coarse_nadir() -> None:
     dark = np.full((512, 512), 8, dtype=np.uint8)
     looks = [image_brightness(dark, camera, EARTHLIGHT) for camera in VT]
     assert coarse_nadir(looks, ALTITUDE, np.array([0.0, 0.0, 1.0])) is None
+
+
+def _changed(changes: Callable[[Hypothesis], Hypothesis]) -> Callable[..., Hypothesis | None]:
+    """Return `examine` with changes of every hypothesis."""
+
+    def examined(*arguments: Any) -> Hypothesis | None:
+        found = examine(*arguments)
+        return None if found is None else changes(found)
+
+    return examined
+
+
+@pytest.mark.parametrize(
+    ("evidence", "sound", "wrong", "status"),
+    [
+        ("chance", -6.2, -5.8, HorizonStatus.NO_HORIZON),
+        ("breadth", 0.14, 0.11, HorizonStatus.NO_HORIZON),
+        ("breadth", 1.9, 2.1, HorizonStatus.NO_HORIZON),
+        ("altitude_off", 2.9, 3.1, HorizonStatus.REFUSED),
+        ("coverage", 0.62, 0.58, HorizonStatus.REFUSED),
+        ("night", 0.09, 0.11, HorizonStatus.REFUSED),
+    ],
+)
+def test_a_horizon_counts_up_to_the_limit_of_each_evidence(
+    day: tuple[EarthScene, Image],
+    monkeypatch: pytest.MonkeyPatch,
+    evidence: str,
+    sound: float,
+    wrong: float,
+    status: HorizonStatus,
+) -> None:
+    """Evidence on both sides of its documented limit, everything else as in a sunlit frame."""
+    scene, frame = day
+    for value, expected in ((sound, HorizonStatus.FOUND), (wrong, status)):
+        changed = _changed(lambda one, value=value: replace(one, **{evidence: value}))  # type: ignore[misc]
+        monkeypatch.setattr(f"{find_nadir.__module__}.examine", changed)
+        assert find_nadir(frame, MODEL.lens, _gps(scene), SETTINGS).status is expected
+
+
+@pytest.mark.parametrize(("stray", "status"), [(0.045, HorizonStatus.FOUND), (0.055, HorizonStatus.REFUSED)])
+def test_a_twentieth_of_the_dark_sky_may_be_bright(
+    day: tuple[EarthScene, Image], monkeypatch: pytest.MonkeyPatch, stray: float, status: HorizonStatus
+) -> None:
+    scene, frame = day
+    changed = _changed(lambda one: replace(one, lighting=replace(one.lighting, stray=stray)))
+    monkeypatch.setattr(f"{find_nadir.__module__}.examine", changed)
+    found = find_nadir(frame, MODEL.lens, _gps(scene), SETTINGS)
+    assert found.status is status
+    assert ("bright" in found.reason) is (status is HorizonStatus.REFUSED)
+
+
+@pytest.mark.parametrize(
+    ("enough", "some", "again"), [(1, 4, False), (10_000, 4, True), (10_000, 10_000, False)]
+)
+def test_an_image_is_read_again_if_it_has_some_edges_but_not_enough(
+    day: tuple[EarthScene, Image], enough: int, some: int, again: bool
+) -> None:
+    scene, frame = day
+    settings = replace(SETTINGS, enough_edges=enough, some_edges=some)
+    found = find_nadir(frame, MODEL.lens, _gps(scene), settings)
+    assert (found.pixels_read > 2 * 32 * 512) is again
+    assert found.nadir is not None
+
+
+def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
+    day: tuple[EarthScene, Image],
+) -> None:
+    scene, frame = day
+    found = find_nadir(frame, MODEL.lens, _gps(scene), SETTINGS)
+    assert found.nadir is not None
+    assert found.view is not None
+    assert found.nadir.used == np.count_nonzero(found.on_horizon) == len(found.limb) == len(found.limb_sigma)
+    assert found.nadir.altitude == pytest.approx(600e3, abs=15e3)
+    assert found.nadir.altitude_sigma == pytest.approx(SETTINGS.altitude_sigma, rel=0.01)
+    # The trace of a covariance does not depend on the axes, and there is no error along the direction.
+    tangent = found.nadir.tangent_covariance
+    assert np.trace(tangent) == pytest.approx(np.trace(found.nadir.covariance), rel=1e-6)
+    assert found.nadir.sigma == pytest.approx(np.sqrt(0.5 * np.trace(tangent)), rel=1e-6)
+    assert found.nadir.covariance @ found.nadir.direction == pytest.approx(np.zeros(3), abs=1e-12)
+    assert found.nadir.direction == pytest.approx(found.view.nadir)
+    # An altitude above the mean sphere is wrong by the flattening.
+    sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
+    assert sphere.nadir is not None
+    assert 10e3 < sphere.nadir.altitude_sigma < 20e3
