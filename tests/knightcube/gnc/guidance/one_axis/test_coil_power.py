@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from knightcube.gnc.guidance.one_axis.plant import steady_heat, supply_power
+from knightcube.gnc.guidance.one_axis.plant import PathCost, SingleAxisPlant, steady_heat, supply_power
 from tests.hal.coils.rig import Rig
 
 VOLTAGE, BUS_VOLTAGE, RESISTANCE = 3.4, 5.0, 23.0
@@ -52,3 +52,19 @@ def test_it_is_the_charge_that_the_simulated_bridges_take_from_their_supply(
     rig.clock.advance(3 * period)
     volts, amperes = rig.wire.circuit.mean_supply(begin, begin + 3 * period)
     assert supply_power(np.array(current), volts).sum() == pytest.approx(volts * amperes, abs=5e-4)
+
+
+@pytest.mark.parametrize("cost", list(PathCost))
+def test_the_smoothed_power_has_its_slope_and_is_within_a_tenth_of_full_power(cost: PathCost) -> None:
+    plant = SingleAxisPlant(1.05e-3, 2.916e-4, RESISTANCE, FULL)
+    current = np.linspace(-FULL, FULL, 41)
+    value, slope = cost.smooth(plant, current)
+    step = 1e-7
+    ahead, behind = (cost.smooth(plant, current + shift)[0] for shift in (step, -step))
+    np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * step), atol=1e-5)
+    assert value[20] == pytest.approx(0.0, abs=1e-12)
+    # The smoothed power is lower by the rounding of a tenth of the limit, at most.
+    lower = cost.power(plant, current) - value
+    assert lower.min() > -1e-12
+    assert lower.max() < 0.1 * VOLTAGE * FULL
+    assert lower[0] == pytest.approx(0.0 if cost is PathCost.HEAT else 0.095 * VOLTAGE * FULL, abs=2e-4)
