@@ -159,7 +159,7 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
 
 
 def test_attitudes_that_are_not_finite_never_restart_the_filter() -> None:
-    """As a vision worker that fails may send them: the control task then failed for good."""
+    """A failing vision worker may send such attitudes. They must not stop the control task."""
     flown = acquired()
     for _ in range(2 * REFUSALS_TO_RESTART):
         flown.fly(2.0)

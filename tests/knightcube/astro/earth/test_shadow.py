@@ -78,7 +78,7 @@ def test_the_cylinder_is_as_wide_as_the_earth() -> None:
 
 
 def test_cone_and_cylinder_agree_outside_the_penumbra() -> None:
-    """Of a sphere of 7078 km it covers 0.42 %: a ring 28.5 km wide, 6378 km about the shadow's axis."""
+    """The penumbra covers 0.42 % of a sphere of 7078 km: a ring 28.5 km wide, 6378 km from the axis."""
     rng = np.random.default_rng(4)
     positions = rng.normal(size=(20_000, 3))
     positions *= 7078e3 / np.linalg.norm(positions, axis=1, keepdims=True)
