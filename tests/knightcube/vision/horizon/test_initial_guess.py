@@ -102,7 +102,7 @@ def test_an_edge_that_is_bright_outside_is_on_no_cone() -> None:
 
 
 @pytest.mark.parametrize(("half_angle", "found"), [(58.0, False), (61.0, True), (69.0, True), (72.0, False)])
-def test_a_cone_outside_the_range_of_altitudes_is_no_candidate(half_angle: float, found: bool) -> None:
+def test_only_cones_within_the_range_of_altitudes_are_candidates(half_angle: float, found: bool) -> None:
     edges = ring(NADIR, math.radians(half_angle), 24)
     limits = (math.cos(math.radians(70.0)), math.cos(math.radians(60.0)))
     assert (best_cone(edges, free(edges), limits, 0.5, 400) is not None) is found
