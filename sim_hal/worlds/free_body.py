@@ -383,8 +383,7 @@ class FreeBody:
         """Hold the body still until it is released; `utc` labels `start_ns`."""
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
-        craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
-        self.craft = build(craft, multiples, errors)
+        self.craft = built_craft(section, errors)
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
@@ -559,6 +558,12 @@ def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArra
         return attitude, tip_off.rate
     x, y, z = (tip_off.speed * axis / np.linalg.norm(axis)).tolist()
     return attitude, (x, y, z)
+
+
+def built_craft(section: FreeBodySection, errors: np.random.Generator) -> TrueCraft:
+    """Return the true craft of a configuration, with its errors drawn from `errors`."""
+    craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
+    return build(craft, section.disturbances, errors)
 
 
 def coil_supply(inputs: WorldInputs) -> CoilSupply:

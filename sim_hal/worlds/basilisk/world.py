@@ -23,10 +23,9 @@ from sim_hal.clock import NEVER
 from sim_hal.settings import FreeBodySection
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body import (
-    CRAFTS,
     KNIGHTCUBE_SUPPLY,
     CoilSupply,
-    build,
+    built_craft,
     coil_supply,
     generators,
     released,
@@ -62,8 +61,7 @@ class BasiliskWorld:
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
             raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
         errors, tip_off, _ = generators(seed)
-        craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
-        self.craft = build(craft, section.disturbances, errors)
+        self.craft = built_craft(section, errors)
         self._attitude, rate = released(section.release, tip_off)
         self._tip_off = np.array(rate)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS
