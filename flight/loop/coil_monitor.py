@@ -47,8 +47,6 @@ from flight.loop.coil_response import (
     ELECTRICAL,
     MEAN,
     NEWEST,
-    NONE,
-    Axes,
     Bounds,
     CoilCommands,
     CoilFault,
@@ -61,7 +59,7 @@ from flight.loop.coil_response import (
     fits,
     predict,
 )
-from hal.interfaces.devices import CoilState, PowerReading
+from hal.interfaces.devices import NO_AXES, Axes, CoilState, PowerReading
 from knightcube.astro.arrays import BoolArray, FloatArray
 
 _SURE = 2
@@ -104,7 +102,7 @@ class StuckLeg:
         self._left: list[int] = []
         self._braked: tuple[int, ...] = ()
         self._await()
-        self.brake = NONE
+        self.brake = NO_AXES
         self.rest = False
         self.suspicion = ""
 
@@ -198,7 +196,7 @@ class StuckLeg:
     def _rest(self, why: str) -> None:
         self.suspicion = self.suspicion or why
         self._step = _Step.RESTING
-        self.brake, self.rest = NONE, True
+        self.brake, self.rest = NO_AXES, True
         self._await()
 
     def _release_next(self) -> None:
@@ -515,7 +513,7 @@ class CoilMonitor:
         self.interrupted(self._commands.newest_ns if self._commands else 0)
 
     def commanded(
-        self, time_ns: int, currents: FloatArray, braked: Axes = NONE, written_ns: int | None = None
+        self, time_ns: int, currents: FloatArray, braked: Axes = NO_AXES, written_ns: int | None = None
     ) -> None:
         """Record the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or then."""
         values = tuple(currents.tolist())

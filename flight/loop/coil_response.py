@@ -33,7 +33,7 @@ from functools import cache
 
 import numpy as np
 
-from hal.interfaces.devices import PowerReading
+from hal.interfaces.devices import NO_AXES, Axes, PowerReading
 from knightcube.astro.arrays import FloatArray, cross_matrices
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
@@ -41,9 +41,6 @@ from knightcube.gnc.estimation.rigid_body import (
     gyroscopic_coefficients,
     rate_products,
 )
-
-Axes = tuple[bool, bool, bool]
-NONE: Axes = (False, False, False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +233,7 @@ class CoilCommands:
         self._reach_ns = reach_ns
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
         self._braked_ns = 0
-        self.braked = NONE
+        self.braked = NO_AXES
 
     def __bool__(self) -> bool:
         """Return whether a command was noted yet."""

@@ -18,10 +18,9 @@ from flight.link import events
 from flight.loop import facts
 from flight.loop.body import CoilCommand, FlightBody, Steered, SteeringState, WindowedLaw
 from flight.loop.coil_monitor import CoilMonitor
-from flight.loop.coil_response import NONE, Axes
 from flight.loop.facts import Services
 from flight.schema.sections import Modes
-from hal.interfaces.devices import CoilState, ImuReading, PowerMonitor, TorqueCoils
+from hal.interfaces.devices import NO_AXES, Axes, CoilState, ImuReading, PowerMonitor, TorqueCoils
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.control.allocation import allocate
 from knightcube.gnc.estimation.estimate import Estimate
@@ -67,7 +66,7 @@ class CoilDrive:
         self._facts = services.facts
         self._events = services.events
         self._verdicts = 0
-        self._braked = NONE
+        self._braked = NO_AXES
         self.available = np.ones(3, dtype=bool)
         self.command: FloatArray = np.zeros(3)
 

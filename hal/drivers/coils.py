@@ -28,7 +28,7 @@ from typing import TypeVar
 import numpy as np
 
 from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS, COUNTS, FULL_OFF, FULL_ON, Pca9685, PwmCounts
-from hal.interfaces.devices import CoilState, FloatArray
+from hal.interfaces.devices import NO_AXES, Axes, CoilState, FloatArray
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from hal.interfaces.wires import Clock, Ticker
 
@@ -182,11 +182,8 @@ def _pulse(counts: int) -> PwmCounts:
 
 Counts = tuple[int, int, int]
 """Signed PWM counts of the three coils."""
-Axes = tuple[bool, bool, bool]
-"""One flag for each coil."""
 
 ZERO: Counts = (0, 0, 0)
-NONE: Axes = (False, False, False)
 
 
 class CommandMailbox:
@@ -206,7 +203,7 @@ class CommandMailbox:
     def __init__(self, clock: Clock, stale_ns: int) -> None:
         """Accept commands; one that is older than `stale_ns` becomes zero."""
         self.lock = threading.RLock()
-        self.braked = NONE
+        self.braked = NO_AXES
         self.number = 0
         self.command: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self.command_ns = -1
@@ -275,7 +272,7 @@ class CoilOutputs:
     def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
         """Drive the chip; `lock` guards `written`, `braked` and `written_ns`."""
         self.written = ZERO
-        self.braked = NONE
+        self.braked = NO_AXES
         self.written_ns = -1
         self.failing = False
         self.faults = 0
@@ -296,7 +293,7 @@ class CoilOutputs:
     def configure(self) -> None:
         """Set the chip up with every output off, once. Raises DeviceError."""
         self._pca.configure()
-        self._record(ZERO, NONE)
+        self._record(ZERO, NO_AXES)
         self._postpone_check()
 
     def check_is_due(self) -> bool:
@@ -332,7 +329,7 @@ class CoilOutputs:
         """Write zero once, then brake the bridges of `braked`; return whether that was acknowledged."""
         try:
             self._pca.all_off()
-            self._record(ZERO, NONE)
+            self._record(ZERO, NO_AXES)
             # A chip that may have lost its set-up would misread a block.
             if any(braked) and not self.failing:
                 self.write(ZERO, braked)
@@ -431,7 +428,7 @@ class PwmTorqueCoils:
                 self._outputs.failing, self._outputs.error = True, str(error)
         with self._mailbox.lock:
             self._mailbox.withdraw()
-            self._mailbox.braked = NONE
+            self._mailbox.braked = NO_AXES
             self._running = True
             if self._ticker is None:
                 self._ticker = self._clock.ticker(DEVICE, SERVE_PERIOD_NS, self._serve)
@@ -460,7 +457,7 @@ class PwmTorqueCoils:
             self._mailbox.put((x, y, z), (counts_x, counts_y, counts_z), limited_x or limited_y or limited_z)
         ticker.kick()
 
-    def brake(self, axes: tuple[bool, bool, bool]) -> None:
+    def brake(self, axes: Axes) -> None:
         """Hold both inputs of these bridges high from now on, whatever is commanded. Never waits for the bus.
 
         Refused before `start` and after `close`.
@@ -604,7 +601,7 @@ def _state_of(
     stale: bool,
     faults: int,
     error: str,
-    braked: tuple[bool, bool, bool],
+    braked: Axes,
 ) -> CoilState:
     """Return the state, made once for all who ask in a cycle; `signed` A are the currents of a count."""
     return CoilState(

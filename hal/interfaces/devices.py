@@ -13,6 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+Axes = tuple[bool, bool, bool]
+"""One flag for each coil."""
+NO_AXES: Axes = (False, False, False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,7 @@ class CoilState:
     stale: bool
     faults: int
     error: str
-    braked: tuple[bool, bool, bool] = (False, False, False)
+    braked: Axes = NO_AXES
 
 
 class InertialUnit(Protocol):
@@ -197,7 +200,7 @@ class TorqueCoils(Protocol):
         Raises OutOfRange, and brings the coils to zero, if a value is not finite.
         """
 
-    def brake(self, axes: tuple[bool, bool, bool]) -> None:
+    def brake(self, axes: Axes) -> None:
         """Hold both inputs of these bridges high from now on, whatever is commanded: never waits for the bus.
 
         A bridge then drives no current, even with a leg stuck high. Valid until `start` or another call.

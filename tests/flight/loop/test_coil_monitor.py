@@ -12,7 +12,6 @@ from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings, StuckLeg
 from flight.loop.coil_response import (
     MEAN,
     NEWEST,
-    NONE,
     PLACE,
     Bounds,
     CoilFault,
@@ -21,7 +20,7 @@ from flight.loop.coil_response import (
     predict,
     supply_currents,
 )
-from hal.interfaces.devices import ImuReading, PowerReading
+from hal.interfaces.devices import NO_AXES, ImuReading, PowerReading
 from knightcube.astro.arrays import FloatArray
 from tests.sim_hal.faults.coil_bench import hold, observe
 
@@ -94,7 +93,7 @@ def test_braking_that_does_not_help_is_ended() -> None:
     for _ in range(6):
         assert leg.look(at_rest) is None
         asked.append(leg.brake)
-    assert asked == [NONE, (True, True, True), (True, True, True), NONE, NONE, NONE]
+    assert asked == [NO_AXES, (True, True, True), (True, True, True), NO_AXES, NO_AXES, NO_AXES]
     for current in (0.0, 0.0, 0.148, 0.148):
         leg.look(replace(at_rest, current=current))
     assert leg.brake == (True, True, True), "once all was normal it is looked for again"
