@@ -18,11 +18,10 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import binary_dilation, gaussian_filter, zoom
 
 from hal.interfaces.errors import OutOfRange, check_limits
-from knightcube.astro.arrays import FloatArray, Image, IntArray, tangent_basis
+from knightcube.astro.arrays import Float32Array, FloatArray, Image, IntArray, tangent_basis
 from knightcube.vision.camera.lens import CameraModel, Lens, Pinhole
 from sim_hal.earth_camera.scene import (
     EarthScene,
-    Float32Array,
     darkening,
     look,
     radiance,

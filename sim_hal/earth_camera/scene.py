@@ -23,17 +23,14 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.special import erfcx, ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import BoolArray, FloatArray, tangent_basis
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, tangent_basis
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, semi_axes
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
-
-Float32Array = npt.NDArray[np.float32]
 
 ATMOSPHERE = "atmosphere"
 _DEEPEST = -9.0

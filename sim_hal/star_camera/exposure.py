@@ -20,14 +20,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
 from hal.interfaces.errors import OutOfRange
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-
-Float32Array = npt.NDArray[np.float32]
 
 DEVICE = "star camera model"
 

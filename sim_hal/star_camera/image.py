@@ -20,11 +20,10 @@ from scipy.special import ndtri
 
 from hal.interfaces.errors import OutOfRange, check_limits
 from knightcube.astro import quaternion
-from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.astro.arrays import Float32Array, FloatArray, Image, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from sim_hal.star_camera.exposure import (
     DEVICE,
-    Float32Array,
     OwnTimes,
     RollingShutter,
     Vectors,

@@ -22,10 +22,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import less_boxes
-from knightcube.vision.streaks.frame import Float32Array, ReducedFrame
+from knightcube.vision.streaks.frame import ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, paths
 
 # Spacing (px) of neighbouring circles of the polar grid.

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import (
     at_least,
@@ -27,8 +26,6 @@ from knightcube.vision.frame import (
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult
-
-Float32Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,10 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.streaks import streak_model
-from knightcube.vision.streaks.frame import MEDIAN_ERROR, Float32Array, ReducedFrame
+from knightcube.vision.streaks.frame import MEDIAN_ERROR, ReducedFrame
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
     Shutter,

@@ -33,9 +33,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.frame import Float32Array
 from knightcube.vision.streaks.geometry import (
     CameraMotion,
     Shutter,

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri
 
-from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from knightcube.vision.camera.lens import Pinhole
-from knightcube.vision.streaks.frame import Float32Array
 from knightcube.vision.streaks.geometry import (
     PIXEL_VARIANCE,
     CameraMotion,

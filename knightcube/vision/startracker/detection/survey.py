@@ -18,7 +18,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import BoolArray, Float32Array, FloatArray, Image, IntArray
 from knightcube.vision.frame import (
     MAD_TO_SIGMA,
     estimate_background,
@@ -29,8 +29,6 @@ from knightcube.vision.frame import (
     place_among_blocks,
     saturation_of_bright,
 )
-
-Float32Array = npt.NDArray[np.float32]
 
 KERNEL_NORM = 6.0
 """Noise of the smoothed frame for white noise of 1: the root of the sum of squares of the kernel."""
