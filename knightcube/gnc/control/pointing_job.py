@@ -1,14 +1,15 @@
 """The planner's job of a satellite: from an orbit, an attitude and a target to a table of the pointing law.
 
-The field and the torques are predicted along the orbit for a revolution and a quarter, which the last stored
-gains need as preview. A third of a revolution is stored. A passing object is gone within minutes: its tables
-are short and fine, and are computed again with each sighting.
+The field and the torques are predicted along the orbit for a revolution and a quarter, because the last
+stored gains need this preview. A third of a revolution is stored. An object passes within minutes, so that
+its tables are short, have short steps, and are computed again at each sighting.
 
-Far from the law, the way into it can be a slew of minimum heat, planned by `slew_plan` with the torques that
-the filter estimates. The dipoles of the slew are flown as planned, because a criterion that weighs rotation
-error against dipole would leave the path of minimum heat. The gains are those of linear-quadratic tracking
-along slew and law, with the field of the revolution ahead; an error at the end of the slew has the highest
-cost. The table also holds the change of the dipole per change of the estimated torques.
+Far from the commanded attitude, the body can approach it by a slew of minimum heat, planned by `slew_plan`
+with the torques that the filter estimates. The planned dipoles of the slew are the feedforward, because an
+optimum of rotation error plus dipole would depart from the path of minimum heat. The gains are those of
+linear-quadratic tracking along slew and law, with the field of the revolution ahead; an error at the end of
+the slew has the highest cost. The table also contains the change of the dipole per change of the estimated
+torques.
 """
 
 from __future__ import annotations
@@ -50,21 +51,22 @@ from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft, SlewPath, S
 from knightcube.gnc.guidance.three_axes.slew_plan import end_law, plan_task
 
 RESERVE = 0.8
-"""Fraction of the coils' limit that a slew is planned with; the rest corrects errors."""
+"""Fraction of the coils' limit for the planned dipoles of a slew; the remainder is for the correction of
+errors."""
 STIFFER = 5.0
-"""Factor on the dipole of unit cost during a slew."""
+"""Factor by which the dipole of unit cost is larger during a slew."""
 LONGEST = 1_500.0
-"""Longest slew, s; a table also needs some of the law after it."""
+"""Longest slew, s. It is shorter than a table, which must include some time after the slew."""
 FINE = 5
-"""Steps of a slew per step of pointing, because a slewing body rotates farther per step."""
+"""Number of steps of a slew table per step of a pointing table, because a slewing body rotates faster."""
 TAIL = 300.0
-"""Duration (s) of the law after a slew that is included in its gains."""
+"""Duration (s) after the end of a slew over which its feedback gains are still computed."""
 END = 2_000.0
-"""Time (s) for which an error costs as much as at the end of a slew. The torques are not known well before
-the slew, and their effects should be gone by its end."""
+"""Duration (s) of an error whose cost equals that of the same error at the end of a slew. The torques are not
+well known before the slew, and their effects should be corrected by its end."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
-"""Factor beyond the excess of the rate on the time of a slew that rotates too fast, largest factor, and
-number of trials."""
+"""Factor by which a slew that rotates too fast is lengthened in addition to the excess of its rate, largest
+total factor, and number of trials."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +74,11 @@ class SlewRequest:
     """The parameters of slews into a pointing target.
 
     Attributes:
-        seconds: requested duration; longer if that does not suffice.
-        heat: (3,) W/(A m^2)^2 of the coils.
+        seconds: requested duration, s; a slew takes longer if this duration does not suffice.
+        heat: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
         residual: (3,) A m^2, the residual dipole of the satellite.
-        camera, angles: body axis (3,) that keeps the exclusion cones of `sun`, `earth` and `moon`, rad.
+        camera, angles: body axis (3,) of the camera, and half-angles, rad, of its exclusion cones for `sun`,
+            `earth` and `moon`.
     """
 
     seconds: float
@@ -269,15 +272,15 @@ class TableSpan:
 
 
 STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
-"""Spans of lasting goals, and of a passing object."""
+"""Spans of the tables for lasting goals, and for a passing object."""
 LEAD = 2.0
 """Time (s) from the state to the start of the table."""
 FAR = math.radians(15.0)
-"""Angle (rad) from the law beyond which the way into it is a slew of minimum heat, if slews are
+"""Angle (rad) from the law above which the body approaches it by a slew of minimum heat, if slews are
 configured."""
 WAY = 4.0
-"""Duration of the initial guess of the way into the law, in time scales of the law; the path found does not
-depend on it."""
+"""Duration of the initial guess of the approach to the law, in time scales of the law. The path found does
+not depend on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -305,7 +308,7 @@ class PointingJob:
         inertia: (3, 3) kg m^2.
         sizes: (9,) N m of the torques.
         limit: A m^2 of each coil, mean.
-        slew: parameters of slews; None for a path by the weights alone.
+        slew: parameters of slews; None if the body approaches the law without a slew.
         sight: the object to point to instead of the target; None for the target.
     """
 

@@ -1,12 +1,12 @@
 """A MEKF of attitude, rate, gyro bias and disturbance that accepts late measurements.
 
-Each measurement is applied at its own time. A late one is inserted at its place in time, and those after it
-are applied again, at once or a few at a time beside the running estimate (module `replay`).
-A rate from a streaked image is the mean over the exposure: the attitude at the start of the exposure is kept
-until its end. The age of the inertial unit's samples may be estimated (module `mekf`). On
-the testbed's thread the same filter uses the component of each measurement about the thread, and all other
-states stay constant. Torsion and damping of the thread are known, or estimated beside the disturbance, from
-which they differ by their dependence on angle and rate.
+Each measurement is applied at its own time. A late measurement is inserted at its own time, and all later
+measurements are applied again. This is done at once, or in small steps while the filter continues without the
+late measurement (module `replay`). A rate from a streaked image is the mean over the exposure: the attitude
+at the start of the exposure is kept until its end. The age of the inertial unit's samples may be estimated
+(module `mekf`). On the testbed's thread the same filter uses the component of each measurement about the
+thread, and all other states stay constant. Torsion and damping of the thread are known, or estimated beside
+the disturbance, from which they differ by their dependence on angle and rate.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class FilterSettings:
 
 
 def free_axes(body: RigidBody) -> FloatArray:
-    """Return one (3,) for each body axis about which the body can rotate, zero for the others."""
+    """Return an array (3,) with 1 for each axis about which the body can rotate, and 0 for other axes."""
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
@@ -143,7 +143,7 @@ def first_checkpoint(
 ) -> Checkpoint:
     """Return the first checkpoint, at the later measurement.
 
-    A suspended body keeps only the thread's angle.
+    For a suspended body, only the angle about the thread is taken from the measured attitude.
     """
     suspended, free = model.body.suspended, free_axes(model.body)
     a, b, c, d = attitude.quaternion.tolist()
@@ -172,7 +172,7 @@ def first_checkpoint(
 
 
 OnApplied = Callable[[list[bool]], None]
-"""Receives one flag per late measurement: whether it passed the gate."""
+"""Function that receives one flag per late measurement: whether the measurement passed the gate."""
 
 
 @dataclass(slots=True, eq=False)
@@ -198,7 +198,8 @@ class AttitudeFilter:
     REJECTIONS_TO_RESTART = 40
     """Number of rejections of attitudes, or of rates, in a row after which the filter restarts."""
     REJECTIONS_AT_THE_START = 3
-    """The same number while no more measurements were accepted than rejected: after a wrong start."""
+    """Number of consecutive rejections after which the filter restarts while it has not accepted more
+    measurements than it rejected, because its start may be wrong."""
 
     def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
         """Use `prior` for the slow states of `body`; by default it follows from the settings."""

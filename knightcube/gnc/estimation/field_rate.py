@@ -3,14 +3,14 @@
 In a rotating body the field rotates on a cone about the rate, so that the direction of the field over time
 gives all three components of the rate, including the one along the field. Only a spin exactly along the field
 is not observable until the field has rotated (by about two revolutions an orbit). A gyro gives that spin at
-once. The states are in body axes: rate w, field B, derivative v of the field with respect to the stars, and a
-small rotation a of the principal axes from those of the assumed inertia, because at a fast spin of a long
-body the gyroscopic torque of 2 deg is the largest error of the model:
+once. The states are in body axes: rate w, field B, inertial time derivative v of the field, and a small
+rotation a of the principal axes from those of the assumed inertia. At a fast spin of a long body, the
+gyroscopic torque by 2 deg of such a rotation is the largest error of the model:
 
     J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
 
-The dipole m of the coils is known, so that the coils may act between measurements. The filter also keeps the
-rotation since its start, which serves as an inertial frame.
+The dipole m of the coils is known, so that the coils may act between measurements. The filter also integrates
+the rotation since its start, so that the initial body axes serve as an inertial frame.
 """
 
 from __future__ import annotations
@@ -53,15 +53,18 @@ class FieldRateSettings:
         inertia: (3, 3) kg m^2, body axes.
         field_sigma: T per axis of a measurement, including constant errors of the magnetometer.
         rate_start: rad/s, standard deviation of the rate along the field at the start.
-        change_start: T/s, standard deviation of the field's derivative with respect to the stars.
-        change_walk: T/s per sqrt(s), random walk of that derivative.
+        change_start: T/s, standard deviation of the field's inertial time derivative at the start.
+        change_walk: T/s per sqrt(s), random walk of the field's inertial time derivative.
         torque_walk: rad/s per sqrt(s) per axis, from torques that are not modelled.
         axes_sigma: rad, rotation of the principal axes from those of `inertia` at the start.
-        inertia_error: share of the gyroscopic torque that no rotation of the axes explains.
+        inertia_error: error of the gyroscopic torque, as a fraction of it, in addition to the effect of
+            rotated principal axes.
         gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
-        refusals: number of consecutive refusals after which the filter restarts, or the gyro is excluded.
+        refusals: number of consecutively rejected measurements after which the filter restarts, or the gyro
+            is excluded.
         gyro_sigma: rad/s per axis, bound of the gyro bias.
-        longest_gap: s, largest time between the samples that start the filter: longer gaps hide fast spins.
+        longest_gap: s, largest time between the samples that start the filter, because longer gaps can hide
+            fast spins.
     """
 
     inertia: FloatArray
@@ -108,7 +111,7 @@ class FieldRate:
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything except `restarts`."""
+        """Reset the filter except for the count `restarts`."""
         self._waiting: list[tuple[float, FloatArray]] = []
         self._since = 0.0
         self._refused = self._gyro_refused = 0
@@ -136,7 +139,7 @@ class FieldRate:
 
     @property
     def change(self) -> FloatArray:
-        """Derivative (3,) T/s of the field with respect to the stars, body axes."""
+        """Time derivative (3,) of the field in inertial axes, T/s, expressed in body axes."""
         return np.array(self._change)
 
     @property
@@ -239,8 +242,9 @@ class FieldRate:
     def _update_unexplained(self) -> None:
         """Set the unexplained share of the gyroscopic torque to the uncertainty of the principal axes.
 
-        The filter is linear and would become overconfident from poorly known rotations of the axes. The worst
-        direction is omitted, because a rotation about the axis of a symmetric body is not observable.
+        The filter is linearised, so that its covariance would become too small while the rotation of the axes
+        is poorly known. The least certain direction is omitted, because a rotation about the axis of a
+        symmetric body is not observable.
         """
         unknown = float(np.linalg.eigvalsh(self._covariance[AXES, AXES])[1])
         self._unexplained = max(self._settings.inertia_error, math.sqrt(unknown))
@@ -272,7 +276,8 @@ class FieldRate:
         self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
         along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
-        # The rate across the field changes meanwhile: in body axes it rotates about the field.
+        # Between the samples, the rate across the field changes, because it rotates about the field in body
+        # axes.
         across += (float(rate @ rate) * span) ** 2
         self._covariance[RATE, RATE] = (
             across * np.eye(3) + (settings.rate_start**2 + float(rate @ rate)) * along
@@ -309,7 +314,8 @@ class FieldRate:
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The gyroscopic error rotates with the body: it keeps its sign for the time of a radian.
+        # The error of the gyroscopic torque rotates with the body and keeps its sign while the body rotates
+        # by a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         gyroscopic = self._unexplained * self._differences

@@ -3,18 +3,18 @@
 A multiplicative extended Kalman filter integrates Euler's equation with the dipole of the coils, the gravity
 gradient and the estimated disturbances, in steps of a second or two. Gyro samples are measurements. Unlike
 `attitude_filter`, which replays each late sample at its own time, a late attitude is propagated to the
-present with the present rate, and its innovation includes the error of that rate. This is accurate for the
-seconds in which a body slow enough for star images rotates evenly. One step with its gyro sample takes 0.3
-ms.
+present with the present rate, and its innovation includes the error of that rate. This is accurate for some
+seconds, in which the rate of a body that is slow enough for star images is nearly constant. One step with its
+gyro sample takes 0.3 ms.
 
-The residual dipole has a constant part and a part in sunlight. The other torques are those of
-`knightcube.astro.earth.disturbance`; their sizes are states. So is a small rotation of the principal axes
-from the assumed ones: at a fast spin of a long body its gyroscopic torque is the largest unknown torque, and
-would otherwise be attributed to the gyro bias.
+The residual dipole has a constant part and a part proportional to the sunlight. The sizes of the torques of
+`knightcube.astro.earth.disturbance` are states too. A further state is a small rotation of the principal axes
+from the assumed axes. At a fast spin of a long body, the gyroscopic torque by this rotation is the largest
+unknown torque, and would otherwise be attributed to the gyro bias.
 
 The error of the field model is a vector that keeps its sign for minutes: a Gauss-Markov process of first
-order in body axes. Its size is learned as in expectation maximisation (Dempster, Laird & Rubin 1977) from
-the square of the estimate and the variance of the estimate, while the attitude is known accurately.
+order in body axes. While the attitude is known accurately, the standard deviation of this error is estimated
+by expectation maximisation (Dempster, Laird & Rubin 1977), from the squared estimate and its variance.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ AXES = slice(18 + SIZES, 21 + SIZES)
 SLOW = slice(GYRO.start, AXES.stop)
 FIELD = slice(21 + SIZES, 24 + SIZES)
 STATES = 24 + SIZES
-"""Indices of the parts of the error state; SLOW are the states that are learned."""
+"""Indices of the parts of the error state. SLOW are the slowly varying states, from GYRO to AXES."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,10 +100,10 @@ class FreeMotion:
     def torque(
         self, quaternion: FloatArray, dipole: FloatArray, sizes: FloatArray, around: FilterEnvironment
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the dynamics (6, 33) of the error without those of rate and axes.
+        """Return the torque (3,) N m, and the error dynamics (6, 33) without the columns of rate and axes.
 
-        `dipole` (3,) A m^2 is that of the coils plus the residual one; `sizes` (9,) N m are those of the
-        other torques.
+        `dipole` (3,), A m^2, is the sum of the coils' and the residual dipole. `sizes` (9,), N m, are the
+        sizes of the disturbance torques.
         """
         to_body = attitude_matrix(quaternion)
         field, position = to_body @ around.field, to_body @ around.position
@@ -135,32 +135,37 @@ class FreeMotion:
 
 
 LASTING = 20.0
-"""Time (s) for which an error of the coils or of the inertia keeps its sign; it scales the white noise that
-models the error."""
+"""Correlation time (s) of errors of the coils and of the inertia, which scales the white noise that models
+these errors."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Expected sizes of the torques, relative to that of air. The constant torque is small, because the rotation
-of the principal axes has states of its own. At one attitude the torques cannot be distinguished, and a torque
-of air that is attributed to the constant one is wrong in every other attitude."""
+"""Expected sizes of the torques, relative to the size of the torque by air. The constant torque is small,
+because the rotation of the principal axes has its own states. At one attitude the torques cannot be
+distinguished, and a torque by air that is attributed to the constant torque is wrong at every other
+attitude."""
 PLAUSIBLE = 4.0
 """Largest plausible deviation of a slow state, in standard deviations at the start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeFilterSettings:
-    """Noise and limits; a pair is the standard deviation at the start and the random walk per sqrt(s).
+    """Noise and limits of the filter.
+
+    A pair of values is the standard deviation at the start and the random walk per sqrt(s).
 
     Attributes:
         gyro: rad/s, gyro bias.
         dipole, sunlit: A m^2, residual dipole: constant part, and part in sunlight.
         magnet: T, magnetometer bias.
         field: T per axis, error of the field model before it is learned.
-        field_memory: s, correlation time of that error.
-        torque: N m, size of the torque by air; the others follow by their relative sizes.
+        field_memory: s, correlation time of the error of the field model.
+        torque: N m, size of the torque by air; the sizes of the other torques follow from the ratios of this
+            module.
         torque_noise: N m sqrt(s), white noise of all other torques.
         coil_error: relative error of the coils' dipole for tens of seconds, in any direction.
         coil_noise: A m^2 sqrt(s), white noise of each coil while the coils are driven.
         axes: rad, rotation of the principal axes.
-        inertia_error: share of the gyroscopic torque that no rotation of the axes explains.
+        inertia_error: error of the gyroscopic torque, as a fraction of it, in addition to the effect of
+            rotated principal axes.
         rate_start: rad/s, error of the first rate.
         fine, coarse: rad, largest sigma of the worst axis of a fine and of a coarse attitude.
         gate_sigma: gate; a measurement less likely than this many sigma of one component is refused.
@@ -200,9 +205,10 @@ LARGEST_ROTATION = 0.1
 FIELD_LEARNED = 2_000.0
 """Time (s) over which the size of the field model's error is averaged."""
 MINIMUM_FIELD_ERROR = 1e-8
-"""Smallest error (T per axis) of the field model: the magnetometer's own errors change as much."""
+"""Minimum error (T per axis) of the field model, equal to the variation of the magnetometer's own errors."""
 CURRENTS = 1e-7
-"""Error (T per axis) of a field by currents in the aurora, which must not cause its rejection."""
+"""Error (T per axis) of the field model due to auroral currents, which must not cause the rejection of a
+measurement."""
 _EYE: FloatArray = np.eye(3)
 _FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
@@ -385,7 +391,7 @@ class FreeFilter:
         """Apply an attitude (4,) measured `age` s ago; covariance (3, 3) rad^2 in the present body axes."""
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
-        # The rotation since then has the error of the rate.
+        # The rotation since the measurement has the error of the rate.
         rows[:, ATTITUDE], rows[:, RATE] = _EYE, -age * _EYE
         error = multiply(multiply(since, quaternion), conjugate(self.quaternion))
         return self._update(to_rotation_vector(error), rows, covariance)
@@ -462,8 +468,8 @@ class FreeFilter:
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
-        # The gyroscopic error rotates with the body: it keeps its sign for the time of a radian to either
-        # side.
+        # The error of the gyroscopic torque rotates with the body and keeps its sign while the body rotates
+        # by two radians.
         speed = math.sqrt(float(self.rate @ self.rate))
         gyroscopic = speed**2 * settings.inertia_error * motion.largest_difference
         lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed

@@ -1,8 +1,8 @@
 """The motion of a rigid body as the filters model it: Euler's equation, propagation, uncertainty.
 
 J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the dipole moment of the coils. On the
-testbed's thread the body rotates about its y axis only: the constraint balances all other torques, so that
-the response to a torque T is T_y / J22 about y, and the thread adds -k theta - c w (5.4).
+testbed's thread the body rotates only about its y axis. The thread balances all other torques, so that a
+torque T causes the acceleration T_y / J22 about y, and the thread adds the torque -k theta - c w (Sease 5.4).
 
 `propagate` integrates state and covariance. The attitude error is a small rotation about the body axes; all
 accelerations that the model does not contain are random walks.
@@ -53,7 +53,7 @@ from knightcube.gnc.estimation.rotation import (
 class Torquing:
     """Coils in a field: dipole moment (body axes, A m^2), field (reference axes, T), 1 for each driven coil.
 
-    `known` is false while the PWM chip does not respond to commands: any coil may then be driven.
+    `known` is false while the PWM chip does not respond to commands, because any coil may then be driven.
     """
 
     dipole: Vector
@@ -150,8 +150,8 @@ class RigidBody:
     ) -> Linearised:
         """Return the acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is that of the rate `ahead` s later, which makes the midpoint step of a tumbling
-        body second order.
+        The gyroscopic torque is computed for the rate `ahead` s later, so that the midpoint step of a
+        tumbling body is of second order.
         """
         x, y, z = times(self._response, self._gyroscopic(rate))
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
@@ -205,15 +205,17 @@ class RigidBody:
 LONGEST_STEP = 0.025
 """Default of the longest step, s: the period of the testbed's loop."""
 _UNKNOWN_FOR = 0.3
-"""Time (s) over which an unknown current has the same effect as the white noise that models it. The guardian
-has zeroed the coils of a hung loop by then."""
+"""Time (s) over which an unknown current has the same effect as the white noise that models it. It exceeds
+the time after which the guardian switches off the coils of a hung loop."""
 
 
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise, and the largest current of a coil.
 
-    `current` is that of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (19,) those of the error
-    state, in the square of its units per s. `unknown_current` A is that of each coil while it is unknown.
+    `current` is the density of the current noise of one driven coil, A^2 s. `rate` (3, 3), rad^2/s^3, is the
+    density of the angular acceleration. `walks` (19,) are the densities of the random walks of the error
+    state, each in the squared unit of the element divided by s. `unknown_current`, A, is the current assumed
+    for each coil while its current is unknown.
     """
 
     current: float
@@ -235,7 +237,7 @@ def propagate(
     steps = max(1, math.ceil(duration / longest_step - 1e-9))
     dt = duration / steps
     half = 0.5 * dt
-    for _ in range(steps):  # of the midpoint rule; kept attitudes do not change
+    for _ in range(steps):  # midpoint rule; attitudes kept from earlier times do not change
         wx, wy, wz = state.rate
         middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
         model = body.linearise(middle, state.rate, state.parameters, torquing, half)

@@ -61,7 +61,8 @@ Q2_LIMIT = 0.68
 
 
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
-"""cos(theta) = 1 - 2 q2^2 is zero here: the coil's axis lies along the field (5.15 corrected)."""
+"""Value of q2^2 at which cos(theta) = 1 - 2 q2^2 is zero, because the coil's axis lies along the field (Sease
+5.15 corrected)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class SingleAxisPlant:
         current_limit: largest |I|, A.
         stiffness: k of the thread, N m/rad.
         damping: c, N m s/rad.
-        disturbance: d, rad/s^2: the acceleration that the other terms do not explain, from the estimator.
+        disturbance: d, rad/s^2, acceleration that the other terms do not explain, from the estimator.
     """
 
     inertia: float
@@ -189,7 +190,8 @@ def current_and_slopes(
 
 
 _ROUNDED = 0.1
-"""Rounding e of |I| relative to Imax: the minimised |I| is sqrt(I^2 + e^2) - e, whose slope is continuous."""
+"""Smoothing parameter e, relative to Imax, of |I| in the cost. The minimised function is sqrt(I^2 + e^2) - e,
+whose slope is continuous."""
 
 
 class PathCost(StrEnum):
@@ -248,7 +250,7 @@ def lgl_rule(count: int) -> LglRule:
     series = legendre.Legendre.basis(degree)
     inner = np.sort(np.real(series.deriv().roots()))
     slope, curvature = series.deriv(), series.deriv(2)
-    for _ in range(3):  # the companion matrix is good to about 1e-12; Newton refines to rounding
+    for _ in range(3):  # eigenvalues of the companion matrix are accurate to 1e-12; Newton steps refine them
         inner = inner - slope(inner) / curvature(inner)
     nodes = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
 

@@ -5,10 +5,10 @@ a bound at every time. If no path over the requested horizon keeps the limits, t
 shortest feasible one and the status of the plan is STRETCHED. With a time cost the horizon is optimised too.
 Energy is the integral of R I^2 in J, without the factor 1/2 of 5.1.
 
-The three searches for a horizon all minimise energy plus a cost per second between a shortest and a longest
-horizon. If the cost per second is far above the coil's power and the shortest horizon is the requested one,
-the solution is the requested horizon if a path there keeps the limits, else the shortest feasible horizon. No
-infeasible program is ever solved.
+All three searches for a horizon minimise energy plus a time cost between a shortest and a longest horizon. If
+the time cost is far above the coil's power and the shortest horizon is the requested one, the solution is the
+requested horizon if a path over it keeps the limits, and otherwise the shortest feasible horizon. In this way
+no infeasible program has to be solved.
 
 The planner is pure and deterministic: the same arguments give the same plan in any process.
 """
@@ -50,12 +50,13 @@ ProgramAt = Callable[[float], PathProgram]
 """Function from a horizon, s, to the program whose family is whitened about the prey over that horizon."""
 
 SHORTEST_COST = 7.0
-"""Cost per second, in R Imax^2, with which the shortest horizon is found. An infinite cost would give the
-shortest path of the family, bang-bang, whose energy is up to 1 % above the optimum at that horizon. With this
-cost the horizon is about 0.3 % longer and the energy within 0.25 %."""
+"""Time cost, in units of R Imax^2, with which the shortest horizon is found. An infinite cost would give the
+bang-bang path, whose energy is up to 1 % above the optimum at its horizon. With this cost, the horizon is
+about 0.3 % longer and the energy within 0.25 % of the optimum."""
 
 _SHORTEST_STRETCH = 1.015
-"""Largest factor by which that cost may stretch a horizon although the requested one is feasible."""
+"""Largest factor by which the time cost SHORTEST_COST may stretch a horizon although the requested horizon is
+feasible."""
 
 _START_BELOW = 1.7
 _GROW_TO = 1.4
@@ -124,10 +125,10 @@ class HorizonSearch:
     ) -> tuple[PathProgram, Trial | None]:
         """Return the path of minimum energy plus `time_cost` W times its horizon, initially `guess` s.
 
-        The derivative of the minimum energy by the horizon is the partial derivative at that optimum. A
-        horizon is a lower bound if lengthening it saves more energy than it costs, else an upper bound. The
-        next horizon follows from E ~ 1/T^3 for a slew without limits. Only the last program imposes the
-        limits.
+        The derivative of the minimum energy by the horizon is the partial derivative at the optimum over this
+        horizon. A horizon is a lower bound if a longer one saves more energy than it costs, otherwise an
+        upper bound. The next horizon follows from E ~ 1/T^3, which holds for a slew without limits. Only the
+        last program imposes the limits.
         """
         low, high, time = shortest, longest, min(max(guess, shortest), longest)
         time_cost = min(time_cost, SHORTEST_COST * self.program_at(time).bang_power)
@@ -171,9 +172,9 @@ class HorizonSearch:
     ) -> tuple[PathProgram, Trial | None]:
         """Return a path over `asked` s, or longer, by continuation from horizons that can be solved.
 
-        If a thread pulls harder than the coil, only some horizons are feasible: those of the body's swings.
-        From a solved horizon, shorter ones first, the horizon changes in steps, each started from the last
-        path.
+        If the torque of the thread exceeds that of the coil, only the horizons of the body's swings are
+        feasible. From a horizon with a known path, the horizon is changed in steps, each started from the
+        last path. Shorter horizons are tried first.
         """
         stretched: tuple[PathProgram, Trial] | None = None
         for factor in _ANCHORS:
@@ -234,11 +235,12 @@ class HorizonSearch:
 
 
 NODES = 24
-"""Number of nodes. On 24 nodes the cost is within 1e-4 of the optimum from 1.1 of the shortest horizon on,
-and a stretched horizon within 1.5 % of the shortest; 16 nodes take half the time and reach 2.5 %."""
+"""Number of nodes of a path. With 24 nodes, the cost is within 1e-4 of the optimum for horizons above 1.1
+times the shortest one, and a stretched horizon is within 1.5 % of the shortest. With 16 nodes, planning takes
+half the time and a stretched horizon is within 2.5 %."""
 FINE_NODES = 40
-"""Number of nodes for paths that run along the current limit near the requested horizon: on 24 nodes they
-cost up to 0.3 % more than the optimum, on 40 up to 0.07 %."""
+"""Number of nodes for paths that run along the current limit near the requested horizon. With 24 nodes the
+cost of such paths is up to 0.3 % above the optimum, with 40 nodes up to 0.07 %."""
 _NEARLY = 1.03
 """Stretch up to which finer nodes may still find a path over the requested horizon."""
 
@@ -366,8 +368,8 @@ def plan(
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     """Return the difference (N,) on the nodes between the rest of `last` and its prey; None without a rest.
 
-    Added to another prey, the difference gives a path between that prey's states, which need not lie on
-    `last`.
+    Adding the difference to another prey gives a path between the boundary states of this prey, which need
+    not lie on `last`.
     """
     if last is None:
         return None
@@ -376,7 +378,7 @@ def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     if not 0.0 < left <= last.horizon:
         return None
     times = 0.5 * left * (lgl_rule(nodes).nodes + 1.0)
-    # Just before the end: at the end itself the coast has begun.
+    # The last time is just before the end of the path, because the coast begins at the end.
     angle, rate, _ = last.motion(elapsed + times * (1.0 - 1e-12))
     q2 = np.sin(0.5 * angle)
     slope = 0.5 * rate * np.cos(0.5 * angle)

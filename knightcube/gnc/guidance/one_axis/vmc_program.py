@@ -5,13 +5,14 @@ The paths are q2 = q_r + v (q_p - q_r) on N nodes, where q_p is the prey and q_r
 are exact between nodes too. The path control parameter v is 1 at both ends; v_2 and v_(N-1) follow from the
 boundary rates by q' = D q at the ends (5.11 corrected). N - 4 path control parameters are free.
 
-The prey is affine in the horizon T, and a path is affine in v - 1 for a fixed prey. The paths are written as
-prey(T) + M y. The columns of M are the changes that preserve the ends and their slopes, scaled by (q_p - q_r)
-and whitened. Every optimisation here thus has affine trajectories and well-conditioned variables.
+The prey is an affine function of the horizon T, and for a fixed prey the path is an affine function of v - 1.
+The paths are therefore written as prey(T) + M y. The columns of M are the changes that preserve the ends and
+their slopes, scaled by (q_p - q_r) and whitened. Every optimisation here thus has affine trajectories and
+well-conditioned variables.
 
 Two programs share cost and limits: minimum energy at a fixed horizon, and minimum energy plus the time cost
-of the horizon. The limits hold at every time and not only on the nodes: they are imposed at those points of a
-dense grid where the previous solution exceeded them, until no point exceeds them (the exchange method of
+of the horizon. The limits hold at every time and not only at the nodes. They are imposed at the points of a
+dense grid at which the previous solution exceeded them, until no point exceeds them (the exchange method of
 semi-infinite programming).
 """
 
@@ -110,7 +111,7 @@ class BoundaryStates:
 
 @dataclass(frozen=True, slots=True)
 class PathFamily:
-    """All paths between two states on N nodes: prey at rest + T * prey of the slopes + basis @ y.
+    """All paths between two states on N nodes: still + T * drift + basis @ y, with the parameters y.
 
     Attributes:
         grid: the discretisation.
@@ -230,7 +231,10 @@ class ImposedLimits:
 
     @classmethod
     def at(cls, chosen: BoolArray, ratios: FloatArray) -> ImposedLimits:
-        """Return limits at `chosen` (2, dense), signed as `ratios` (2, dense), current then q2."""
+        """Return the limits at the `chosen` points (2, dense).
+
+        Row 0 is the limit of the current and row 1 that of q2, each with the sign of `ratios` (2, dense).
+        """
         row, index = np.nonzero(chosen)
         return cls(index, np.sign(ratios[row, index]), row == 1)
 
@@ -255,8 +259,8 @@ class PathProgram:
         self._cost = cost
         # The ends are given, and an end at the limit leaves no margin.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
-        # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
-        # finite.
+        # An iterate may pass the singularity at |q2| = 0.707.
+        # Above its limit, q2 is clamped so that the current stays finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
@@ -275,7 +279,7 @@ class PathProgram:
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
-        """Return the prey path itself over `horizon` s: every path control parameter one."""
+        """Return the prey path over `horizon` s, on which all path control parameters are one."""
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: PathFamily, horizon: float) -> PathFamily:
@@ -324,7 +328,7 @@ class PathProgram:
     def excess(
         self, limits: ImposedLimits, points: ObservedFamily, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,) at `points` (m)."""
+        """Return excesses over the limits (m,), gradients (m, N - 4) and derivatives by the horizon (m,)."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -335,7 +339,7 @@ class PathProgram:
         return limits.sign * value - 1.0, _contract(slopes, points.basis), aged
 
     def ratios(self, trial: Trial) -> FloatArray:
-        """Return current and q2 over their limits on the dense grid, signed (2, dense)."""
+        """Return the signed ratios (2, dense) of current and q2 to their limits on the dense grid."""
         nodes = self.family.nodes(trial.parameters, trial.horizon)
         trajectory = time_scale(trial.horizon) * (self.family.grid.dense.matrices @ nodes)
         current, _ = self._current(trajectory, trial.horizon)
@@ -379,7 +383,7 @@ class PathProgram:
             if worst <= 1.0 + LIMIT_TOLERANCE:
                 return trial if converged else None
             if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
-                return None  # exceeded although imposed
+                return None  # an imposed limit is exceeded
             added = _peaks(latest) & ~chosen
             ratios = np.where(added, latest, ratios)
             chosen = chosen | added
@@ -421,7 +425,7 @@ class PathProgram:
         try:
             found = np.asarray(solver.optimize(last))
         except _SOLVER_STOPS:
-            # Trivial and infeasible problems end so: the line search has shrunk onto the last point.
+            # Trivial and infeasible problems end in this way, with a line search of negligible length.
             return variables.trial(last), False
         return variables.trial(found), solver.last_optimize_result() in _CONVERGED
 
