@@ -1,17 +1,18 @@
 """Least-squares fits of attitude, scale and radial distortion to matched stars.
 
-`refine` solves Wahba's problem with one more unknown: the factor k of all tangents x/z, y/z, by which the
-assumed focal length is wrong. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation d
-about the camera axes and a small change of ln k they change by -[A r x] d + s dlnk, with
-s = (x z^2, y z^2, -z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood
-estimate for directions with errors of sigma rad along either axis across them.
+`refine` solves Wahba's problem with one more unknown, the scale k, which multiplies all tangents x/z and y/z
+to correct the assumed focal length. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation
+d about the camera axes and a small change of ln k they change by -[A r x] d + s dlnk, with s = (x z^2, y z^2,
+-z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood estimate for directions
+with errors of sigma rad along either axis across them.
 
 `fit_with_distortion` adds radial distortion, for a lens that is not calibrated. Such a lens shifts stars by
 some percent of their distance from the axis: a pinhole then fits a group of neighbours and misses the other
 stars, and its attitude error is larger than its residuals suggest. An image at the tangent t of the true
 direction appears at t (1 + c (t / R)^2), where R is the tangent of the corner (Brown 1966, the first radial
-term); c has the prior `PRIOR`. The match grows outwards from the stars that match first, as c is determined.
-Where the stars do not determine c, the covariance of the attitude includes its uncertainty.
+term); c has the prior `PRIOR`. The match starts with the stars that match without distortion and grows
+outwards while c is determined. If the stars do not determine c, the covariance of the attitude includes the
+uncertainty of c.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class StarField:
         return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
 
     def subset(self, chosen: IntArray) -> StarField:
-        """Return the field of the stars `chosen` (k,) by number, in that order."""
+        """Return the field of the stars with the indices `chosen` (k,), in this order."""
         magnitude = None if self.magnitude is None else self.magnitude[chosen]
         return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
 
@@ -87,7 +88,7 @@ class StarMatch:
 
     Attributes:
         status: the other attributes are valid for IDENTIFIED only.
-        star: numbers of the guide stars (n,); -1 for an observed point without one.
+        star: indices of the guide stars (n,); -1 for an observed point without a guide star.
         fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
         scale: factor by which the tangents of the observed directions had to be multiplied.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
@@ -116,10 +117,12 @@ class StarMatch:
 _CROSS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
 )
-# Step (rad) at which the iteration ends: a step d leaves an error of about d^2, 0.002 arcsec.
+# Step (rad) at which the iteration ends.
+# A step d leaves an error of about d^2, 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition: for directions within 1e-6 rad of one line the rotation about it is undefined.
+# Minimum reciprocal condition number.
+# The rotation about a line is undefined if all directions are within 1e-6 rad of it.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -254,12 +257,14 @@ def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 PRIOR = 0.05
-"""Standard deviation of c, the relative shift in the corner, of lenses that are not calibrated."""
+"""Prior standard deviation of the radial distortion c of an uncalibrated lens. The value of c is the shift of
+a star in the image corner, as a fraction of its distance from the axis."""
 _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half width of the gate while the match grows: in sigmas of a star, and relative to the corner's tangent.
+# Half width of the gate while the match grows, in standard deviations of a star and relative to the corner's
+# tangent.
 _GATE_SIGMAS = 8.0
 _GATE_SHARE = 0.004
 # Standard deviations of the scatter beyond which a star is excluded from the final fit.
@@ -273,8 +278,8 @@ class DistortedFit:
     """The matched stars and the attitude of a camera with a distorted lens.
 
     Attributes:
-        observed: numbers of observed stars (k,).
-        star: numbers of guide stars (k,).
+        observed: indices of the matched observed stars (k,).
+        star: indices of the matched guide stars (k,).
         refined: attitude, scale and their covariance, increased according to the residuals.
         distortion: the coefficient c of the module docstring.
         seen: directions of all observed stars, corrected for the distortion (n, 3), camera frame.
@@ -299,7 +304,7 @@ def fit_with_distortion(
 ) -> DistortedFit | None:
     """Return the match grown from the stars `observed` and `star` (k,), starting at `start`.
 
-    `expected` are the numbers of the guide stars in and around the field, the brightest first. Returns None
+    `expected` are the indices of the guide stars in and around the field, the brightest first. Returns None
     if the matched stars do not determine the lens.
     """
     corner = math.hypot(*field.half_width)
@@ -334,7 +339,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Residuals beyond the sigmas increase the covariance, except for the part of the prior.
+    # Residuals that exceed the standard deviations increase the covariance, except for the part of the prior.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
@@ -358,7 +363,7 @@ class _DistortedPose:
         return stretched(direction, self.scale * self.ratio(direction, corner))
 
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
-        """Return true over observed tangents (n,) at the scale: Newton's method for r (1 + c s^2 r^2) = 1."""
+        """Return the ratios r (n,) of true to observed tangents, the roots of r (1 + c s^2 r^2) = 1."""
         squared = self.distortion * _squared_tangent(direction) / corner**2
         ratio = np.ones(len(direction))
         for _ in range(4):

@@ -1,20 +1,20 @@
 """The attitude from matched stars whose image positions have individual covariances.
 
-A streaked star is measured well across its path and badly along it. Each residual b - A r is taken in the two
-directions across the star and whitened by the covariance of the position; Gauss-Newton minimises the sum of
-squares, the maximum likelihood estimate for Gaussian errors. The light of another star in a streak shifts its
-position. Stars that disagree by more than chance allows, given the scatter of the majority, are found with
-Huber's weights, which bound the influence of any star, and are excluded.
+The position of a streaked star is accurate across its path and inaccurate along it. Each residual b - A r is
+taken in the two directions across the star and whitened by the covariance of the position; Gauss-Newton
+minimises the sum of squares, the maximum likelihood estimate for Gaussian errors. The light of another star
+in a streak shifts its position. Stars that disagree by more than chance allows, given the scatter of the
+majority, are found with Huber's weights, which bound the influence of any star, and are excluded.
 
 Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are fitted too, with a prior from
 the calibration or from typical lenses: their remaining uncertainty is part of the covariance of the attitude.
 The same holds for an error of the line time of a rolling shutter, which displaces each star along its motion
 in proportion to its row.
 
-Streaks that differ from the model err by pixels, bright ones as much as faint ones. Where streaks scatter
-beyond their noise, a common variance is added to the noise, so large that the sum of squares equals the
-degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without it the brightest stars, whose
-noise is smallest, would dominate, and the covariance would be too small.
+The positions of streaks that differ from the model have errors of pixels, independent of their brightness. If
+the streaks scatter beyond their noise, a common variance is added to the noise, so that the sum of squares
+equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without it the brightest
+stars, whose noise is smallest, would dominate, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _MOST_STEPS = 8
 _SETTLED = 1e-11
 # Step (px) of the numerical derivative of the lens.
 _STEP_PX = 0.5
-# Chi-square with 2 degrees of freedom: the value exceeded by chance once in 1000, and the median.
+# Chi-square with 2 degrees of freedom that is exceeded by chance once in 1000, and the median.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
-# Standard deviations beyond which the influence of a star is bounded in the search for outliers.
+# Residual (standard deviations) above which the influence of a star is bounded in the search for outliers.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
-# Maximum number of Newton steps to the common variance, and the excess of the squares at which they end.
+# Maximum number of Newton steps for the common variance, and excess of the sum of squares at which they end.
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 
 
@@ -56,9 +56,10 @@ class Unknowns:
 
     Attributes:
         scale: whether the focal length is fitted.
-        bend: information about the bend of the lens (6,); (0,) if the lens is exact.
-        late: displacement of each star by a standard deviation of the line time of the shutter (n, 2), px;
-            (0, 2) if the line time is exact.
+        bend: prior information (6,), the reciprocal variances, of the lens errors (`sky_map`); empty (0,) if
+            the lens is exact.
+        late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
+            line time; (0, 2) if the line time is exact.
         scatter: whether a common variance may be added to those of the positions.
     """
 
@@ -80,8 +81,8 @@ class ImageFit:
         scale: factor of the tangents x/z, y/z; 1 if it was fixed.
         scale_sigma: relative standard deviation of the scale; 0 if it was fixed.
         bend: bend of the lens (6,), see `sky_map`; zeros for an exact lens.
-        delay: error of the line time of the shutter, in its standard deviations.
-        squares: squared error of each star over its covariance (n,), with two degrees of freedom.
+        delay: fitted error of the shutter's line time, in standard deviations.
+        squares: chi-square of each star (n,), with two degrees of freedom.
         agree: whether the star was used (n,).
     """
 
@@ -175,16 +176,16 @@ class _Seen:
 
     @property
     def before(self) -> FloatArray:
-        """The prior information about the last parameters, bend and delay."""
+        """The prior information about bend and delay, which are the last parameters."""
         return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
 
     @property
     def camera(self) -> IntArray:
-        """The numbers of bend and delay among the parameters, after the rotation and ln scale."""
+        """The indices of bend and delay among the parameters, after the rotation and ln scale."""
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _FittedPose) -> float:
-        """Return the number of parameters that the stars determine; those with a prior count in part."""
+        """Return the effective number of parameters that the stars determine, without prior information."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
@@ -248,7 +249,8 @@ class _Seen:
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
     """Return the fit to the stars that agree, and a mask (n,) of these stars.
 
-    An outlier shifts all residuals: their spread is meaningless until its influence is bounded.
+    An outlier shifts all residuals, so that their spread is meaningful only after the influence of outliers
+    is bounded.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
@@ -261,7 +263,7 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
-    """Return stars and fit with the variance that stars which `agree` (n,) share beside their own."""
+    """Return stars and fit with a common variance added to the variances of the stars that `agree` (n,)."""
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):
         root = np.linalg.cholesky(seen.covariance[agree])

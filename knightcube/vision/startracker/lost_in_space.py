@@ -3,9 +3,10 @@
 Every triangle of the brightest observed stars is looked up by shape, orientation and size among the triangles
 of guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
 occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
-field until one is accepted. If none is, triangles spread over all stars are looked up: of a thousand, enough
-consist of true stars to win the vote even if most stars, including the brightest, are false. Finally the
-mirrored field is tried, and a scale outside of a narrow range that was given as a hint.
+field until one is accepted. If no match is accepted, triangles spread over all stars are looked up. Even if
+most stars, including the brightest, are false, enough of a thousand triangles consist of true stars only.
+Finally the mirrored field is tried, and scales outside the given range if this range is narrow, because a
+narrow range may be wrong.
 
 The shape of a triangle on the sphere depends slightly on the scale of the image. A wide range of scales is
 divided into steps, each narrow enough for the side ratios to stay within the tolerance.
@@ -48,14 +49,14 @@ _BRIGHTEST = 12
 _NEIGHBOURS = 5
 _CENTRES = 40
 _MOST_STARS = 64
-# Limits of the longest side, relative to the width of the field: the index has larger triangles of bright
-# stars only, and smaller triangles are less accurate.
+# Limits of the longest side, relative to the width of the field.
+# The index has larger triangles only of bright stars, and smaller triangles are less accurate.
 _MIDDLE_SIZES = 0.3, 0.75
 
 
 @dataclass(frozen=True, slots=True)
 class BatchSizes:
-    """Numbers of triangles that are looked up at once, batch after batch.
+    """Numbers of triangles in successive batches, each of which is looked up at once.
 
     Attributes:
         bright: batches of the brightest stars, at each step of scale; these solve most frames.
@@ -67,7 +68,7 @@ class BatchSizes:
 
 
 def batches_of(field: StarField, sizes: BatchSizes, steps: int) -> Iterator[tuple[IntArray, bool]]:
-    """Yield batches of triangles (t, 3), and whether they are spread over many stars.
+    """Yield batches of triangles (t, 3), and whether the triangles are spread over many stars.
 
     With many `steps` of scale a batch of the brightest stars is smaller, by the square root of their number.
     The last batch includes triangles of neighbours, for a list that is not sorted by brightness.
@@ -96,7 +97,7 @@ def middle_sized(field: StarField) -> IntArray:
     least = np.minimum(np.minimum(cosine[first, second], cosine[second, third]), cosine[third, first])
     longest = np.sqrt(np.maximum(2.0 - 2.0 * least, 0.0)) / (2.0 * max(field.half_width))
     kept = np.flatnonzero((longest >= _MIDDLE_SIZES[0]) & (longest <= _MIDDLE_SIZES[1]))
-    # A fixed seed: the same list always gives the same result.
+    # The seed is fixed, so that the same list always gives the same result.
     return np.asarray(triangles[np.random.default_rng(len(field)).permutation(kept)])
 
 
@@ -158,8 +159,8 @@ class TriangleMatches:
     """Matches of observed triangles with triangles of guide stars, corner by corner.
 
     Attributes:
-        observed: numbers of observed stars (k, 3), uint32.
-        star: numbers of guide stars (k, 3), uint32.
+        observed: indices of the observed stars (k, 3), uint32.
+        star: indices of the guide stars (k, 3), uint32.
         scale: factor of the tangents that makes the longest sides equal (k,).
     """
 
@@ -186,7 +187,7 @@ class TriangleMatches:
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
         bins -= bins.min()
         bits = max(13, self.star.size.bit_length())
-        # A multiplicative hash: two pairs rarely share a slot, and a collision is harmless.
+        # With this multiplicative hash, two pairs rarely share a slot, and a collision is harmless.
         code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
         code += bins.astype(np.uint32)[:, None]
         slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
@@ -211,8 +212,8 @@ def look_up(
         field: the observed stars.
         sky: the index.
         steps: ranges of scale.
-        triangles: numbers of observed stars (t, 3).
-        tolerance: tolerance of a side ratio, in its sigmas.
+        triangles: indices (t, 3) of the observed stars at the corners of each triangle.
+        tolerance: tolerance of a side ratio, in standard deviations.
         distortion: additional error of a side ratio.
         most: maximum number of entries to read; the first triangles take precedence.
     """
@@ -220,7 +221,7 @@ def look_up(
     size = np.maximum(sides[:, 2], SIZE_UNIT)
     sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
     step = np.tile(np.arange(len(steps)), len(triangles))
-    # The error of the difference of two directions, and of the side by which it is divided.
+    # The error of a side ratio follows from the errors of two directions and of the longest side.
     slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
     ratio = sides[:, :2] / size[:, None]
     usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
@@ -229,12 +230,12 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    # The first runs that hold at most `most` entries in total.
+    # Only the first runs with at most `most` entries in total are read.
     count = end - begin
     kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
     begin, count = begin[:kept], count[:kept]
     query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
-    # int32: the entries are the bulk of the work.
+    # int32 halves the time, most of which is spent on these entries.
     first = (begin - (np.cumsum(count) - count)).astype(np.int32)
     entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
     near = np.ones(len(entry), dtype=np.bool_)
@@ -259,8 +260,8 @@ def look_up(
 def _places(
     ratio: FloatArray, slack: FloatArray, cells: IntArray
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
-    """Return the lowest position in the cell within `slack` of each ratio, and the number of further ones."""
-    # In units of the finest division of a ratio, from the middle of the division.
+    """Return the lowest position within `slack` of each ratio, and the number of further positions."""
+    # The positions are in units of the finest division of a ratio, relative to the middle of a division.
     wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
     reach = slack * (CELLS * FINE) + 0.5
     lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
@@ -271,7 +272,7 @@ def _places(
 def _forms(
     field: StarField, triangles: IntArray, steps: ScaleSteps
 ) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return corners and sides (t s, 3), sorted by the opposite sides, and whether triangles turn left."""
+    """Return corners and sides (t s, 3), sorted by side, and whether the corners run counterclockwise."""
     x, y, z = field.direction.T
     direction = np.empty((len(steps), len(field), 3))
     direction[:, :, 0] = steps.middle[:, None] * x
@@ -302,15 +303,15 @@ def _runs(
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
     """Return the runs of keys that contain triangles similar to the queries.
 
-    Each run has the number of its query, the cells of the short and of the middle ratio, and its beginning
-    and end. Each ratio of a query may lie in up to three cells.
+    Each run has the index of its query, the cells of the short and of the middle ratio, and its beginning and
+    end. Each ratio of a query may lie in up to three cells.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # In order of the queries: the first triangles get the first of the entries that may be read.
+    # The runs are in the order of the queries, so that the first triangles are read first.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle
@@ -327,7 +328,7 @@ class IdentificationSettings:
     """Tolerances and limits of the search.
 
     Attributes:
-        tolerance: tolerance of the side ratios, in their sigmas.
+        tolerance: tolerance of the side ratios, in standard deviations.
         distortion: additional error of a side ratio, for a lens that is not a pinhole.
         batches: numbers of triangles to look up.
         work: maximum number of index entries to read.

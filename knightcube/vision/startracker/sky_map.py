@@ -3,8 +3,8 @@
 - Stellar aberration: a moving camera sees stars displaced towards its direction of motion, by up to 20.8"
   (the exact formula of special relativity; Green, Spherical Astronomy, 1985, 8.3; Explanatory Supplement,
   7.2.3).
-- Lens errors that remain besides a wrong focal length: the optical axis is not in the image centre, and the
-  lens distorts. Tangents u are off by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with tilt a, decentring b
+- Lens errors other than a wrong focal length: an optical axis outside the image centre, and distortion.
+Tangents u are off by (u. a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with tilt a, decentring b
   and distortion k, l (Brown 1966). The vector (a, b, k, l), (6,), is called the bend of the lens.
 - Pointing: right ascension, declination and roll of an attitude.
 """
@@ -43,8 +43,9 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 BENDS = 6
-# Standard deviations of the tilt along x and y, relative to the corner's tangent, and of the two terms of the
-# distortion in the corner: 20 px of 1024, 3 % and 1 %. The decentring is the product of tilt and distortion.
+# Standard deviations of a typical lens: of the tilt along x and y, relative to the corner's tangent (20 px of
+# 1024), and of the two terms of the distortion in the corner (3 % and 1 %).
+# The decentring is the product of tilt and distortion.
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
 # Minimum standard deviations of the image centre (px) and of the distortion (relative to the radius).
@@ -140,7 +141,7 @@ def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatAr
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Each step leaves the bend's slope, a few percent, of the error before it.
+# Each step reduces the error to a few percent, the slope of the bend.
 _BEND_STEPS = 8
 
 

@@ -61,11 +61,11 @@ class FrameSolution:
         kind: whether the frame shows points or streaks.
         camera: the camera, with the focal length fitted to the stars if it was free.
         points: positions of the detected stars at mid-exposure (n, 2), px, the brightest first.
-        covariance: of the positions (n, 2, 2), px^2.
-        late: displacement of the points by one standard deviation of the line time of the shutter (n, 2), px;
-            (0, 2) if the line time is exact.
-        star: numbers of the guide stars (n,); -1 for a point without one.
-        expected: predicted positions of the guide stars (n, 2), px; NaN for a point without one.
+        covariance: covariance of the positions (n, 2, 2), px^2.
+        late: displacement of the points (n, 2), px, due to an error of one standard deviation of the
+            shutter's line time; (0, 2) if the line time is exact.
+        star: indices of the guide stars (n,); -1 for a point without a guide star.
+        expected: predicted positions of the guide stars (n, 2), px; NaN for a point without a guide star.
         fix: attitude, ICRS to camera, and its covariance; the scalar part of the quaternion is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 if it was given.
         bend: fitted errors of an inexact lens (6,), see `sky_map`; zeros for an exact lens.
@@ -131,11 +131,11 @@ class Weighting:
 
 
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
-"""Points: the mean over the exposure, by Simpson's rule."""
+"""Weighting of points, which show the mean attitude over the exposure, by Simpson's rule."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
-"""Streaks fitted at a constant rate, which their ends determine, or measured at their ends alone."""
+"""Weighting of streaks that are fitted with a constant rate or measured only at their ends."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Streaks fitted with an acceleration: the middle of the parabola that fits the motion best."""
+"""Weighting of streaks that are fitted with an acceleration, by the middle of the best-fitting parabola."""
 
 
 def weighting_of(motion: FrameMotion) -> Weighting:
@@ -164,9 +164,9 @@ def middle_covariance(
 def timing_covariance(motion: MotionResult) -> FloatArray:
     """Return the covariance (3, 3), rad^2, of the rotation error that all stars of a frame share.
 
-    If the rate changes, only the light along a streak determines its position at mid-exposure. A wrong
-    acceleration makes all stars early or late by the same time, which does not average out over the stars.
-    The uncertainty of the best star along its path bounds this error.
+    If the rate changes, only the light along a streak determines its position at mid-exposure. An error of
+    the acceleration shifts all stars along their paths by the same time, which does not average out over the
+    stars. The uncertainty of the most accurate star along its path bounds this error.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))
@@ -185,21 +185,24 @@ _LEAST_SIGMA_PX = 0.005
 _COLOUR_PX = 0.002
 # Common centroid error, as a fraction of the excess PSF width (campaign `resting`).
 _SHAPE_DOUBT = 0.05
-# Position error (px) of an uncalibrated lens in identification. It is tried second: most pictures need only
-# the errors of their positions, within which fewer stars agree by chance.
+# Position error (px) of an uncalibrated lens in the second attempt of an identification.
+# The first attempt uses only the errors of the positions, within which fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
-# Attitude error of an uncalibrated lens and of the air beyond the fit of the lens, in px across the boresight
-# and at the edge about it. Attitudes of photographs by other solvers differ by this.
+# Attitude error of an uncalibrated lens and of refraction that the fit of the lens does not remove.
+# It is in px across the boresight, and in px at the image edge for the rotation about it.
+# Attitudes of photographs by other solvers differ by this value.
 _UNCALIBRATED_LENS_PX = 0.25
 # Minimum significance of a streaked star (standard deviations of its light) for identification.
 _LEAST_SIGNIFICANCE = 5.0
-# Standard deviation (px) above which a star has no usable position: its streak may end outside of the frame.
+# Standard deviation (px) above which a position is unusable, for example if the streak ends outside the
+# frame.
 _PLACELESS_PX = 5.0
-# Limit of agreement with the prior: chi-square with 3 degrees of freedom, exceeded once in 100,000 by chance.
+# Largest chi-square of the difference from the prior attitude, exceeded by chance once in 100,000 cases.
 _NEAR = 25.9
-# Number of stars that tracking looks for, within PRIOR_SIGMAS of the prior.
+# Number of guide stars that tracking searches in the frame, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
-# Limits of the search radius (px); above the larger one, a search of the whole frame is faster.
+# Minimum and maximum search radius (px).
+# Above the maximum, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 
 
@@ -371,7 +374,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude agrees with the prior, near which alone it was tested against chance."""
+    """Return whether an attitude agrees with the prior, near which alone its significance is valid."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
@@ -382,8 +385,8 @@ def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
     """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
-    The centroid of a star with a tail, due to the lens or to stray light, depends on the weights of its
-    pixels: all positions have the same error.
+    If the images of stars have a tail, due to the lens or to stray light, the centroid depends on the weights
+    of the pixels, which causes the same error of all positions.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
@@ -412,7 +415,7 @@ def _identify(
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
     options = settings.identification
     if seen.kind is FrameKind.STREAKS:
-        # The rate of a mirrored picture would be wrong.
+        # Streaks are not matched with the mirrored sky, because the rate would be wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
     if found.status is MatchStatus.NO_MATCH and settings.uncalibrated_lens and scale[0] != scale[1]:
@@ -463,7 +466,7 @@ def _with_attitude(
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    # Prior information about the bend of the lens; none if no bend is fitted.
+    # The prior information about the bend of the lens is empty if no bend is fitted.
     known = np.zeros(0)
     if free_lens:
         known = usual_bend(camera)

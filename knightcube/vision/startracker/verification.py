@@ -2,10 +2,10 @@
 
 The guide stars predicted in the field are compared with the observed stars; coincident stars refine attitude
 and scale, repeatedly, until the set of matched stars no longer changes. The significance is an upper bound of
-the expected number of attitudes, among those searched, at which random stars would match the guide stars as
-well or better. If it is far below one, it also bounds the probability of a false match. The bound does not
-depend on how a candidate was found. It is raised for every choice that the matching makes among gates,
-brightness limits and tests (Bonferroni).
+the expected number of searched attitudes at which random stars would match the guide stars equally well or
+better. If it is far below one, it also bounds the probability of a false match. The bound does not depend on
+how a candidate was found. It is raised for every choice that the matching makes among gates, brightness
+limits and tests (Bonferroni).
 
 `track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error shifts all
 predicted stars by nearly the same vector. Of all pairs of an observed and a predicted star close enough to be
@@ -44,7 +44,7 @@ _MOST_ORDERED = 12
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """The parameters of the probability of a chance match.
+    """The parameters from which the probability of a chance match is computed.
 
     Attributes:
         observed: number of observed stars.
@@ -53,7 +53,7 @@ class Chance:
         scales: ln of the highest over the lowest scale.
         choices: number of gates from which the matching chooses.
         least: minimum number of matched stars.
-        enough: log10 of the bound below which the exact value does not matter.
+        enough: log10 of the bound below which the exact value is not needed.
     """
 
     observed: int
@@ -67,8 +67,9 @@ class Chance:
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
         """Return log10 of the bound for `observed` stars that match the expected stars `ranks` within `gate`.
 
-        Both are numbered in order of brightness. The matching chooses the faintest star that counts: for
-        the j-th choice, with j - 1 brighter expected stars missing, the bound is multiplied by j^2 pi^2/6.
+        Observed and expected stars are numbered in order of brightness. Because the matching also chooses the
+        faintest star that counts, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of missing
+        brighter expected stars.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -88,9 +89,9 @@ class Chance:
 
         The first star may be any star of the sky. The second star lies in a ring around it that the distance
         of the two defines, with a width given by the range of the scale and the gate. Each other star must
-        lie within the gate of an expected star. This is counted for all choices of the matched stars among
-        the observed ones. The fit moves towards its own stars: excluded from the fit, each star would be
-        farther away by 1/(1 - leverage).
+        lie within the gate of an expected star. The number of choices of the matched stars among the observed
+        stars multiplies the probability. Because the fit moves towards its own stars, the distance of each
+        star is increased by the factor 1/(1 - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -128,11 +129,13 @@ class VerificationSettings:
 
     Attributes:
         log10_false_alarm: log10 of the maximum expected number of chance matches in the searched sky.
-        gates: half widths within which a star matches, in its sigmas; the most significant gate is used. The
-            wide gates serve a lens with distortion, or sigmas that are too small.
+        gates: half widths within which a star matches, in standard deviations; the most significant gate is
+            used. The wide gates are for a lens with distortion, or for standard deviations that are too
+            small.
         least_matches: minimum number of matched stars.
         rounds: maximum number of rounds of matching and refinement.
-        most: number of the brightest observed stars that decide; finally all stars are matched.
+        most: number of the brightest observed stars that decide the acceptance; after it all stars are
+            matched.
     """
 
     log10_false_alarm: float = -4.5
@@ -153,11 +156,13 @@ class _Matching:
 
 # Share of matched bright expected stars below which distortion of the lens is fitted.
 _FEW_MISSED = 0.8
-# Maximum share of bright expected stars, beyond chance, without a match although an unmatched star is near,
-# and the radius of "near" relative to the corner's tangent. A larger share means that the fit of the lens is
-# wrong; a foreground hides stars, but adds none beside them.
+# Maximum share of bright expected stars, beyond chance, without a match but with an unmatched star nearby,
+# and the radius of the neighbourhood relative to the corner's tangent.
+# A larger share indicates a wrong fit of the lens, because a foreground hides stars but adds no stars near
+# them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess over the limit, in powers of ten, above which a new candidate is rejected at once.
+# Excess of the chance probability over its limit, in powers of ten, above which a candidate is rejected
+# without refinement.
 _HOPELESS = 7.0
 
 
@@ -194,7 +199,7 @@ def verify(
         if decided is None:
             return nothing(field)
         matching, refined = decided
-    # A calibrated lens has no unknown distortion. Other lenses have, if stars are missed or scatter.
+    # The distortion of an uncalibrated lens is fitted if stars are missed or scatter too much.
     bright = _bright_matched(expected, matching.star)
     missed = not len(bright) or float(np.mean(bright)) < _FEW_MISSED
     scattered = inflation(refined.squares, len(refined.covariance)) > 1.0
@@ -248,7 +253,7 @@ def nothing(field: StarField, status: MatchStatus = MatchStatus.NO_MATCH) -> Sta
 def expected_stars(
     sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
 ) -> npt.NDArray[np.intp]:
-    """Return the numbers of the `count` brightest guide stars in the field, the brightest first."""
+    """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
     # Search twice as many of the brightest stars as an even sky would need for `count` stars in the field:
@@ -261,7 +266,7 @@ def expected_stars(
 
 
 def _expected_in(field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float) -> npt.NDArray[np.intp]:
-    """Return the numbers of the guide stars that a field of some stars may contain, the brightest first."""
+    """Return the indices of the guide stars that may be in the field, the brightest first."""
     across, down = field.half_width
     return expected_stars(sky, matrix, (across * scale, down * scale), int(1.3 * len(field)) + 8)
 
@@ -335,7 +340,7 @@ def _match(
     matched = settings.least_matches - 1
     for gate in settings.gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A wider gate with the same stars is less significant.
+        # A wider gate that matches no further stars is less significant.
         if len(within) <= matched:
             continue
         matched = len(within)
@@ -361,7 +366,8 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
 PRIOR_SIGMAS = 4.0
 """Largest assumed error of a prior attitude, in standard deviations."""
 _BRIGHTEST = 16
-# More pairs are ambiguous, and comparing them takes longer than a search of the whole sky.
+# Maximum number of pairs.
+# The comparison of more pairs is ambiguous and takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -395,7 +401,7 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # Volume of the ball of rotations around the prior over that of all rotations, 8 pi^2 in this measure.
+    # The searched fraction is the volume of rotations near the prior over that of all rotations, 8 pi^2.
     searched = min((PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify(field, sky, matrix, scale, searched, settings)
 
@@ -411,7 +417,8 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # Roll, and an unknown scale, make the shifts of stars at the edge differ.
+    # Because of errors of roll and scale, the shifts of stars at the image edge differ from the shift at the
+    # centre.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
