@@ -1,4 +1,4 @@
-"""One control cycle (40 Hz): from readings to an estimate, and by mode and path to coil currents."""
+"""One control cycle (40 Hz): readings update the estimate; mode and path determine the coil currents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from knightcube.gnc.estimation.estimate import ATTITUDE as ATTITUDE_ERROR
 from knightcube.gnc.estimation.estimate import RATE, Estimate
 
 ATTITUDE_EVERY = 4
-"""Control cycles from one attitude packet to the next."""
+"""Number of control cycles between attitude packets."""
 _NAN3 = np.full(3, np.nan)
 _NAN4 = np.full(4, np.nan)
 
@@ -59,10 +59,10 @@ class _CycleRecord:
     """The inputs and results of one cycle, filled in step by step.
 
     Attributes:
-        coils: the coil command on the wire at the start of the cycle.
+        coils: the coil command that the PWM chip holds at the start of the cycle.
         validity: whether the coil currents are known.
-        readings: of the inertial unit since the last cycle, oldest first.
-        estimate: for now, measured or propagated by the model; None without an estimate.
+        readings: readings of the inertial unit since the last cycle, oldest first.
+        estimate: present estimate, from measurements or propagated by the model; None without an estimate.
         measured: the estimate, if it may be used for steering.
     """
 
@@ -76,7 +76,7 @@ class _CycleRecord:
 
     @property
     def now_ns(self) -> int:
-        """Start of the cycle."""
+        """Time (ns) at which the cycle started."""
         return self.cycle.start_ns
 
 
@@ -106,9 +106,9 @@ class ControlCycle:
         return self._publish(record, steered)
 
     def _sample(self, cycle: Cycle) -> _CycleRecord:
-        """Read the coil command on the wire and the inertial unit, and give both to navigation."""
+        """Read the coil command in force and the inertial unit, and pass both to navigation."""
         tasks, now_ns = self._tasks, cycle.start_ns
-        # The last command may have reached the wire late: the coils' thread sends it.
+        # The last command may have reached the PWM chip late, because the thread of the coil driver sends it.
         coils = tasks.drive.state()
         validity = self._knowledge.look(coils, now_ns, suspected=tasks.drive.is_suspect)
         tasks.navigation.commanded(coils, validity)
@@ -122,14 +122,14 @@ class ControlCycle:
         record.estimate = self._tasks.navigation.estimate(record.now_ns)
 
     def _check(self, record: _CycleRecord) -> None:
-        """Check the coils against supply current and motion, and the star camera."""
+        """Compare the coils with supply current and motion, and check the star camera."""
         known = record.validity.since_last_look
         self._tasks.drive.look(record.coils, record.readings, record.now_ns, known=known)
         if self._tasks.imaging is not None:
             self._tasks.imaging.serve(record.now_ns)
 
     def _decide(self, record: _CycleRecord) -> None:
-        """Set mode and target; request a path if the target is new or there is an estimate again."""
+        """Set mode and target; request a path for a new target, or when the estimate is available again."""
         tasks, control, now_ns, estimate = self._tasks, self._body.control, record.now_ns, record.estimate
         overdue = None
         if estimate is not None and self._target is not None:
@@ -152,7 +152,7 @@ class ControlCycle:
         self._was_measured = measured
 
     def _accept_results(self, record: _CycleRecord) -> None:
-        """Give the workers' results to their tasks; a result of a camera changes the estimate."""
+        """Pass the workers' results to their tasks; results from camera frames change the estimate."""
         tasks, now_ns = self._tasks, record.now_ns
         for result in self._jobs.collect():
             tasks.observer.job(result, now_ns)

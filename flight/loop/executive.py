@@ -1,18 +1,18 @@
-"""The executive, which runs rate groups on an injected clock, and the runners of jobs outside its thread.
+"""The executive runs rate groups on an injected clock; job runners run jobs outside its thread.
 
-Rate groups run in order of their due times, one at a time. A late cycle re-phases to the grid. A slot is run
-if it is less than half a period late, otherwise it is skipped and counted, so two cycles are never closer
-than half a period: there is no burst of catch-up cycles. Slots run plus slots skipped always equal the slots
-elapsed.
+Each rate group has a fixed grid of time slots. Rate groups run in order of their due times, one at a time. A
+slot that is less than half a period late is run; a later slot is skipped and counted. Two cycles of a group
+are therefore never closer than half a period, and there is no burst of catch-up cycles. The number of slots
+run and skipped always equals the number of slots elapsed.
 
-Groups are given in order of importance: among groups due at the same time the first runs first. The
-executive's task runner is one of the named containment boundaries: an exception of a task is reported and the
-loop goes on.
+Groups are given in order of importance. Of several groups that are due at the same time, the first one runs
+first. The executive's task runner is one of the named containment boundaries: an exception of a task is
+reported, and the loop continues.
 
 The control thread submits a job and later collects the finished result; it never waits. In lock-step
 simulation `LockStepRunner` runs the job at once, in `submit`, and delivers the result after the worker's
-modelled latency of simulated time, so that a flight is bit for bit the same on a busy machine. In real time
-`flight.loop.worker_processes.ProcessRunner` runs jobs in processes.
+modelled latency of simulated time, so that the result of a flight does not depend on the speed of the
+machine. In real time `flight.loop.worker_processes.ProcessRunner` runs jobs in processes.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class Worker:
 
     Attributes:
         name: short name for telemetry.
-        function: runs in a process of its own in real time, so its argument must pickle, and its result be of
-            plain values, arrays of numbers, and dataclasses and enumerations of modules that the control
-            process has imported.
-        latency_ns: delay of a result in lock-step simulation.
-        timeout_ns: in real time, a job that runs for longer is killed.
+        function: function that runs in a process of its own in real time. Its argument must be picklable. Its
+            result must consist of plain values, arrays of numbers, and dataclasses and enumerations of
+            modules that the control process has imported.
+        latency_ns: delay (ns) of a result in lock-step simulation.
+        timeout_ns: longest execution time (ns) of a job in real time; a job that runs longer is killed.
     """
 
     name: str
@@ -62,7 +62,7 @@ class JobResult:
 
 
 class WorkerChange(Enum):
-    """A change of a worker: its process ended, runs again, or died too often and rests."""
+    """A change of a worker: its process died, was restarted, or died so often that restarts pause."""
 
     DIED = "died"
     READY = "ready"
@@ -132,7 +132,7 @@ class LockStepRunner:
         return True
 
     def collect(self) -> list[JobResult]:
-        """Return the results whose latency has passed."""
+        """Return the results whose modelled latency has passed."""
         now_ns = self._clock.now_ns()
         ready = [result for result in self._pending.values() if result.delivered_ns <= now_ns]
         for result in ready:
@@ -150,7 +150,7 @@ class LockStepRunner:
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """One run of a rate group: its slot on the grid, when it was due and when it began, in ns."""
+    """One cycle of a rate group: number of its slot, time at which it was due, and time of its start (ns)."""
 
     slot: int
     due_ns: int
@@ -161,7 +161,7 @@ Task = Callable[[Cycle], None]
 
 
 class RateGroup:
-    """A task, its period, and their statistics."""
+    """A periodic task, its period, and the statistics of its cycles."""
 
     def __init__(self, name: str, period_ns: int, task: Task) -> None:
         if period_ns <= 0:
@@ -230,7 +230,7 @@ class Observer(Protocol):
         """Report slots that were skipped."""
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Report that a task raised, and bring the devices to a safe state."""
+        """Report that a task raised an exception, and bring the devices to a safe state."""
 
 
 class CyclicExecutive:
@@ -250,7 +250,7 @@ class CyclicExecutive:
         self._stop = False
 
     def stop(self) -> None:
-        """Let the running cycle end, then return from `run`. Safe from a signal handler."""
+        """Let the running cycle end, then return from `run`. A signal handler may call this method."""
         self._stop = True
 
     def run(self, epoch_ns: int, until_ns: int) -> None:

@@ -1,8 +1,8 @@
-"""Horizon cameras: passes their frames to a worker, and Sun and nadir to the body.
+"""Task of the horizon cameras: passes frames to a worker, and the directions of Sun and nadir to the body.
 
-All cameras are triggered together, and more often while the body needs them. Cameras that give no frame, or
-the same image again, or images that contradict a fine attitude, are reported. The task runs once a second,
-beside the control cycle: a frame is used at its own time.
+All cameras are triggered together, and more often while the body needs their frames. A camera is reported if
+it gives no frame, repeats an image, or gives images that contradict a finely known attitude. The task runs
+once a second, independently of the control cycle. A frame is used at the time of its exposure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from knightcube.vision.horizon_camera_job import HorizonCameraResult
 
 WORKER = "wide"
 _SPARSE = 8
-"""Spacing (px) of the pixels that are compared with the last image; noise makes intact images differ."""
+"""Spacing (px) of the pixels that are compared with the last image to detect a repeated image."""
 _NONE = [float("nan")] * 3
 
 
@@ -32,9 +32,10 @@ class HorizonCameraSettings:
 
     Attributes:
         exposures_ns: exposure time of each camera.
-        period_ns, fine_period_ns: time between triggers, while frames are needed and otherwise.
-        late_ns: longest wait for the frames of a trigger.
-        max_age_ns: time without a frame after which a camera is lost.
+        period_ns: time between triggers while frames are needed often.
+        fine_period_ns: time between triggers otherwise.
+        late_ns: longest delay of a frame after its trigger.
+        max_age_ns: time without a frame after which a camera counts as lost.
     """
 
     exposures_ns: Sequence[int]
@@ -45,7 +46,7 @@ class HorizonCameraSettings:
 
 
 class HorizonCameraTask:
-    """Triggers the horizon cameras, monitors them, and owns the frames of one round."""
+    """Triggers and monitors the horizon cameras, and owns the frames of one trigger."""
 
     def __init__(
         self,
@@ -66,20 +67,20 @@ class HorizonCameraTask:
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
         self._pictures = [b""] * len(cameras)
-        self._job: tuple[int, int, int] | None = None  # mid-exposure (ns), camera bits and submission (ns)
+        self._job: tuple[int, int, int] | None = None  # mid-exposure (ns), camera bit mask, submission (ns)
 
     def begin(self, time_ns: int) -> None:
-        """Measure the ages of frames from `time_ns` on, when the first round is due."""
+        """Measure the ages of frames from `time_ns` on, at which the first trigger is due."""
         self._begun_ns = time_ns
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 
     def busy_since_ns(self) -> int | None:
-        """Return when the processing of the present frames began (ns); None without frames in process."""
+        """Return the time (ns) at which the worker received the present frames; None while it is idle."""
         return None if self._job is None else self._job[2]
 
     def run(self, now_ns: int) -> None:
-        """Collect the frames of a round, submit them, and trigger the next round when it is due."""
+        """Collect the frames of a trigger, submit them, and trigger the cameras again when it is due."""
         if self._waits:
             self._collect(now_ns)
         period_ns = self._settings.period_ns if self._sight.needed else self._settings.fine_period_ns
@@ -104,7 +105,7 @@ class HorizonCameraTask:
             return
         found: HorizonCameraResult = result.value
         if found.false is not None:
-            # The attitude is fine, and shows whether each camera's image is plausible.
+            # The attitude is known finely, so that each camera's image can be checked against it.
             text = "all pictures are of what they must be"
             if found.false:
                 names = ", ".join(str(number + 1) for number in found.false)
@@ -131,7 +132,7 @@ class HorizonCameraTask:
                 self._errors[number] = "its picture is the last one again"
                 continue
             if frame.exposure_start_ns < self._triggered_ns:
-                continue  # the frame belongs to an earlier round
+                continue  # the frame belongs to an earlier trigger
             self._frames[number], self._seen_ns[number], self._errors[number] = frame, now_ns, ""
         if len(self._frames) == len(self._cameras) or now_ns - self._triggered_ns >= self._settings.late_ns:
             self._waits = False

@@ -1,27 +1,29 @@
-"""The state that outlives the process: its content, its two copies on disk, and the thread that writes them.
+"""State that is stored for the next boot: its content, its two copies on disk, and the thread that writes it.
 
-The state is typed, bounded and validated. UTC is a label for people, never used in computations. Crashes are
-counted per operating time, the sum over all boots of monotonic running time: a wrong or stepped clock has no
-effect, and a board that crashes at once, repeatedly, does not age its crashes out.
+The state is typed, bounded and validated. UTC is stored as a label only and is not used in computations.
+Crashes are counted over operating time, which is the monotonic running time summed over all boots. A wrong
+wall clock therefore has no effect on the count, and a board that crashes repeatedly right after its start
+does not forget its earlier crashes.
 
-The learned parameters are the parts of an estimate that belong to the devices, not to the motion. The next
-boot starts from them, with the covariance increased by a fraction of the configured prior, for changes
-meanwhile. Values that the prior makes implausible are rejected.
+The learned parameters are the estimated properties of the devices, such as biases; attitude and rate are not
+stored. The next boot starts from these parameters. Their covariance is increased by a fraction of the
+configured prior, because the devices may have changed meanwhile. Values that are implausible under the prior
+are rejected.
 
-A copy is one line of JSON and a line with the CRC-32 of the first. Both copies are written each time, one
-after the other, so that one copy survives a crash or damage to the other. A file is replaced atomically: a
-crash at any moment leaves either the old or the new content. The order is that of Pillai et al., "All File
-Systems Are Not Created Equal" (OSDI 2014), section 2: write a temporary file, sync it, rename it over the old
-one, sync the folder. Each call goes through `LinuxFiles`, so that a test can simulate a power loss before any
-of them.
+A copy consists of a line of JSON and a line with the CRC-32 of the first line. Both copies are written each
+time, one after the other, so that one copy survives if a crash damages the other one. A file is replaced
+atomically, so that a crash at any moment leaves either the old or the new content. The order of the system
+calls follows Pillai et al., "All File Systems Are Not Created Equal" (OSDI 2014), section 2: write a
+temporary file, sync it, rename it over the old one, sync the folder. Each call goes through `LinuxFiles`, so
+that a test can simulate a power loss before any of them.
 
-The number of each boot is also noted in the state's folder and in the folder of its run. Intact copies may
-still be old, after the repair of a file system or from a backup: a state that counts fewer boots than a note
-is recognised.
+The number of each boot is also written to files in the state's folder and in the folder of its run. An intact
+copy may be outdated after the repair of a file system or the restore of a backup. It is recognised by a boot
+count that is smaller than a number in these files.
 
-The control thread sets values in memory, a ticker's thread writes them. The disk is written at the start,
-before the loop, by the clock's ticker during the flight, and at the end, when the coils are at zero; a
-hanging disk delays only the ticker.
+The control thread sets values in memory, and a ticker thread writes them to disk. The disk is also written at
+the start, before the loop runs, and at the end, when the coil currents are zero. A hanging disk delays only
+the ticker thread.
 """
 
 from __future__ import annotations
@@ -66,22 +68,22 @@ LONGEST_LABEL = 32
 Label = Annotated[str, Meta(max_length=LONGEST_LABEL)]
 
 REMEMBERED = 32
-"""Number of newest unclean shutdowns that are kept."""
+"""Number of unclean shutdowns that are stored, the newest ones."""
 
 
 class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A part of the state; unknown keys are rejected."""
+    """Base class of the parts of the state; unknown keys are rejected."""
 
 
 class Learned(StatePart, frozen=True):
-    """Parameters learned in flight: `values` (n,) and their covariance (n, n), by rows, in SI units."""
+    """Parameters learned in flight: `values` (n,) and their covariance (n, n) row by row, in SI units."""
 
     values: Annotated[tuple[float, ...], Meta(min_length=1, max_length=16)]
     covariance: tuple[tuple[float, ...], ...]
 
     @staticmethod
     def of(values: FloatArray, covariance: FloatArray) -> Learned:
-        """Return the stored form of arrays; the covariance is made exactly symmetric."""
+        """Return the stored form of values (n,) and covariance (n, n), which is made exactly symmetric."""
         even = 0.5 * (covariance + covariance.T)
         return Learned(tuple(values.tolist()), tuple(map(tuple, even.tolist())))
 
@@ -91,7 +93,7 @@ class Learned(StatePart, frozen=True):
 
 
 class UncleanShutdown(StatePart, frozen=True):
-    """An unclean shutdown: boot number, and operating time and UTC label of its last stored state."""
+    """An unclean shutdown: boot number, operating time (s) and UTC label of the last state before it."""
 
     boot: Count
     operated: Seconds
@@ -99,12 +101,12 @@ class UncleanShutdown(StatePart, frozen=True):
 
 
 class KeptTable(StatePart, frozen=True, kw_only=True):
-    """A table of parameters that was loaded: values by the configuration's keys.
+    """A table of parameters that was loaded by command: values by the keys of the configuration.
 
     Attributes:
-        before: the values that flew before it, empty for those of the configuration.
-        proven: whether it has flown long enough to be trusted after an unclean shutdown.
-        loads: tables loaded so far.
+        before: the values that were in use before this table; empty for the values of the configuration.
+        proven: whether the table was in use long enough to be trusted after an unclean shutdown.
+        loads: number of tables loaded so far.
     """
 
     values: Annotated[dict[Label, float], Meta(max_length=256)] = {}
@@ -114,17 +116,17 @@ class KeptTable(StatePart, frozen=True, kw_only=True):
 
 
 class StoredState(StatePart, frozen=True, kw_only=True, omit_defaults=True):
-    """The stored state.
+    """The state that is stored for the next boot.
 
     Attributes:
-        boot_count: how often the application has started.
-        operated: s, total operating time by the monotonic clock: the time scale of crash counts.
-        running: set at the start and cleared at a clean end.
+        boot_count: number of starts of the application.
+        operated: total operating time (s) by the monotonic clock, over which crashes are counted.
+        running: true from the start of the application until its clean end.
         unclean: unclean shutdowns, oldest first.
-        mode: the mode at the last write.
-        utc: a label of the last write.
-        learned: parameters by name.
-        devices: digest of the configuration of the devices that the parameters belong to.
+        mode: name of the mode at the last write.
+        utc: UTC of the last write, as a label.
+        learned: learned parameters by name.
+        devices: digest of the configuration of the devices for which the parameters were learned.
         table: the table of parameters that an operator loaded.
     """
 
@@ -164,13 +166,13 @@ def check(state: StoredState) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BootRecord:
-    """The history of earlier boots, as needed at the start.
+    """The information about earlier boots that is needed at the start.
 
     Attributes:
-        boot_count: this boot's number, 1 the first.
-        unclean_recent: unclean shutdowns within the given window of operating time.
+        boot_count: number of this boot; the first boot is number 1.
+        unclean_recent: number of unclean shutdowns within the given window of operating time.
         after_unclean: whether the previous boot ended uncleanly.
-        mode: the mode at the last stop; empty when there was none.
+        mode: name of the mode at the last stop; empty for the first boot.
     """
 
     boot_count: int
@@ -181,7 +183,7 @@ class BootRecord:
 
 @dataclass(frozen=True, slots=True)
 class Noted:
-    """The loop's values for the next write: the mode, the learned parameters, and the table of parameters."""
+    """Values that the loop set for the next write: mode, learned parameters and table of parameters."""
 
     mode: str
     learned: Mapping[str, Learned]
@@ -189,10 +191,10 @@ class Noted:
 
 
 def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
-    """Return the state of the next boot: running, and with a crash of the last boot recorded.
+    """Return the state of the next boot, marked as running; a crash of the last boot is added to it.
 
-    Parameters learned of other `devices` are discarded. After a crash, an unproven table is replaced by the
-    table that flew before it.
+    Parameters that were learned for other `devices` are discarded. After a crash, an unproven table is
+    replaced by the previous table.
     """
     unclean = state.unclean
     if state.running:
@@ -213,7 +215,10 @@ def begin_boot(state: StoredState, utc: str, devices: str = "") -> StoredState:
 
 
 def state_after(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
-    """Return the state `elapsed` s after the start `begun`; new learned parameters replace the old."""
+    """Return the state `elapsed` s after the state `begun` of the start.
+
+    New learned parameters replace old ones.
+    """
     return msgspec.structs.replace(
         begun,
         operated=begun.operated + max(elapsed, 0.0),
@@ -230,7 +235,7 @@ def end_cleanly(state: StoredState) -> StoredState:
 
 
 CRASH_WINDOW = 600.0
-"""Operating time (s) in which unclean shutdowns count as recent."""
+"""Window of operating time (s) within which an unclean shutdown counts as recent."""
 
 
 def boot_record(begun: StoredState, window: float) -> BootRecord:
@@ -243,14 +248,14 @@ def boot_record(begun: StoredState, window: float) -> BootRecord:
 GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
 
 _PLAUSIBLE_SIGMAS = 4.0
-"""Largest deviation of a learned value from the configured prior, in sigmas."""
+"""Largest plausible deviation of a learned value from the configured prior, in standard deviations."""
 
 
 def learned_of(estimate: Estimate) -> dict[str, Learned]:
-    """Return the estimate's slow parts by name, in its units and axes.
+    """Return the slowly changing parameters of an estimate by name, in the estimate's units and axes.
 
-    The gyro's bias; torsion, damping and coil gain of the plant; the age of the inertial unit's samples; the
-    magnetometer's bias. Cross-covariances are dropped.
+    The parameters are gyro bias, torsion, damping and coil gain of the plant, latency of the inertial unit's
+    samples, and magnetometer bias. Their cross-covariances are discarded.
     """
     parts: dict[str, tuple[FloatArray, slice]] = {
         GYRO_BIAS: (estimate.bias, BIAS),
@@ -264,7 +269,7 @@ def learned_of(estimate: Estimate) -> dict[str, Learned]:
 
 
 def digest_of(config: Config) -> str:
-    """Return a digest of the devices of a configuration."""
+    """Return a digest of the device sections of a configuration."""
     return f"{zlib.crc32(msgspec.json.encode(config.hardware())):08x}"
 
 
@@ -273,8 +278,8 @@ def start_from(
 ) -> tuple[SlowPrior, list[str]]:
     """Return the filter's prior, and why learned parameters were rejected.
 
-    `configured` is the prior without learning; since the last boot a value may have changed by the fraction
-    `changed` of its standard deviation in `configured`.
+    `configured` is the prior without learned parameters. The change of a value since the last boot has a
+    standard deviation of `changed` times the standard deviation in `configured`.
     """
     problems: list[str] = []
 
@@ -291,7 +296,7 @@ def start_from(
         if problem:
             problems.append(f"{name} {found.tolist()}: {problem}")
             return values, covariance
-        # Values that the configuration does not estimate stay as configured.
+        # Values that are configured not to be estimated keep their configured value.
         estimated = variance > 0.0
         wide = np.where(np.outer(estimated, estimated), spread, 0.0) + np.diag(changed**2 * variance)
         return np.where(estimated, found, values), wide
@@ -315,18 +320,21 @@ def start_from(
 
 
 LARGEST_FILE = 1 << 20
-"""Size (bytes) of the largest file that is read."""
+"""Largest size (bytes) of a file that is read."""
 
 
 class LinuxFiles:
-    """The file system calls in use; each raises OSError. Tests replace them to simulate a power loss."""
+    """The file system calls that are used; each can raise OSError.
+
+    Tests replace them to simulate a power loss.
+    """
 
     def read(self, path: Path) -> bytes | None:
         """Return the content of a regular file of at most `LARGEST_FILE` bytes; None if it does not exist."""
         return read_regular(path, LARGEST_FILE)
 
     def create(self, path: Path) -> int:
-        """Return the descriptor of an empty file for writing, which replaces whatever has its name."""
+        """Create an empty file, which replaces an existing file, and return its descriptor for writing."""
         with suppress(FileNotFoundError):
             os.unlink(path)
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
@@ -348,12 +356,12 @@ class LinuxFiles:
         os.rename(old, new)
 
     def sync_folder(self, folder: Path) -> None:
-        """Make the names in a folder durable."""
+        """Make the directory entries of a folder durable."""
         make_lasting(folder)
 
 
 def replace_file(files: LinuxFiles, path: Path, data: bytes) -> None:
-    """Replace the file's content, durably. Raises OSError; the old content then remains."""
+    """Replace the content of a file durably. If OSError is raised, the old content remains."""
     temporary = path.with_suffix(".tmp")
     file = files.create(temporary)
     try:
@@ -374,14 +382,14 @@ NOTE = "boots"
 
 
 def note_boot(folders: Iterable[Path], number: int) -> None:
-    """Note the number of a boot in some folders. Never raises."""
+    """Write the number of a boot to a file in each of the folders. Never raises."""
     for folder in folders:
         with suppress(OSError):
             replace_file(LinuxFiles(), folder / NOTE, b"%d\n" % number)
 
 
 def newest_boot(folders: Iterable[Path]) -> int:
-    """Return the highest boot number noted in some folders, 0 without a note. Never raises."""
+    """Return the highest boot number that `note_boot` wrote to the folders, or 0. Never raises."""
     numbers = [0]
     for folder in folders:
         with suppress(OSError):
@@ -394,11 +402,11 @@ def newest_boot(folders: Iterable[Path]) -> int:
 COPIES = ("state-a.json", "state-b.json")
 
 Report = Callable[[EventKind, str], None]
-"""Reports an event: kind and text."""
+"""Function that reports an event, given its kind and text."""
 
 
 class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of one file."""
+    """The JSON content of one file."""
 
     generation: Annotated[int, Meta(ge=1, le=2**62)]
     state: StoredState
@@ -406,7 +414,7 @@ class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class _ReadCopy:
-    """One file as read; `problem` is empty when the copy is valid, or missing."""
+    """One copy as it was read; `problem` is empty if the copy is valid or missing."""
 
     name: str
     copy: _StateCopy | None
@@ -414,7 +422,7 @@ class _ReadCopy:
 
 
 class StateStore:
-    """Stores a StoredState in a folder. Not for two processes at once."""
+    """Stores a StoredState in a folder. Only one process may use a folder at a time."""
 
     def __init__(self, folder: Path, report: Report, files: LinuxFiles | None = None) -> None:
         self._folder = folder
@@ -424,14 +432,14 @@ class StateStore:
         self._order: tuple[str, ...] = COPIES
 
     def load(self) -> StoredState:
-        """Return the newest valid copy; defaults when there is none. Never raises.
+        """Return the newest valid copy, or the defaults if there is no valid copy. Never raises.
 
         A lost state counts as an unclean shutdown.
         """
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
-        # A missing copy is written first: only an interrupted first write leaves one copy alone.
+        # A missing copy is written first, because only an interrupted first write leaves a single copy.
         self._order = tuple(r.name for r in sorted(read, key=lambda r: r.copy is not None or bool(r.problem)))
         first = newest is None or newest.copy is None or newest.copy.generation == 1
         problems = ((r.name, r.problem or ("is gone" if r.copy is None and not first else "")) for r in read)
@@ -447,7 +455,10 @@ class StateStore:
         return newest.copy.state
 
     def store(self, state: StoredState) -> bool:
-        """Write both copies; return whether at least one is durable. Raises ValueError if invalid."""
+        """Write both copies; return whether at least one is durable.
+
+        Raises ValueError for an invalid state.
+        """
         data = encode(self._generation + 1, state)
         failures = []
         for name in self._order:
@@ -457,7 +468,8 @@ class StateStore:
                 failures.append(f"{name}: {error.strerror or error}")
         if failures:
             self._report(events.STATE_UNWRITTEN, "; ".join(failures))
-        # A copy whose write failed late may still be on disk: a generation is never used twice.
+        # A generation number is never used twice, because a copy may be on disk although its write reported
+        # an error.
         self._generation += 1
         return len(failures) < len(COPIES)
 
@@ -503,13 +515,13 @@ _NOTICES = 64
 
 
 class Notices:
-    """Keeps the newest events of threads without an event log, until the loop collects them."""
+    """Stores the newest events of threads that have no event log, until the loop collects them."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[EventKind, str]] = deque(maxlen=_NOTICES)
 
     def report(self, kind: EventKind, text: str) -> None:
-        """Keep an event. Safe from any thread."""
+        """Store an event. Any thread may call this method."""
         self._kept.append((kind, text))
 
     def drain(self) -> list[tuple[EventKind, str]]:
@@ -518,13 +530,13 @@ class Notices:
 
 
 class StateKeeper:
-    """The state of one boot, from its begin to its end.
+    """Keeps the stored state up to date from the start of a boot to its end.
 
     Attributes:
-        record: the history of earlier boots.
-        learned: the parameters that earlier boots learned, by name.
-        counted: whether this boot is on disk.
-        table: the table of parameters to fly.
+        record: information about earlier boots.
+        learned: parameters that earlier boots learned, by name.
+        counted: whether the number of this boot was written to disk.
+        table: the table of parameters to use.
     """
 
     def __init__(
@@ -538,11 +550,12 @@ class StateKeeper:
         period_ns: int,
         boots: int = 0,
     ) -> None:
-        """Load the state, count this boot and store it as running.
+        """Load the state, increase its boot count, and store it as running.
 
-        `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` is the digest
-        of the devices flown: parameters learned of others are discarded. A state of fewer `boots` than known
-        from elsewhere is old or lost, and the last boot counts as unclean.
+        `window` is the operating time (s) within which an unclean shutdown counts as recent. `devices` is the
+        digest of the present devices; parameters that were learned for other devices are discarded. `boots`
+        is the boot number known from other files. A state with a smaller number is outdated or lost, and the
+        last boot then counts as unclean.
         """
         self._store = store
         self._notices = notices
@@ -564,7 +577,7 @@ class StateKeeper:
         self._ticker = clock.ticker("state", period_ns, self._write)
 
     def _report_changes(self, loaded: StoredState) -> None:
-        """Report how the begin of this boot changed the stored state."""
+        """Report how the start of this boot changed the stored state."""
         begun, report = self._begun, self._notices.report
         if loaded.learned and not begun.learned:
             text = (
@@ -594,7 +607,7 @@ class StateKeeper:
         return self._notices.drain()
 
     def close(self, clean: bool) -> None:
-        """Write the last state, as a clean end or not. Safe to call twice; waits 5 s at most."""
+        """Write the final state, with or without a clean end. May be called twice; waits at most 5 s."""
         self._ticker.stop()
         if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
             self._closed = True
@@ -606,7 +619,7 @@ class StateKeeper:
             self._writing.release()
 
     def _write(self) -> None:
-        """Write the newest values: the ticker's job."""
+        """Write the newest values. This is the job of the ticker."""
         with self._writing:
             if not self._closed:
                 self._put(ended=False)
@@ -618,7 +631,8 @@ class StateKeeper:
         try:
             self._store.store(end_cleanly(state) if ended else state)
         except ValueError as error:
-            # Only the learned parameters are invalid; operating time and ending must still be stored.
+            # Only the learned parameters can be invalid. Operating time and clean end are stored without
+            # them.
             self._notices.report(events.STATE_UNWRITTEN, str(error))
             self._noted = replace(noted, learned={})
             state = state_after(self._begun, elapsed, self._noted, self._label())
@@ -630,7 +644,7 @@ class StateKeeper:
 
 
 def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
-    """Return the state's folder: as configured, else systemd's for a flight of real devices, else None."""
+    """Return the folder of the state: the configured folder, or that of systemd for real devices, or None."""
     if config.state.folder is not None:
         return Path(config.state.folder)
     if config.simulation is not None:
@@ -640,7 +654,7 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
 
 def service_folder(environment: Mapping[str, str]) -> Path | None:
     """Return the state folder of a systemd service; None outside a service."""
-    # systemd separates several folders by colons; the first is the application's own.
+    # systemd separates several folders by colons; the first folder belongs to the application.
     first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(first) if first else None
 
@@ -652,16 +666,16 @@ def open_state(
     stack: ExitStack,
     runs: Sequence[Path] = (),
 ) -> StateKeeper | None:
-    """Count this boot and return its state; None if no state is stored.
+    """Open the stored state and count this boot; return None if no state is stored.
 
-    `runs` are the folders of the newest runs, this one the last: the boot's number is noted in them.
-    `stack` closes the state: cleanly, unless an exception passes. A DeviceError counts as clean: the device
-    is reported, and safe mode would not help.
+    `runs` are the folders of the newest runs, of which the last is the present run; they contain files with
+    boot numbers. `stack` closes the state, as a clean end unless an exception passes. A DeviceError counts as
+    a clean end, because it is reported as a device error and safe mode would not help.
     """
     folder = state_folder(config, environment)
     if folder is None:
         return None
-    with suppress(OSError):  # the first write will fail and be reported; the flight goes on
+    with suppress(OSError):  # the first write will fail and be reported; the flight continues
         folder.mkdir(parents=True, exist_ok=True)
     notices = Notices()
     keeper = StateKeeper(

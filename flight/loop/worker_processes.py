@@ -1,15 +1,15 @@
-"""Jobs in real time: a thread starts, supervises, restarts and reaps the workers' processes.
+"""Job runner for real time: a thread starts, supervises, restarts and reaps the worker processes.
 
-The control thread exchanges only finished values with this thread, through queues that never wait: nothing of
-a worker's life costs the control thread time. Each worker process has a socket for messages, and a memory
-file for arrays that both sides map: frames of megabytes never go through a pipe. Each death of a worker is
-reported as `WorkerNews`.
+The control thread exchanges finished values with the supervising thread through queues that never wait, so
+that starts and deaths of workers do not delay the control thread. Each worker process has a socket for
+messages, and a memory file for arrays that both processes map, so that frames of several megabytes are not
+sent through a pipe. Each death of a worker is reported as `WorkerNews`.
 
-A worker that dies or exceeds its time is restarted at growing intervals and within a budget. The first
-restart comes at once, the next after half a second, then after twice the interval before. A worker that lived
-for a minute has a new budget. After `BUDGET` deaths in a row the worker rests for ten minutes and then has a
-new budget, so that a flight of years gets its worker back once the cause is gone. One worker is thus started
-at most `BUDGET` times in 12 minutes, however it fails.
+A worker that dies or exceeds its time limit is restarted, within a budget. The first restart is immediate and
+the second is delayed by half a second; each later delay is twice the previous one. The budget is reset when a
+worker has run for a minute. After `BUDGET` deaths in a row, no restart is attempted for ten minutes; then the
+budget is reset, so that the worker recovers on a long flight once the cause has disappeared. One worker is
+therefore started at most `BUDGET` times in 12 minutes.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from hal.interfaces.wires import SECOND_NS, Clock
 from knightcube.errors import FlightError
 
 BUDGET = 10
-"""Number of deaths in a row after which a worker rests; they take at least 127.5 s."""
+"""Number of deaths in a row after which restarts pause. The delays between them add up to 127.5 s."""
 FIRST_NS = SECOND_NS // 2
 STEADY_NS = 60 * SECOND_NS
-"""Life (ns) after which a worker has its full budget of restarts again."""
+"""Running time (ns) after which a worker's budget of restarts is reset."""
 REST_NS = 600 * SECOND_NS
 
 
 class Attempts:
-    """Counts the deaths of one worker since its last long life."""
+    """Counts the deaths of one worker since it last ran for longer than a minute."""
 
     def __init__(self) -> None:
         self.deaths = 0
 
     def died(self, lived_ns: int) -> int:
-        """Count a death after a life of `lived_ns`; return the delay (ns) of the restart."""
+        """Count a death after a running time of `lived_ns`; return the delay (ns) of the restart."""
         if lived_ns >= STEADY_NS or self.is_spent:
             self.deaths = 0
         self.deaths += 1
@@ -62,21 +62,21 @@ class Attempts:
 
     @property
     def is_spent(self) -> bool:
-        """Whether the budget of restarts is spent, so that the worker rests."""
+        """Whether the budget of restarts is used up, so that restarts pause."""
         return self.deaths >= BUDGET
 
 
 JobAnswer = tuple[Outcome, Any, str, int]
-"""Outcome, value, error and execution time in ns of a job."""
+"""Answer of a worker: outcome, value, error, and execution time of the job (ns)."""
 
 MODULE = "flight.loop.worker"
-"""The module that a worker's process runs."""
+"""Module that a worker process runs."""
 
 _REAPED_WITHIN_S = 1.0
 
 
 class WorkerProcess:
-    """A running worker, for use by one thread; `ready` once it has imported its function."""
+    """A running worker process. Only one thread may use it. `ready` is whether its function is imported."""
 
     def __init__(self, worker: Worker, cores: Set[int] = frozenset()) -> None:
         """Start the process on the given cores; an empty set permits all cores. Raises OSError."""
@@ -107,9 +107,10 @@ class WorkerProcess:
             [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            # Ctrl-C is for the control process, which then closes its workers. A group of this session, not a
-            # session: once the control process has died nobody in it could continue a stopped worker, and the
-            # kernel ends such a worker by SIGHUP and SIGCONT (setpgid(2)), also before Python runs in it.
+            # A process group of its own keeps Ctrl-C from the worker; the control process closes its workers.
+            # The group stays in the session of the control process. If the control process dies while a
+            # worker is stopped, the group is orphaned, and the kernel ends the stopped worker by SIGHUP and
+            # SIGCONT (setpgid(2)), even before Python runs in it.
             process_group=0,
         )
 
@@ -119,7 +120,7 @@ class WorkerProcess:
         return self._process.pid
 
     def is_stopped(self) -> bool:
-        """Return whether a signal such as SIGSTOP has stopped the process; it may still be starting."""
+        """Return whether a signal such as SIGSTOP has stopped the process, even during its start."""
         look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # the process can still be reaped
         with suppress(ChildProcessError):  # reaped already
             return os.waitid(os.P_PID, self._process.pid, look) is not None
@@ -142,7 +143,10 @@ class WorkerProcess:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
 
     def receive(self) -> JobAnswer | None:
-        """Return an arrived answer, else None. Raises EOFError at a death, FlightError for damage."""
+        """Return an answer that has arrived, else None.
+
+        Raises EOFError if the process died, FlightError for damage.
+        """
         try:
             while chunk := self._socket.recv(1 << 16):
                 self._received += chunk
@@ -167,7 +171,7 @@ class WorkerProcess:
         """Kill the process, reap it and release its memory; return how the process ended."""
         status = self._process.poll()
         if status is None:
-            with suppress(subprocess.TimeoutExpired):  # at its end the process may still be writing
+            with suppress(subprocess.TimeoutExpired):  # the process may be writing while it ends
                 status = self._process.wait(0.05)
         self._process.kill()
         with suppress(
@@ -182,13 +186,13 @@ class WorkerProcess:
 
 
 START_LIMIT_NS = 60 * SECOND_NS
-"""A worker that has not imported its function within this time is restarted."""
+"""Longest time (ns) that a worker may take to import its function before it is restarted."""
 _IDLE_MS = 1000.0
 _CLOSE_S = 5.0
 
 
 class _Kept:
-    """A worker that the supervisor's thread keeps alive, and its job."""
+    """A worker that the supervising thread keeps running, and its present job."""
 
     def __init__(self, worker: Worker, clock: Clock, cores: Set[int]) -> None:
         self.worker = worker
@@ -202,7 +206,10 @@ class _Kept:
         self._deaths = 0
 
     def due_ns(self) -> int:
-        """Return the next time (ns) at which to serve this worker without a message; -1 for none."""
+        """Return the next time (ns) at which this worker needs service without a message.
+
+        -1 for no such time.
+        """
         if self.process is None:
             return self._due_ns
         dues = [self.submitted_ns + self.worker.timeout_ns] if self.submitted_ns >= 0 else []
@@ -214,7 +221,7 @@ class _Kept:
         try:
             if self.process is None:
                 if now_ns < self._due_ns:
-                    # A job that was accepted at the moment of the death.
+                    # The job was accepted while the process died.
                     return self._lose("died", "the worker is not running", now_ns), []
                 self._begun_ns = now_ns
                 self.process = WorkerProcess(self.worker, self._cores)
@@ -276,7 +283,7 @@ class _Kept:
         return results, news
 
     def _lose(self, outcome: Outcome, text: str, now_ns: int) -> list[JobResult]:
-        """Return the results of the lost jobs: the running job and the waiting jobs."""
+        """Return failed results for the lost jobs, which are the running job and the waiting jobs."""
         lost = [self.submitted_ns] if self.submitted_ns >= 0 else []
         while self.inbox:
             lost.append(self.inbox.popleft()[1])
@@ -285,7 +292,7 @@ class _Kept:
 
 
 class ProcessRunner:
-    """A JobRunner whose workers are processes. Its methods are for one thread, the control thread."""
+    """A JobRunner whose workers are processes. Only the control thread may call its methods."""
 
     borrowed_ns = 0
 
@@ -302,7 +309,7 @@ class ProcessRunner:
         self._thread.start()
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Submit a job; return False when that worker is busy, or has died and is not ready again."""
+        """Submit a job; return False if the worker is busy, or was restarted and is not ready yet."""
         kept = self._kept[worker]
         if worker in self._busy or not kept.accepts:
             return False
@@ -339,7 +346,10 @@ class ProcessRunner:
         return {name: process.process_id for name, process in running if process is not None}
 
     def _supervise(self) -> None:
-        """Serve the workers until `close`; the kernel kills them when the thread that started them ends."""
+        """Serve the workers until `close`.
+
+        The kernel kills the workers when the thread that started them ends.
+        """
         while not self._closing.is_set():
             for kept in self._kept.values():
                 results, news = kept.serve()
