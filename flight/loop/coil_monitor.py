@@ -10,24 +10,24 @@ The current monitor measures the sum of |I| of three bridges, so it cannot detec
 an open coil only while that axis is commanded: axes that are not driven are not judged. Every reading is
 compared with the prediction of each hypothesis (healthy; each axis open, shorted, either leg of either input
 stuck; see `flight.loop.coil_response`). There is a verdict when `healthy` is rejected and the hypotheses that
-explain the readings since then all name one axis; between axes that are not driven, a small wave on each in
-turn decides. A reversed coil is found from the angular acceleration, which also distinguishes a wrong monitor
-from a broken coil; over longer bins the acceleration raises a suspicion if a current too small for the
-monitor makes no torque.
+explain the readings since then all name one axis; between axes that are not driven, a small probe current on
+each axis in turn decides. A reversed coil is found from the angular acceleration, which also distinguishes a
+wrong monitor from a broken coil; over longer bins the acceleration also shows missing torque at currents that
+are too small for the monitor.
 
 A leg stuck high is found by setting the coils to zero and braking bridges. Braking (both inputs high) removes
 the voltage from any coil, whether its bridge is healthy or not. When the supply current is far too large or
-too small, all coils are commanded to zero: a remaining current was not commanded. Then all bridges are braked
-at once. If the current stops, they are released one by one: the bridge with which the current returns is
-broken. No healthy coil carries current meanwhile, and there is no other verdict during the search. If neither
-rest nor brakes change the current, as with a shorted coil or a wrong monitor, the search ends. When commands
-change all the time, as in B-dot's windows, the command of an ADC sample is ambiguous: then there is a rest
-every few seconds without a suspicion, as a check.
+too small, all coils are commanded to zero. A current that remains is caused by a fault. All bridges are then
+braked at once. If the current stops, the bridges are released one by one, and the bridge with which the
+current returns is broken. During this search no healthy coil carries current, and no other verdict is given.
+If neither zero commands nor braking change the current, as with a shorted coil or a wrong monitor, the search
+ends. When commands change continuously, as in the windows of B-dot detumbling, the command during an ADC
+sample is ambiguous. The coils are then commanded to zero every few seconds as a check, without a suspicion.
 
-A reversed coil draws the current of a healthy one, so that the monitor cannot confirm the verdict, and in a
-tumble the motion depends on the inertia more than on the coils. A coil that looks reversed in a tumble is
-therefore not isolated: it rests, and is tried and judged again once the body is slower than `tumble_rate`, or
-after ten minutes.
+A reversed coil draws the same supply current as a healthy coil, so that the monitor cannot confirm the
+verdict. In a tumble the motion depends more on the inertia than on the coils. A coil that looks reversed in a
+tumble is therefore not isolated. It is kept at zero current, and used and judged again when the body is
+slower than `tumble_rate`, or after ten minutes.
 
 The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
 18 % error of a single ADC sample of the chopped current (`hal.drivers.ina219`).
@@ -67,9 +67,9 @@ _SURE = 2
 _PATIENCE = 12
 """Number of ADC samples without agreement after which a step is given up."""
 _PAUSE = 50
-"""Number of ADC samples between a rest without a finding and the next rest, for control."""
+"""Number of ADC samples between a check at zero command that found no fault and the next check."""
 _UNCLEAR = 20
-"""Number of ADC samples in a row with an ambiguous command, after which there is a rest as a check."""
+"""Number of ADC samples in a row with an ambiguous command after which the coils are checked at zero."""
 
 
 class _Step(Enum):
@@ -84,9 +84,9 @@ class StuckLeg:
     """Searches for a stuck leg: processes ADC samples, requests rest and brakes, and returns an axis.
 
     Attributes:
-        brake: which bridges to brake now.
+        brake: which bridges must be braked now.
         rest: whether all commands must be zero now.
-        suspicion: reason for the search; empty without a suspicion.
+        suspicion: reason for the search; empty without a search.
     """
 
     def __init__(self, excess: float) -> None:
@@ -108,7 +108,7 @@ class StuckLeg:
 
     @property
     def is_searching(self) -> bool:
-        """Whether a search is running, with the coils at rest and perhaps braked."""
+        """Whether a search is running, during which the coils are at zero command and may be braked."""
         return self.rest
 
     def exceeds(self, supplied: Supplied) -> bool:
@@ -116,7 +116,7 @@ class StuckLeg:
         return supplied.current > supplied.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Rest, unless a search is running or the last rest was too recent."""
+        """Request zero commands, unless a search is running or the last request was too recent."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 
@@ -231,7 +231,7 @@ _PROOFS = 2
 
 
 class BrakeProof:
-    """Collects ADC samples made under brakes that are not confirmed yet."""
+    """Collects ADC samples to confirm that the braked bridges have a leg stuck high."""
 
     def __init__(self) -> None:
         self._axes: set[int] = set()
@@ -242,7 +242,7 @@ class BrakeProof:
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
-        """Add an axis whose brake follows from a verdict alone."""
+        """Add an axis that is braked because of a verdict, without confirmation."""
         self._axes.add(axis)
 
     def discard(self, axis: int) -> None:
@@ -250,7 +250,10 @@ class BrakeProof:
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Accept whether an ADC sample shows current despite the brakes; return the axes braked wrongly."""
+        """Accept whether an ADC sample shows current despite braking.
+
+        Return the axes that were braked wrongly.
+        """
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:
             return frozenset()
@@ -276,19 +279,20 @@ class CoilMonitorSettings:
     """Properties of the coils' circuit and of the monitor.
 
     Attributes:
-        full_current: A, of a coil that is fully on: supply voltage over resistance.
-        current_uncertainty: A, bound on each driven coil's deviation from its command.
-        gain_error: relative bound: resistance, supply, and the monitor's sampling of the chopped current.
-        monitor_noise: A, bound, at any current.
+        full_current: current of a coil that is fully on, A: supply voltage divided by resistance.
+        current_uncertainty: bound (A) on the deviation of each driven coil's current from its command.
+        gain_error: relative error bound due to resistance, supply voltage, and sampling of the chopped
+            current.
+        monitor_noise: error bound of the monitor at any current, A.
         window_ns: averaging time of a reading's mean. A longer gap between readings resets the monitor.
-        persistence: readings in a row that fit no healthy circuit, until there is a suspicion.
-        settle: readings after that until the window lies wholly after the fault.
+        persistence: number of readings in a row inconsistent with a healthy circuit that raise a suspicion.
+        settle: number of further readings until the averaging window lies entirely after the fault.
         evidence: number of readings that a verdict needs.
-        probe_current: A, of the wave that distinguishes faults of axes at rest.
-        probe_half_ns: half the period (ns) of the wave.
+        probe_current: amplitude (A) of the square wave that distinguishes faults of axes that are not driven.
+        probe_half_ns: half the period of this square wave, ns.
         response: the body's response to the coils; None if the motion is not used.
-        slow: the same over longer bins, which show currents below the noise of the monitor.
-        tumble_rate: rate (rad/s) above which a coil that looks reversed rests until the body is slower.
+        slow: as `response`, with longer bins, which show the torque of currents below the monitor's noise.
+        tumble_rate: body rate (rad/s) above which a coil that looks reversed is kept at zero current.
     """
 
     full_current: tuple[float, float, float]
@@ -309,7 +313,7 @@ class CoilMonitorSettings:
 _UNSEEN_NS = 600_000_000
 """Largest age (ns) of an error when it is detected; the driver reads its outputs back twice a second."""
 _UNSUSPECTED_NS = 800_000_000
-"""Largest age (ns) of a fault when its suspicion begins, which is four readings of the monitor."""
+"""Longest time (ns) between a fault and its suspicion, which is four readings of the monitor."""
 STOOD_NS = 200_000_000
 """Stall of the loop (ns) after which the guardian may have zeroed the coils."""
 
@@ -321,8 +325,9 @@ class CurrentValidity:
     Attributes:
         now: whether the currents in force are known.
         since_last_look: whether the chip kept all commands since the previous look.
-        since_ns: time since which they are known.
-        uncertain_since_ns: time from which the assumed currents are uncertain after all; else None.
+        since_ns: time (ns) since which the currents are known.
+        uncertain_since_ns: time (ns) from which currents that were recorded as known are uncertain; else
+            None.
     """
 
     now: bool
@@ -343,8 +348,8 @@ class CoilKnowledge:
     def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
         """Return which currents are known, from the driver's state and the time since the last look.
 
-        `suspected` is whether the supply current fits no healthy circuit, so that a coil may carry any
-        current.
+        `suspected` is whether the supply current contradicts a healthy circuit, so that a coil current may be
+        arbitrary.
         """
         obeyed, self._obeys = self._obeys, not in_force.error
         was_suspected, self._suspected = self._suspected, suspected
@@ -363,7 +368,7 @@ class CoilKnowledge:
 
 
 class Probe:
-    """Applies a zero-mean square wave to one axis after the other.
+    """Applies a square wave with zero mean to one axis after the other.
 
     The two halves last `half_ns` each and carry +`current` and -`current` (A), so that the mean torque is
     zero.
@@ -372,7 +377,7 @@ class Probe:
     def __init__(self, current: float, half_ns: int) -> None:
         self._current = current
         self._half_ns = half_ns
-        self._running: tuple[int, int] | None = None  # axis, and since when
+        self._running: tuple[int, int] | None = None  # axis, and start time (ns)
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int) -> int | None:
@@ -407,15 +412,15 @@ AXES = "xyz"
 
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
 _STUCK_EXCESS = 0.3
-"""Excess current of a leg stuck high, at least this fraction of the current of a coil that is fully on."""
+"""Minimum excess current of a leg stuck high, as a fraction of the current of a coil that is fully on."""
 _LEAST_SHORT = 0.02
-"""Smallest excess (A) of a shorted coil that the body's motion can confirm."""
+"""Minimum excess current (A) of a shorted coil that the motion of the body can confirm."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
-"""Number of readings after which a verdict may leave the kind of fault open."""
+"""Number of readings after which a verdict may name an axis without a kind of fault."""
 _LONGEST_REST_NS = 600_000_000_000
-"""Longest rest (ns) of a coil that looks reversed in a tumble, before it is tried again at any rate."""
+"""Longest time (ns) at zero current for a coil that looks reversed in a tumble."""
 
 
 class CoilMonitor:
@@ -441,7 +446,7 @@ class CoilMonitor:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # time after which a verdict may leave the kind of fault open
+        self._judge_ns = 0  # time (ns) after which a verdict needs no kind of fault
         self._sound_ns = 0  # time at which a driven coil last drew the expected current
         self._unmixed_ns = 0  # time after which a reading's mean covers one state of the circuit
         self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
@@ -465,33 +470,33 @@ class CoilMonitor:
 
     @property
     def available(self) -> BoolArray:
-        """(3,) which axes may be used, for `knightcube.gnc.control.allocation`."""
+        """Flags (3,) of the axes that may be used, for `knightcube.gnc.control.allocation`."""
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property
     def resting(self) -> BoolArray:
-        """(3,) which axes rest because they look reversed in a tumble."""
+        """Flags (3,) of the axes that are kept at zero current because they look reversed in a tumble."""
         return np.array([axis in self._rests for axis in range(3)])
 
     @property
     def suspicion(self) -> str:
-        """Why a coil is suspected; empty while the readings fit a healthy circuit."""
+        """Why a coil is suspected; empty while the readings are consistent with a healthy circuit."""
         rests = "; ".join(why for _, why in self._rests.values())
         return self._unknown or rests
 
     @property
     def doubts_currents(self) -> bool:
-        """Whether a coil may carry another current than its command; a coil that rests carries none."""
+        """Whether the current of a coil in use may differ from its command."""
         return bool(self._unknown)
 
     @property
     def _unknown(self) -> str:
-        """Why a coil may carry another current than its command."""
+        """Why a coil's current may differ from its command; empty if it does not."""
         return self._leg.suspicion or self._strangeness or self._weak
 
     @property
     def braked(self) -> Axes:
-        """Which bridges to brake: with a leg stuck high, and during the search for such a leg."""
+        """The bridges to brake: bridges with a leg stuck high, and bridges under test in the search."""
         if not self._verdicts:
             return self._leg.brake
         x, y, z = (
@@ -506,7 +511,7 @@ class CoilMonitor:
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Discard the verdict on an axis, by command; a lasting fault is detected again."""
+        """Discard the verdict on an axis, on command. A lasting fault is detected again."""
         self._verdicts.pop(axis, None)
         self._rests.pop(axis, None)
         self._proof.discard(axis)
@@ -518,7 +523,7 @@ class CoilMonitor:
         """Record the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or then."""
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
-        # Without readings, a rest or a brake would never end.
+        # Without readings of the monitor, the search would never end.
         if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
         for response in self._responses:
@@ -538,7 +543,7 @@ class CoilMonitor:
         In a tumble an axis that looks reversed rests without a verdict.
         """
         for axis in response.reversed_axes():
-            # An uncommanded current rotates the body too.
+            # An uncommanded current makes a torque too, so that the motion gives no evidence.
             if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
                 continue
             if response.fastest <= self.tumble_rate:
@@ -561,7 +566,7 @@ class CoilMonitor:
                 response.reset()
 
     def interrupted(self, now_ns: int) -> None:
-        """Discard the evidence until now: the coil currents of that time are unknown."""
+        """Discard all evidence until now, because the coil currents of that time are unknown."""
         self._fresh = 0
         self._leg.reset()
         self._reset()
@@ -595,12 +600,12 @@ class CoilMonitor:
 
     @property
     def probe(self) -> FloatArray:
-        """(3,) A to be added to the commands now: zero, or a zero-mean wave."""
+        """Currents (3,) A to add to the commands now: zero, or the probe's square wave."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
 
     @property
     def monitor_doubted(self) -> str:
-        """Why the monitor, not a coil, is doubted; empty while the monitor is trusted."""
+        """Why the current monitor is assumed to be wrong; empty while the monitor is trusted."""
         return self._witness.doubt
 
     @property
@@ -613,7 +618,7 @@ class CoilMonitor:
 
     @property
     def _known(self) -> dict[int, CoilFault]:
-        """The fault of each broken axis in the supply current: a braked axis draws no current."""
+        """The known fault of each broken axis, for the supply current; a braked axis draws no current."""
         return {
             axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
             for axis, verdict in self._verdicts.items()
@@ -700,7 +705,7 @@ class CoilMonitor:
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
         excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
-            self._reset()  # too small to be confirmed by the motion: it may be the monitor
+            self._reset()  # the motion cannot confirm so small an excess; the monitor may be wrong
             return
         if self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
@@ -719,9 +724,9 @@ class CoilMonitor:
         return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:
-        """Probe the next of the axes in question; when all were tried, collect new evidence.
+        """Probe the next suspected axis; after the last one, collect new evidence.
 
-        No hypothesis explains an intermittent fault, or a fault of the monitor.
+        An intermittent fault, or a fault of the monitor, is not explained by any hypothesis.
         """
         ends_ns = self._probe.begin(axes, now_ns)
         if ends_ns is None:

@@ -1,25 +1,27 @@
 """Responses of the coils to commands: supply current and angular acceleration, with and without faults.
 
-The supply current of each hypothesis (healthy, or one fault on one axis) is predicted from the commands.
-Input A of a bridge is pulsed for a positive current, B for a negative one. A leg that is stuck high drives
-its coil continuously; a pulse on the other input cancels the drive for its duration.
+The supply current of each hypothesis (healthy, or one fault on one axis) is predicted from the commands. An
+H-bridge has the inputs A and B. Input A is pulsed for a positive current, and input B for a negative current.
+An output leg that is stuck high drives its coil continuously, except during a pulse on the other input.
 
 `CoilResponse` estimates the torque gain of each coil from the body's angular acceleration over some seconds.
 Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins; differences of
 neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
-constant disturbance, a torsion and a damping of each free axis. Gain 1 is healthy, 0 is without torque, -1 is
-reversed. When the commands vary too little, the gain's standard deviation is large and no axis is judged. A
-gain beyond `LARGEST_GAIN` is physically impossible: the model is wrong then, and no axis is judged.
+constant disturbance, a torsion and a damping of each free axis. A gain of 1 indicates a healthy coil, 0 a
+coil without torque, and -1 a reversed coil. When the commands vary too little, the gain's standard deviation
+is large and no axis is judged. A gain beyond `LARGEST_GAIN` is physically impossible. It shows that the model
+is wrong, and no axis is judged.
 
-The gyroscopic acceleration of a free body exceeds the coils' hundredfold in a tumble, so that an inertia 2 %
-wrong makes healthy coils look reversed. The fit therefore subtracts the acceleration that the assumed inertia
-makes, and estimates the error that remains by nuisance parameters (`knightcube.gnc.estimation.rigid_body`).
-If the coils' field at the magnetometer is as large as the Earth's, the field measured in their last pause is
-rotated with the body.
+While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
+that an inertia error of 2 % makes healthy coils look reversed. The fit therefore subtracts the gyroscopic
+acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
+(`knightcube.gnc.estimation.rigid_body`). If the field of the coils at the magnetometer is as large as the
+Earth's field, the fit uses the Earth's field that was measured in the last pause of the coils, rotated with
+the body.
 
-The residual accelerations, with all coils assumed healthy, are kept longer. A change at the time of a change
-of the supply current distinguishes a broken coil from a wrong monitor (`observed_share`). `MotionWitness`
-checks verdicts that rest on the supply current in this way.
+The residual accelerations for healthy coils are stored for a longer time. If they change at the same time as
+the supply current, a coil is broken; otherwise the current monitor is wrong (`observed_share`).
+`MotionWitness` checks verdicts that are based on the supply current in this way.
 """
 
 from __future__ import annotations
@@ -45,12 +47,12 @@ from knightcube.gnc.estimation.rigid_body import (
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """An ADC sample made entirely under the present brakes, and the expected current of healthy coils.
+    """An ADC sample made entirely with the present braking, and the current expected of healthy coils.
 
     Attributes:
-        current: A, measured.
-        least, most: A, bounds of the total current of healthy coils.
-        spread: A, range of the total command in the sample's window.
+        current: measured supply current, A.
+        least, most: bounds of the total current of healthy coils, A.
+        spread: range of the total commanded current within the time window of the sample, A.
         at_rest: the axes that were not driven and have no known fault.
         driven: whether any axis was driven.
     """
@@ -64,7 +66,7 @@ class Supplied:
 
 
 class CoilFault(Enum):
-    """The fault of an axis; the values are the log's texts."""
+    """A fault of a coil axis; the values are the texts in the log."""
 
     OPEN = "open: no current when driven"
     SHORTED = "shorted: too much current when driven"
@@ -87,11 +89,11 @@ ELECTRICAL = (
 )
 _VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
 PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-"""Of each variant in a prediction; None is a healthy bridge."""
+"""The variants of a prediction, in order; None is a healthy bridge."""
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
-"""Fraction of the readings that a hypothesis may miss: those whose window contains the fault's onset."""
+"""Fraction of the readings that a hypothesis need not explain, because the fault began in their window."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +101,10 @@ class Bounds:
     """Bounds of the error of a predicted reading.
 
     Attributes:
-        full_current: A, of a coil that is fully on.
-        uncertainty: A, for each driven coil.
-        gain: relative, common to all readings.
-        noise: A, of the monitor.
+        full_current: current of a coil that is fully on, A.
+        uncertainty: error bound of the current of each driven coil, A.
+        gain: relative error bound that is common to all readings.
+        noise: error bound of the current monitor, A.
     """
 
     full_current: tuple[float, float, float]
@@ -116,9 +118,9 @@ class Sampling:
     """Error bounds of a reading of a chopped current that changes within the reading's window.
 
     Attributes:
-        scatter: error caused by chopping, of a bridge's current or of what lacks to its full current,
-            whichever is smaller: a bridge that is fully on is not chopped.
-        range_share: error of the mean, as a fraction of the range in the window.
+        scatter: error caused by chopping, as a fraction of the bridge's current or of its difference from the
+            full current, whichever is smaller. A bridge that is fully on is not chopped.
+        range_share: error of the mean, as a fraction of the range of the current within the window.
     """
 
     scatter: float
@@ -126,17 +128,20 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""Error of a single ADC sample at an unknown time in its window, 18 % (`hal.drivers.ina219`)."""
+"""Error bounds of a single ADC sample at an unknown time in its window: 18 % (`hal.drivers.ina219`)."""
 MEAN = Sampling(0.02, 0.25)
-"""Error of the mean of five ADC samples; the remaining 7 % are in the gain, common to all readings."""
+"""Error bounds of the mean of five ADC samples.
+
+A further 7 %, common to all readings, are part of the gain error.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading in A, and the prediction of each axis (rows) under each variant (3, v), A.
+    """A reading (A), and the predicted current (3, v) A of each axis for each of v variants.
 
-    `mean` of the window, `slack`, and `chopped`, the error by chopping. A `clipped` reading may be smaller
-    than the current.
+    `mean` is the mean over the window, `slack` its error bound without chopping, and `chopped` the error
+    bound due to chopping. The current may exceed a `clipped` reading.
     """
 
     current: float
@@ -149,7 +154,7 @@ class Predicted:
 def predict(
     current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
 ) -> Predicted:
-    """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
+    """Predict the current of each variant for the commands (k, 3) A within a reading's time window."""
     full = np.array(bounds.full_current)[:, None]
     drawn = supply_currents(commands.T, full)
     count = len(commands)
@@ -160,9 +165,10 @@ def predict(
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
-    """Return the supply currents (n, v, k) of n bridges under each variant for commands (n, k) A.
+    """Return the supply currents (n, v, k) A of n bridges for each of v variants and commands (n, k) A.
 
-    `full` (n, 1) A is drawn when fully on. A shorted coil's are those of a healthy coil.
+    `full` (n, 1) is the current of a coil that is fully on, A. The result for a shorted coil is that for a
+    healthy coil.
     """
     forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
     drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
@@ -216,7 +222,7 @@ def fits(
 
 @cache
 def _scales(gain: float) -> FloatArray:
-    """Return factors (9, 1, 1) over the range of the gain error."""
+    """Return nine gain factors (9, 1, 1) that cover the range of the gain error."""
     return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]
 
 
@@ -226,17 +232,17 @@ _NOTED_LATE_NS = 25_000_000
 
 
 class CoilCommands:
-    """Commanded currents and brakes with their times; `braked` holds which bridges are braked now."""
+    """Commanded currents and braking, with their times; `braked` is which bridges are braked now."""
 
     def __init__(self, reach_ns: int) -> None:
-        """Keep the commands of the last `reach_ns`."""
+        """Store the commands of the last `reach_ns` (ns)."""
         self._reach_ns = reach_ns
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
         self._braked_ns = 0
         self.braked = NO_AXES
 
     def __bool__(self) -> bool:
-        """Return whether a command was noted yet."""
+        """Return whether any command was recorded."""
         return bool(self._commands)
 
     @property
@@ -245,7 +251,7 @@ class CoilCommands:
         return self._commands[-1][0]
 
     def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
-        """Note the currents (3,) A and brakes in force from `time_ns` on."""
+        """Record the currents (3,) A and the braking that are in force from `time_ns` on."""
         if braked != self.braked:
             self._braked_ns, self.braked = time_ns, braked
         self._commands.append((time_ns, currents))
@@ -254,7 +260,7 @@ class CoilCommands:
             self._commands.popleft()
 
     def is_known_since(self, time_ns: int) -> bool:
-        """Return whether all commands since `time_ns` are known and made under the present brakes."""
+        """Return whether all commands since `time_ns` are known and had the present braking."""
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
@@ -298,22 +304,23 @@ class ResponseSettings:
     """The body's response to the coils, and the settings of the fit.
 
     Attributes:
-        inertia: (3, 3) kg m^2.
-        dipole_per_ampere: n A of each coil, m^2.
-        rate_noise: rad/s, standard deviation of a sample of the rate about each axis.
+        inertia: inertia (3, 3), kg m^2.
+        dipole_per_ampere: turns times area of each coil, m^2.
+        rate_noise: standard deviation of a sample of the rate about each axis, rad/s.
         free: (3,) whether the body can rotate about each axis; on a thread only about y.
         bin_samples: number of rate samples in a bin.
         bins: number of bin differences in the fit.
-        model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.
-        torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
+        model_error: acceleration error of a bin, rad/s^2, caused by the uncertain delay between command and
+            current.
+        torsion, damping: prior standard deviations of torsion (1/s^2) and damping (1/s) about each free axis.
         errors: largest errors of inertia and gyro for a body that is free about three axes.
-        sure: standard deviation below which a gain is used.
-        persistence: fits in a row that must agree.
-        lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
-            torque, and of a reversed one.
-        memory_ns: how long the residual accelerations are kept.
-        settle_ns: how long the coils must have been at rest for the field to be the Earth's; None if the
-            coils' field is small compared with the Earth's.
+        sure: standard deviation of a gain below which the gain is used.
+        persistence: number of fits in a row that must agree.
+        lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of a coil
+            without torque, and of a reversed coil.
+        memory_ns: time (ns) for which the residual accelerations are stored.
+        settle_ns: time (ns) after the coils are switched off until the magnetometer measures the Earth's
+            field alone; None if the field of the coils is small compared with the Earth's field.
     """
 
     inertia: FloatArray
@@ -337,22 +344,23 @@ class ResponseSettings:
 
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
-"""For how long commands are kept: after a stall of the loop, samples arrive late and in a burst."""
+"""Time (ns) for which commands are stored. After a stall of the loop, samples arrive late and in a burst."""
 _LEAST_CHANGE = 4.0e-3
-"""rad/s^2: smaller changes cannot be detected."""
+"""Smallest change of the angular acceleration that can be detected, rad/s^2."""
 LARGEST_GAIN = 1.5
-"""Largest gain, of either sign, that a coil and the described body can have."""
+"""Largest absolute gain that is physically possible for the configured body."""
 _GAIN_PRIOR = 10.0
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
-"""Gain of a coil with little torque, and number of standard deviations by which the gain must be lower."""
+"""Upper bound of a weak coil's gain, and number of standard deviations by which the gain must be lower."""
 
 
 class CoilResponse:
-    """Sliding fit of the three gains.
+    """Fit of the three coil gains over a sliding window.
 
     Attributes:
-        gain, sigma: (3,) newest fit; sigma is infinite before the first.
-        fastest: largest body rate within the newest fit, rad/s.
+        gain, sigma: gains (3,) of the newest fit and their standard deviations (3,), infinite before the
+            first fit.
+        fastest: largest body rate within the window of the newest fit, rad/s.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
@@ -361,7 +369,7 @@ class CoilResponse:
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
-        # The gyroscopic acceleration (3, 6) per rate product, and the changes (k, 3, 6) that its errors make.
+        # Gyroscopic acceleration (3, 6) per product of rates, and its changes (k, 3, 6) by the k error modes.
         self._gyroscopic: FloatArray = np.zeros((3, 6))
         self._modes: FloatArray = np.zeros((0, 3, 6))
         if count == 3:
@@ -403,7 +411,7 @@ class CoilResponse:
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
-        """Note the currents (3,) A in force from `time_ns` on."""
+        """Record the currents (3,) A in force from `time_ns` on."""
         if currents == self._commands[-1][1]:
             return
         self._commands.append((time_ns, currents))
@@ -416,7 +424,7 @@ class CoilResponse:
         self.reset()
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
-        """Add a sample of rate (3,) rad/s and field (3,) T; return whether there is a new fit."""
+        """Add a sample of rate (3,) rad/s and magnetic field (3,) T; return whether a new fit was made."""
         if time_ns < self._known_ns:
             return False
         since_ns = time_ns - self._last_ns
@@ -435,7 +443,10 @@ class CoilResponse:
     def _field_without_coils(
         self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
     ) -> FloatArray | None:
-        """Return the Earth's field of the pause, or of the last one turned with the body; None before one."""
+        """Return the Earth's field of the present or last pause, rotated with the body.
+
+        None before a pause.
+        """
         since_ns, currents = self._commands[-1]
         settle_ns = self._settings.settle_ns or 0
         if not any(currents) and time_ns - since_ns >= settle_ns:
@@ -467,9 +478,9 @@ class CoilResponse:
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return the observed fraction of a change of torque.
 
-        The assumed change: the coil carries `constant` A instead of its command. The residuals before
-        `since_ns` are compared with those after `settled_ns`. None if the change is too small to be observed,
-        NaN if there are too few residuals.
+        The assumed change is that the coil carries `constant` A instead of its command. The residuals before
+        `since_ns` are compared with the residuals after `settled_ns`. The result is None if the change is too
+        small to be observed, and NaN if there are too few residuals.
         """
         before = [row[3] - row[4] @ self._weights for row in self._remainders if row[0] < since_ns]
         after = [row for row in self._remainders if row[0] >= settled_ns]
@@ -484,7 +495,7 @@ class CoilResponse:
         return float(change @ expected) / size
 
     def text(self, axis: int) -> str:
-        """Return the gain in words."""
+        """Return the gain of an axis as text."""
         return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
 
     def _close_bin(self) -> bool:
@@ -530,7 +541,7 @@ class CoilResponse:
 
     def _fit(self, span: float) -> None:
         rows = np.array(self._rows)
-        # A constant disturbance about each free axis drops out with the means.
+        # Subtracting the means removes a constant disturbance about each free axis.
         rows -= rows.sum(axis=0) / len(rows)
         count = len(self._free)
         inputs = np.zeros((len(rows), count, len(self._prior)))
@@ -551,7 +562,7 @@ class CoilResponse:
         self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
         self.fastest = max(self._speeds)
         self._weights = found[3 + 2 * count :]
-        # The model is wrong if a gain is certainly impossible.
+        # The model is wrong if a gain is impossible by more than its uncertainty.
         possible = bool((np.abs(self.gain) - 3.0 * self.sigma < LARGEST_GAIN).all())
         pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
         for number, (gain, sigma) in enumerate(pairs):
@@ -566,7 +577,7 @@ class CoilResponse:
 
 
 _DRIVEN = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
-"""A leg stuck high drives its coil continuously, in this direction."""
+"""Direction in which a leg stuck high drives its coil continuously."""
 _LITTLE_RESPONSE = 0.4
 _DOUBTED_FOR_NS = 60_000_000_000
 """Time (ns) after a false verdict during which the monitor is ignored if the motion is inconclusive."""
@@ -576,29 +587,29 @@ class MotionWitness:
     """Compares verdicts with the torque observed in the body's motion.
 
     Attributes:
-        doubt: why the monitor, not a coil, is doubted; empty while the monitor is trusted.
+        doubt: why the current monitor is assumed to be wrong; empty while the monitor is trusted.
     """
 
     def __init__(self, response: CoilResponse | None, full_current: tuple[float, float, float]) -> None:
-        """Take the fit of the motion, and the current (3,) A of each coil when fully on."""
+        """`full_current` is the current (3,) A of each coil when it is fully on."""
         self._response = response
         self._full_current = full_current
         self._doubted_ns = -_DOUBTED_FOR_NS
         self.doubt = ""
 
     def trust_monitor(self) -> None:
-        """Trust the monitor: its readings fit a healthy circuit."""
+        """Trust the current monitor again, because its readings are consistent with a healthy circuit."""
         self.doubt = ""
 
     def doubt_monitor(self, why: str, now_ns: int) -> None:
-        """Doubt the monitor from now on."""
+        """Assume from now on that the current monitor is wrong."""
         self.doubt, self._doubted_ns = why, now_ns
 
     def contradicts(self, axis: int, fault: CoilFault, begun_ns: int, suspected_ns: int, now_ns: int) -> bool:
         """Return whether the coil's torque is unchanged, so that the monitor is wrong.
 
-        The fault began after `begun_ns`, when the coil last drew the expected current, and was suspected at
-        `suspected_ns`; the newest reading is of `now_ns`.
+        The coil last drew the expected current at `begun_ns`, so that the fault began later. The fault was
+        suspected at `suspected_ns`; the newest reading was made at `now_ns`.
         """
         if self._response is None:
             return False
