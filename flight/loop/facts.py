@@ -1,16 +1,16 @@
 """Events, facts and streams, by which the loop detects and reports faults; and the shared services.
 
 Events are written to the flight log, throttled by kind, and trigger their reactions. The first event of a
-kind is written at once, then at most one every `THROTTLE_NS`, with the number held back: a fault at 40 Hz
-writes one event every few seconds, not forty a second.
+kind is written at once, and then at most one every `THROTTLE_NS`, together with the number of events held
+back. A fault at 40 Hz therefore writes one event every few seconds.
 
 A fact is a condition that monitors update. As in NASA's Limit Checker, a fact counts after N violations in a
-row; an unknown state (None) changes no count. A latching fact stays until it is cleared by command. A mode in
-which a fact is not watched resets its count.
+row; an unknown state (None) does not change the count. A latching fact stays active until it is cleared by
+command. The count is reset in a mode in which the fact is not watched.
 
 A stream is one kind of reading, with its nominal rate, age limit and valid range. As in openpilot's
-SubMaster, liveness, rate and validity are checked separately. A stale value is not good, however plausible
-the value was.
+SubMaster, liveness, rate and validity are checked separately, so that a stale value is not used even if it is
+plausible.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class EventLog:
         self.counts: Counter[EventKind] = Counter()
 
     def react_by(self, react: Reactor) -> None:
-        """Call `react` for every event whose reaction is more than a note, throttled or not."""
+        """Call `react` for every event whose reaction is more than a record, even if it is held back."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -81,15 +81,15 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """One row: a fact's persistence, and the events that report its begin and end.
+    """A row of the fact table: persistence of a fact, and the events that report its begin and end.
 
-    Facts of the 40 Hz cycle count cycles, the others count runs of the health task.
+    Facts that the 40 Hz cycle updates count cycles; other facts count runs of the health task.
 
     Attributes:
-        after: updates in a row in which the condition holds, until the fact counts.
-        mended_after: updates in a row in which the condition does not hold, until the fact ends.
-        latching: the fact ends only when cleared by command.
-        modes: in which the fact is watched.
+        after: number of updates in a row with the condition true that make the fact active.
+        mended_after: number of updates in a row with the condition false that end the fact.
+        latching: whether the fact ends only when it is cleared by command.
+        modes: modes in which the fact is watched.
     """
 
     name: str
@@ -153,7 +153,8 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
     """Validate the table; raises FlightError naming the row.
 
-    `modes_of` returns the modes in which a reaction has an effect: facts watched in none have no effect.
+    `modes_of` returns the modes in which a reaction has an effect. A fact that is watched in none of these
+    modes is an error.
     """
     seen: set[str] = set()
     for fact in facts:
@@ -184,7 +185,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """Update whether a fact's condition holds now, None when unknown. `text` goes with the event."""
+        """Update a fact with its condition, or None if unknown. `text` becomes the text of the event."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -202,11 +203,11 @@ class Facts:
             self._events.report(kind, now_ns, text)
 
     def holds(self, fact: Fact) -> bool:
-        """Return whether a fact counts now."""
+        """Return whether a fact is active."""
         return self._states[fact.name].holds
 
     def held(self) -> tuple[Fact, ...]:
-        """Return the facts that count now, in the order of the table."""
+        """Return the active facts, in the order of the table."""
         return tuple(fact for fact in FACTS if self._states[fact.name].holds)
 
     def clear(self, event_name: str) -> bool:
@@ -225,14 +226,14 @@ class Facts:
 
 
 LEAST_RATE = 0.8
-"""Fraction of the nominal rate below which a stream is slow."""
+"""Fraction of the nominal rate below which a stream counts as slow."""
 _SPAN = 2.0
 _SECOND = 1e-9
 _PERIODS = 5
 
 
 class StreamState(IntEnum):
-    """The quality of a stream; the values are those of the health packet."""
+    """The quality of a stream; the values are the numbers in the health packet."""
 
     NOT_FITTED = 0
     NEVER = 1
@@ -244,9 +245,9 @@ class StreamState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class StreamLimits:
-    """One row: rate in Hz, age limit in s, and the range of its value, in the value's unit.
+    """Limits of a stream: nominal rate (Hz), age limit (s), and range of its value, in the value's unit.
 
-    `has_silence_alarm`: another fact covers the silence of this stream, so that `poor` does not.
+    `has_silence_alarm` is whether another fact reports the silence of this stream, so that `poor` ignores it.
     """
 
     name: str
@@ -273,7 +274,7 @@ def streams_of(config: Config) -> tuple[StreamLimits, ...]:
         camera = config.camera
         longest = camera.period
         if camera.fine_period is not None or camera.streak_exposure is not None:
-            # Exposures that follow the rate shift the frames.
+            # An exposure time that depends on the rate shifts the times of frames.
             longest = max(longest, camera.fine_period or 0.0)
             longest += max(camera.streak_exposure or (camera.exposure,))
         rows.append(StreamLimits("camera", 1.0 / longest, camera.max_age, CAMERA_POOR))
@@ -298,7 +299,7 @@ class StreamWatch:
         self._since_ns = time_ns
 
     def note(self, time_ns: int, value: float | None = None) -> None:
-        """Note a reading taken at `time_ns`, with the value that has a range."""
+        """Record a reading made at `time_ns`, with the value that is compared with the valid range."""
         if self._times and time_ns - self._times[-1] > self._window_ns // 2:
             self._since_ns = time_ns  # a gap is reported as stale, not as slow
         self._times.append(time_ns)
@@ -306,11 +307,11 @@ class StreamWatch:
             self._valid = self.stream.low <= value <= self.stream.high  # NaN compares false
 
     def age(self, now_ns: int) -> float:
-        """Return the age of the newest reading in s, infinite before the first."""
+        """Return the age (s) of the newest reading, which is infinite before the first reading."""
         return (now_ns - self._times[-1]) * _SECOND if self._times else float("inf")
 
     def rate(self, now_ns: int) -> float:
-        """Return the rate in Hz over the window that ends now, NaN before it is full."""
+        """Return the rate (Hz) over the window that ends now; NaN while the window is incomplete."""
         begin_ns = now_ns - self._window_ns
         if begin_ns < self._since_ns:
             return float("nan")
@@ -330,7 +331,7 @@ class StreamWatch:
         return StreamState.GOOD
 
     def poor(self, now_ns: int) -> tuple[bool | None, str]:
-        """Return whether the stream is poor, None if unknown or covered elsewhere, and why."""
+        """Return whether the stream is poor (None if unknown or reported by another fact), and why."""
         stream, state = self.stream, self.state(now_ns)
         if state is StreamState.GOOD:
             return False, f"{stream.name}: good again"
@@ -345,7 +346,7 @@ class StreamWatch:
 
 
 class Streams:
-    """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
+    """All streams of a flight by name. Readings of devices that the configuration lacks are ignored."""
 
     def __init__(self, rows: tuple[StreamLimits, ...]) -> None:
         self._watches = {row.name: StreamWatch(row, 0) for row in rows}
@@ -356,7 +357,7 @@ class Streams:
             watch.begin(time_ns)
 
     def note(self, name: str, time_ns: int, value: float | None = None) -> None:
-        """Note a reading of the named stream, if fitted."""
+        """Record a reading of the named stream, if the configuration has it."""
         watch = self._watches.get(name)
         if watch is not None:
             watch.note(time_ns, value)

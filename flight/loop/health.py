@@ -1,14 +1,15 @@
 """Health, housekeeping and performance: checks and records the loop itself.
 
-Health checks streams, progress and resources, and feeds the watchdog while all of them progress. A rate group
-is stalled when no cycle has completed within its time limit; a worker, when a job has been running for longer
-than its time limit. Jobs on tickers are only reported: a slow disk or a hung bus may delay them, which a
-restart would not cure. A `ResourceReader` samples processor, memory, disk and temperature (`Board` on Linux,
-a script in tests) on a ticker outside the control loop, because the kernel may take milliseconds to answer.
+The health task checks streams, progress and resources, and feeds the watchdog while every rate group and
+worker makes progress. A rate group is stalled if it has completed no cycle within its time limit. A worker is
+stalled if a job has run for longer than its time limit. A stalled ticker job is reported but does not stop
+the feeding, because a restart would not cure a slow disk or a hung bus. A `ResourceReader` samples processor,
+memory, disk and temperature (`Board` on Linux, a script in tests) on a ticker outside the control loop,
+because the kernel may take milliseconds to answer.
 
 Housekeeping records the counters of devices and loop once a second, and checks the flight log. The
-performance record has the times and execution times of cycles in a log of its own; its observer turns slips
-and failures into events, and zeroes the coils after a failed control cycle.
+performance record stores lateness and execution time of cycles in a separate log. Its observer reports
+skipped slots and failures as events, and zeroes the coils after a failed control cycle.
 """
 
 from __future__ import annotations
@@ -47,12 +48,12 @@ class ResourceSample:
     """One sample of the board's resources; NaN for values that are not available.
 
     Attributes:
-        time_ns: monotonic.
+        time_ns: time of the sample by the monotonic clock.
         cpu: processor time (s) of the control process since its start.
-        resident: bytes, resident set size of the control process.
-        proportional: bytes, proportional set size of all flight processes together.
-        disk_free: bytes, free on the flight log's file system.
-        temperature: degree C of the warmest zone.
+        resident: resident set size of the control process, bytes.
+        proportional: sum of the proportional set sizes of all flight processes, bytes.
+        disk_free: free space on the file system of the flight log, bytes.
+        temperature: temperature of the warmest thermal zone, degree C.
     """
 
     time_ns: int
@@ -72,11 +73,11 @@ class ResourceReader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ResourceState:
-    """Values derived from the samples; NaN before there are enough.
+    """Values derived from the samples; NaN while there are too few samples.
 
     Attributes:
-        cpu_share: of one core, between the last two samples.
-        memory_slope: bytes/s, by least squares over the window.
+        cpu_share: processor time between the last two samples, as a fraction of one core.
+        memory_slope: growth of the memory use by least squares over the window, bytes/s.
     """
 
     sample: ResourceSample | None = None
@@ -94,7 +95,7 @@ class ResourceMonitor:
         self.state = ResourceState()
 
     def adopt(self, settings: Health) -> None:
-        """Go on with other bounds."""
+        """Replace the bounds of resources."""
         self._settings = settings
 
     def ingest(self, sample: ResourceSample) -> None:
@@ -110,7 +111,7 @@ class ResourceMonitor:
         self.state = ResourceState(sample, share, self._slope())
 
     def report(self, facts_: Facts, now_ns: int) -> None:
-        """Update the facts from the newest sample."""
+        """Update the facts about resources from the newest sample."""
         sample, limits = self.state.sample, self._settings
         if sample is None:
             return
@@ -138,7 +139,7 @@ class ResourceMonitor:
 
 
 _CLOCK_STEP_NS = 500_000_000
-"""Smallest step of the wall clock that is reported, ns."""
+"""Smallest step of the wall clock that is reported (ns)."""
 
 
 class ClockWatch:
@@ -151,7 +152,7 @@ class ClockWatch:
         self.steps = 0
 
     def look(self) -> float | None:
-        """Return the step in s since the last call, None without one; slow drift is followed."""
+        """Return the step (s) of the wall clock since the last call, or None. Slow drift is not reported."""
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) <= _CLOCK_STEP_NS:
@@ -197,14 +198,14 @@ class Board:
         )
 
     def _below(self, parent: int) -> Iterator[int]:
-        """Yield all descendants of `parent`, its workers."""
+        """Yield the identifiers of all descendants of the process `parent`."""
         for task in sorted((self._proc / str(parent) / "task").glob("*/children")):
             for word in _read(task).split():
                 yield int(word)
                 yield from self._below(int(word))
 
     def _proportional(self, process: int) -> float:
-        """Return the proportional set size in bytes; 0 for a process that has ended, waited for or not."""
+        """Return the proportional set size (bytes) of a process, or 0 if the process has ended."""
         for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
             if line.startswith("Pss:"):
                 return float(line.split()[1]) * 1024.0
@@ -226,7 +227,10 @@ _SHORTEST_LIMIT_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WorkerWatch:
-    """A worker by name; `busy_since_ns` returns since when a job has been running, None when none is."""
+    """A worker to watch.
+
+    `busy_since_ns` returns the start time of its running job, or None while it is idle.
+    """
 
     name: str
     busy_since_ns: Callable[[], int | None]
@@ -261,7 +265,7 @@ class GroupsAndWorkers:
 
 
 def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
-    """Return a text for each job outside the loop that raises or is stalled."""
+    """Return a text for each ticker job that raises errors or is stalled."""
     problems = []
     for ticker in tickers:
         stood_ns = now_ns - ticker.served_ns
@@ -296,7 +300,10 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Report skipped slots of the control group: no other group can slip without it."""
+        """Report skipped slots of the control group.
+
+        Other groups skip slots only if the control group does.
+        """
         if group.name != CONTROL:
             return
         text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
@@ -348,7 +355,10 @@ class Housekeeping:
         log_error: Callable[[], str],
         services: Services,
     ) -> None:
-        """Record the counters of the given parts; `log_error` returns the error of the log, else empty."""
+        """Record the counters of the given tasks.
+
+        `log_error` returns the error of the log, or an empty text.
+        """
         self._navigation = navigation
         self._planner = planner
         self._imaging = imaging
@@ -365,7 +375,7 @@ class Housekeeping:
         return self._coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
-        """Write the packet; `state` is that of the newest control cycle."""
+        """Write the packet; `state` is the state of the coils in the newest control cycle."""
         now_ns, power, log_error = cycle.start_ns, self._power, self._log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
@@ -396,7 +406,7 @@ class Housekeeping:
         )
 
     def report_lost(self, now_ns: int) -> None:
-        """Report the records that were lost since the last call, with the newest reason."""
+        """Report how many records were lost since the last call, and the newest reason."""
         lost = self._recorder.lost
         if lost != self._lost:
             text = f"{lost - self._lost} more, the newest: {self._recorder.lost_text}"
@@ -426,7 +436,7 @@ class HealthWatch:
         feed: Callable[[], None],
         services: Services,
     ) -> None:
-        """Watch the given parts; `feed` is called while every rate group and worker makes progress."""
+        """Watch the given tasks; `feed` is called while every rate group and worker makes progress."""
         self._modes = modes
         self._drive = drive
         self._power = power
@@ -437,7 +447,7 @@ class HealthWatch:
         self._recorder = services.recorder
         self._events = services.events
         self._jobs = services.jobs
-        # Every death of a worker is written without a throttle, because the budget of restarts limits them.
+        # Events of workers are not throttled, because the budget of restarts limits their number.
         self._worker_events = EventLog(services.recorder.event, 0)
         self._facts = services.facts
         self._streams = services.streams
@@ -462,11 +472,11 @@ class HealthWatch:
         self._ticker = self._clock.ticker("resources", period_ns, sample)
 
     def adopt(self, limits: Health) -> None:
-        """Go on with other bounds of resources."""
+        """Replace the bounds of resources."""
         self._monitor.adopt(limits)
 
     def begin(self, time_ns: int) -> None:
-        """Count from here."""
+        """Start all measurements of progress and age now."""
         self._progress.begin(time_ns)
 
     def close(self) -> None:

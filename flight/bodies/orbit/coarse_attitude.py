@@ -2,11 +2,11 @@
 
 They start the filter without a star fix, and update it until the attitude is fine.
 
-An attitude by field and solar cells has a covariance that covers every turn that is possible while any one
-cell fails (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for minutes: a
-measurement is used only if it is more accurate than the filter, so that repetition never reduces the
-filter's covariance. Two directions that contradict an estimate which no stars made fine, several times in
-a row, start the filter again.
+The covariance of an attitude from field and solar cells includes every rotation that is possible if any one
+cell has failed (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for
+minutes. A measurement is therefore used only if it is more accurate than the estimate, so that repeated
+measurements do not reduce the filter's covariance. If two directions contradict an estimate several times in
+a row, and stars have not made this estimate fine, the filter is restarted.
 """
 
 from __future__ import annotations
@@ -45,24 +45,27 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Interval (ns) between judged readings, whose errors are correlated over shorter times."""
+"""Interval (ns) between readings that are checked.
+
+The errors of readings are correlated over shorter times.
+"""
 OVERHEAD_ALBEDO = 0.2
-"""Light of an Earth lit from overhead, relative to sunlight, for an albedo of 0.3."""
+"""Irradiance by a fully lit Earth, relative to sunlight, for an albedo of 0.3."""
 CLOUDS = 0.5
-"""Relative variation of the Earth's light by clouds."""
+"""Relative variation of the Earth's irradiance due to clouds."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Number of identical readings in a row that indicate a fault; noise makes intact readings differ."""
+"""Number of identical readings in a row that indicate a fault. Intact readings differ by noise."""
 SUNLIT = 0.99
-"""Visible fraction of the solar disc above which the solar cells must measure the Sun."""
+"""Visible fraction of the solar disc above which the solar cells are expected to measure the Sun."""
 CONTRADICTED = 3
-"""Number of contradicting attitudes or rounds in a row after which a filter that is not fine restarts."""
+"""Number of contradicting measurements in a row after which an estimate that is not fine is discarded."""
 GATE = 30.7
 """Chi-square threshold of three axes (1e-6) for an attitude that contradicts the estimate."""
 START_SIGMA = np.radians(5.0)
 """Largest standard deviation (rad) of the rotation about the field with which the filter starts."""
 STRENGTH_SIGMA = 5.0
-"""Largest deviation of the field's strength from its model, in sigmas."""
+"""Largest accepted deviation of the field strength from its model, in standard deviations."""
 
 
 class CoarseSunFeed:
@@ -75,7 +78,7 @@ class CoarseSunFeed:
         filter_: OrbitFilter,
         environment: EstimatedEnvironment,
     ) -> None:
-        """`period_ns` is the duration of a round of readings, which are not simultaneous."""
+        """`period_ns` is the time (ns) in which all cells are read, one after the other."""
         self.strings = strings
         self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
@@ -88,7 +91,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Accept a reading; return its fault, else an empty text; None if the reading was not judged."""
+        """Accept a reading; return its fault or an empty text; None if the reading was not checked."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
@@ -117,7 +120,7 @@ class CoarseSunFeed:
         if abs(excess) > STRENGTH_SIGMA * sigma:
             self._turns.forget()
             return f"the field is {excess * 1e6:+.1f} uT off its model: no attitude by it"
-        # The body rotates during a round of readings.
+        # The body rotates while the cells are read one after the other.
         blur = float(np.linalg.norm(gyro)) * self._period_ns / SECOND_NS / np.sqrt(12.0)
         fix = self._turns.accept(reading.currents, seen, sigma, sky, blur)
         if fix is not None and self._filter.knowledge is not Knowledge.FINE:
@@ -146,16 +149,17 @@ class CoarseSunFeed:
 
 
 def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
-    """Return field, Sun and nadir, and the light of an Earth with unknown clouds."""
+    """Return field, Sun, nadir, and the irradiance by the Earth, whose clouds are unknown."""
     up = around.position / np.linalg.norm(around.position)
     light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
     return KnownDirections(around.field, sun, -up, light, CLOUDS * light)
 
 
 DIRECTIONS_START_SIGMA = math.radians(15.0)
-"""Largest standard deviation (rad) of the worst axis with which an attitude starts the filter."""
+"""Largest standard deviation (rad), about the worst axis, of an attitude that may start the filter."""
 NEEDED_SIGMA = math.radians(0.05)
-"""Standard deviation (rad) of the worst axis above which directions of 0.01 to 0.04 deg are useful."""
+"""Standard deviation (rad), about the worst axis, above which directions accurate to 0.01 to 0.04 deg help.
+"""
 ROUGH_SIGMA = 0.3
 """Largest standard deviation (rad) of an estimate that helps to find the horizon."""
 IMPROBABLE = 1e-6
@@ -177,7 +181,9 @@ class HorizonCameraFeed:
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
-        """`lens_error` (rad) of an axis remains after calibration; `sun` has the newest reading of the cells.
+        """`lens_error` is the lens error (rad, per axis) after calibration.
+
+        `sun` has the newest cell reading.
 
         `response` is the response of all cameras to light; None for a linear response.
         """
@@ -223,7 +229,7 @@ class HorizonCameraFeed:
         then = self._filter.past(time_ns)
         if then is None:
             return False, False
-        # A Sun of the solar cells alone reaches the filter through `CoarseSunFeed`.
+        # A Sun direction from the solar cells alone is passed to the filter by `CoarseSunFeed`.
         of_cells = found.sun is not None and not found.sun.cameras
         mine = [None if of_cells else seen[0], seen[1]]
         claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
@@ -317,10 +323,10 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a direction's departure (2,) from an attitude (3, 3), and the covariances (2, 2) of both."""
+    """Return the deviation (2,) of a direction from an attitude (3, 3), and both covariances (2, 2)."""
     expected = turn @ sight.reference
     across = tangent_basis(expected)
-    # A turn e moves the direction d by d x e.
+    # A small rotation e changes the direction d by d x e.
     rows = across @ np.cross(expected, np.eye(3)).T
     return across @ sight.observed, across @ sight.covariance @ across.T, rows @ claim @ rows.T
 

@@ -1,18 +1,18 @@
 """The satellite's filter behind the loop's Protocol: `FreeFilter` in steps of a second at most.
 
-A step holds the commands and measurements between two times. It ends early when the coils begin or cease to
-act, so that its dipole is nearly constant. It is taken when it is over, with the mean dipole that was on the
-wire and the mean of the gyro's samples; the magnetometer counts only while the coils are at rest and their
+A step holds the commands and measurements between two times. It ends early when the coils are switched on or
+off, so that its dipole is nearly constant. The filter processes a step after its end, with the mean commanded
+dipole and the mean of the gyro samples. Magnetometer samples are used only while the coils are off and their
 field has decayed. Between steps the estimate is propagated by the model. A measurement of a past time, such
-as an attitude of the stars, is applied at that time: the filter returns to the step's beginning and takes it
-and the later steps again.
+as a star fix, is applied at that time: the filter returns to the beginning of the step that contains it, and
+processes this step and the later ones again.
 
 The learned states are stored for the next boot in two parts, without their cross-covariance:
 `attitude-errors` has the biases of gyro and magnetometer and the rotation of the principal axes,
-`attitude-torques` the residual dipole in shadow and sunlight and the torques. A third, `learned-at`, is the
-time (UTC, s) to which their covariance refers. Until the next boot each state walks on as in flight, and may
-have changed by a fraction of its standard deviation at the start: a unit that was switched off has another
-bias.
+`attitude-torques` the residual dipole in shadow and sunlight and the torques. A third entry, `learned-at`, is
+the time (UTC, s) to which their covariance refers. At the next boot the random walk of each state is
+continued over the elapsed time, and a fraction of its initial standard deviation is added, because the bias
+of a unit changes when the unit is switched off and on.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ _NOTHING: Floats = (0.0, 0.0, 0.0)
 
 
 class DipoleHistory:
-    """The dipoles on the wire in order of time."""
+    """The commanded dipoles, in order of time."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns
         self._times: list[int] = []
         self._dipoles: list[Floats] = []
-        self._sums: list[Floats] = []  # A m^2 ns: the integral until each time
+        self._sums: list[Floats] = []  # integral of the dipole until each time, A m^2 ns
         self.unknown_ns = -1
-        """Time (ns) until which dipoles were not known; -1 if they always were."""
+        """Time (ns) until which the dipoles were unknown; -1 if they were always known."""
 
     def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
         """Record the dipole (A m^2) in force from `time_ns` on; calls are in order of time."""
@@ -116,8 +116,8 @@ class FilterStep:
     """The commands and measurements between two times.
 
     Attributes:
-        dipole: (3,) A m^2, mean on the wire.
-        doubt: A m^2, largest deviation of an axis from `dipole`; 0 for known dipoles.
+        dipole: mean commanded dipole (3,), A m^2.
+        doubt: largest possible deviation of an axis from `dipole`, A m^2; zero for known dipoles.
         gyro: (3,) rad/s, mean of `samples` readings, whose mean time is `gyro_ns`.
         impulse: (3,) A m^2 s, impulse of the dipole after a sample, as the mean over the samples.
         field: (3,) T, mean of `fields` readings around `field_ns`; None without a reading.
@@ -150,7 +150,7 @@ class OpenStep:
     """Collects the readings of the present step."""
 
     def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Begin at a time; `acts` is whether the coils carry a current."""
+        """Start a step at a time; `acts` is whether the coils carry current during the step."""
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
@@ -170,7 +170,7 @@ class OpenStep:
             self._fields_ns += since
 
     def is_over(self, acts: bool, longest_ns: int) -> bool:
-        """Return whether the step has its full length, or the coils have begun or ceased to act."""
+        """Return whether the step has its full length, or the coils were switched on or off."""
         return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
 
     def close(self, dipole: FloatArray, doubt: float, around: FilterEnvironment) -> FilterStep:
@@ -203,12 +203,14 @@ class OrbitFilterSettings:
     """The body, its sensors, and the steps.
 
     Attributes:
-        inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
-        gyro_noise: rad/s of an axis of a sample. field_noise: T of an axis of a sample.
-        unknown_psd: rad^2/s^3, density of the body's acceleration where no estimate has one.
-        settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
-        history_ns: how old a measurement may be.
-        step_ns: the longest step.
+        inertia: inertia (3, 3), kg m^2. dipole_per_ampere: turns times area, m^2. dipole_limit: largest
+            dipole of each coil, A m^2.
+        gyro_noise, field_noise: standard deviations per axis of a gyro sample (rad/s) and a magnetometer
+            sample (T).
+        unknown_psd: power spectral density of the body's angular acceleration without an estimate, rad^2/s^3.
+        settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed.
+        history_ns: largest age of a measurement that is applied, ns.
+        step_ns: longest duration of a step, ns.
         slow: the slow states that an earlier boot learned.
     """
 
@@ -254,7 +256,7 @@ class StepReplay:
             self.take_on(len(self.steps) - 1)
 
     def follow_gyro(self) -> None:
-        """Take the last steps again with unknown dipoles if the gyro contradicts the commanded dipoles.
+        """Process the last steps again with unknown dipoles if the gyro contradicts the commanded dipoles.
 
         The deviation may have begun in the step before, whose mean rate shows only half of it.
         """
@@ -271,7 +273,7 @@ class StepReplay:
             self.take_again(first)
 
     def doubt_since(self, since_ns: int) -> set[int]:
-        """Take the steps since then again with unknown dipoles; return the measurements used."""
+        """Process the steps since a time again with unknown dipoles; return the measurements used."""
         steps = self.steps
         first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
         for k in range(first, len(steps)):
@@ -279,7 +281,7 @@ class StepReplay:
         return self.take_again(first)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since then as unknown if this admits a refused attitude; return the used ones.
+        """Treat the dipoles since a time as unknown if a refused attitude then passes; return those used.
 
         Deviations of the dipoles that the gyro cannot detect accumulate in the attitude.
         """
@@ -338,7 +340,10 @@ class StepReplay:
         return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
-        """Return to the beginning of step `first`, take it and later steps; return the measurements used."""
+        """Return to the start of step `first`, and process it and the later steps.
+
+        Return the measurements used.
+        """
         while first < len(self.steps) and self.steps[first].before is None:
             first += 1
         if first == len(self.steps):
@@ -349,7 +354,7 @@ class StepReplay:
         return self.take_on(first)
 
     def take_on(self, first: int) -> set[int]:
-        """Take the steps from number `first` on; return the identities of the late measurements used."""
+        """Process the steps from number `first` on; return the identities of the late measurements used."""
         used: set[int] = set()
         for k in range(first, len(self.steps)):
             step = self.steps[k]
@@ -375,7 +380,8 @@ class StepReplay:
         free, settings = self.free, self._settings
         since = (step.end_ns - step.gyro_ns) / SECOND_NS
         shown = attitude_matrix(free.quaternion) @ step.around.field
-        # The coils act for a part of the step: after its samples by `impulse`, not by the mean.
+        # The coils act during a part of the step only: the rate change after its samples follows from
+        # `impulse`, not from the mean dipole.
         uneven = np.cross(step.impulse - since * step.dipole, shown)
         change = since * free.acceleration + free.motion.inverse @ uneven
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
@@ -404,7 +410,7 @@ class StepReplay:
 
 
 STUCK, CONTRADICTED = 20, 4
-"""Numbers in a row of equal fields, which noise excludes, and of fields that contradict the estimate."""
+"""Numbers of fields in a row that indicate a fault: equal fields, and fields that contradict the estimate."""
 
 
 class StuckFieldCheck:
@@ -442,7 +448,7 @@ _NONE: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beginning:
-    """An estimate at the end of a step, with the terms that all its propagations share.
+    """An estimate at the end of a step, with terms that are computed once for all its propagations.
 
     Attributes:
         spread: (19, 19) the covariance in the loop's order.
@@ -536,7 +542,7 @@ REFUSALS_TO_RESTART = 3
 class OrbitFilter:
     """The satellite's filter; implements `flight.loop.body.Filter`.
 
-    Longer than 200 lines because loop, feeds and telemetry each use several short methods.
+    The class is longer than 200 lines because loop, feeds and telemetry each use several short methods.
 
     Attributes:
         restarts: number of estimates that were discarded.
@@ -560,7 +566,7 @@ class OrbitFilter:
 
     @property
     def knowledge(self) -> Knowledge:
-        """How well the attitude is known."""
+        """The quality of the attitude estimate."""
         return self._free.knowledge
 
     @property
@@ -570,7 +576,7 @@ class OrbitFilter:
 
     @property
     def started(self) -> bool:
-        """Whether there is an estimate: not while the attitude is lost."""
+        """Whether there is an estimate; false while the attitude is lost."""
         return self.knowledge is not Knowledge.LOST
 
     @property
@@ -630,12 +636,12 @@ class OrbitFilter:
         return self._free.magnet_bias
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on; only a guess unless `known`."""
+        """Record the coil currents (3,) A in force from `time_ns` on; `known` is whether they are certain."""
         x, y, z = (self._settings.dipole_per_ampere * currents).tolist()
         self._dipoles.record(time_ns, (x, y, z), known)
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the currents recorded since then as unknown, and take the steps since again."""
+        """Treat the currents recorded since a time as unknown, and process the steps since then again."""
         self._replay.doubt_since(since_ns)
 
     def accept(self, reading: ImuReading) -> bool:
@@ -682,7 +688,8 @@ class OrbitFilter:
             for m in late:
                 if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
                     continue
-                # A refused attitude that is more accurate than a fine estimate casts doubt on the dipoles.
+                # If an attitude is refused that is more accurate than a fine estimate, the dipoles may be
+                # wrong.
                 sigma = math.sqrt(float(m.covariance.diagonal().max()))
                 if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
                     used = self._replay.make_room(m, self._placed_ns)
@@ -799,7 +806,7 @@ def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
 def start_from(
     learned: Mapping[str, Learned], settings: FreeFilterSettings, changed: float, utc: float
 ) -> tuple[SlowStates, list[str]]:
-    """Return the filter's prior at a time (UTC, s), and why learned states were rejected.
+    """Return the prior of the filter at a time (UTC, s), and why learned states were rejected.
 
     Since the last boot a state may have changed by the fraction `changed` of its initial deviation.
     """
