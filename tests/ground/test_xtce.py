@@ -104,3 +104,29 @@ def test_the_states_of_the_table_are_those_of_the_code() -> None:
     grave = {fact.name: fact.begins.severity is Severity.FAULT for fact in FACTS}
     named = dict(definitions.FACTS)
     assert {named[bit]: level == "fault" for bit, level in definitions.FACT_ALARMS} == grave
+
+
+def test_each_stage_of_a_command_is_verified_by_identifier_sequence_and_stage() -> None:
+    commands = found(fromstring(document(verified=True)), "x:CommandMetaData/x:MetaCommandSet")
+    verifiers = found(commands, "x:MetaCommand[@name='ping']/x:VerifierSet")
+    seen = {}
+    for verifier in verifiers:
+        conditions = [
+            (
+                found(condition, "x:ParameterInstanceRef").get("parameterRef"),
+                condition.findtext("x:Value", None, SPACE),
+            )
+            for condition in verifier.iter("{http://www.omg.org/spec/XTCE/20180204}Condition")
+        ]
+        window = found(verifier, "x:CheckWindow").get("timeToStopChecking")
+        seen[verifier.tag.partition("}")[2]] = (window, conditions)
+    same = [("verification_packet", str(0x1A01)), ("verification_sequence", None)]
+    assert seen == {
+        "AcceptedVerifier": ("PT20S", [*same, ("verification_stage", "accepted")]),
+        "ExecutionVerifier": ("PT20S", [*same, ("verification_stage", "started")]),
+        "CompleteVerifier": ("PT1H", [*same, ("verification_stage", "completed")]),
+        "FailedVerifier": (
+            "PT1H",
+            [*same, ("verification_stage", "refused"), ("verification_stage", "failed")],
+        ),
+    }

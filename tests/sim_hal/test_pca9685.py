@@ -242,3 +242,21 @@ def test_a_brown_out_is_a_power_on(bench: Bench) -> None:
     assert bench.chip.duty(0) == 0.0
     assert bench.read(0x00) == [0x11]
     assert bench.read(0x09) == [0x10]
+
+
+def test_a_power_on_and_an_upset_change_all_outputs_at_once(bench: Bench) -> None:
+    bench.wake()
+    stops: list[int] = []
+    bench.chip.on_stop = stops.append
+    bench.chip.brown_out()
+    bench.chip.upset(0x06, 1)
+    bench.chip.flip(0x06, 1)
+    bench.bus.write_byte(0x00, 0x06)
+    assert stops == [0xFFFF] * 4
+    assert bench.read(0x06) == [0]
+
+
+def test_a_flipped_bit_stays_zero_where_the_data_sheet_reserves_it(bench: Bench) -> None:
+    bench.chip.flip(0x07, 5)
+    bench.chip.flip(0x07, 4)
+    assert bench.read(0x07) == [0x10]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from flight.loop.coil_monitor import CoilMonitor, CoilMonitorSettings
-from flight.loop.coil_response import CoilResponse, ResponseSettings
+from flight.loop.coil_response import CoilFault, CoilResponse, MotionWitness, ResponseSettings
 from knightcube.astro.arrays import FloatArray
 
 FIELD = np.array([0.0, 0.0, 60e-6])
@@ -179,3 +180,88 @@ def test_a_rest_ends_after_ten_minutes_however_fast_the_body_is() -> None:
     body.fly(60.0)
     body.watch.observe_motion(700_000_000_000, np.full(3, 0.1), np.full(3, 3e-5))
     assert not body.watch.resting.any()
+
+
+@pytest.mark.parametrize(("since_ns", "kept"), [(199_999_999, True), (200_000_000, False)])
+def test_samples_that_are_200_ms_apart_begin_a_new_fit(since_ns: int, kept: bool) -> None:
+    settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
+    response = CoilResponse(settings)
+    response.observe_motion(1, np.zeros(3), FIELD)
+    response.observe_motion(2, np.zeros(3), FIELD)
+    assert len(response._samples) == 2
+    response.observe_motion(2 + since_ns, np.zeros(3), FIELD)
+    assert bool(response._samples) is kept
+
+
+def test_before_the_first_fit_no_gain_is_claimed() -> None:
+    response = CoilResponse(ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4))
+    assert response.text(1) == "the motion shows +1.00 +- inf of its torque"
+    assert response.reversed_axes() == response.feeble_axes() == []
+    assert not any(response.is_healthy(axis) for axis in range(3))
+    assert math.isnan(response.observed_share(0, 0.0, 1, 2) or 0.0)
+
+
+class Motion:
+    """A fit whose answers are set by hand."""
+
+    def __init__(self, share: float | None, healthy: bool) -> None:
+        self.share, self.healthy = share, healthy
+        self.asked: list[tuple[int, float, int, int]] = []
+
+    def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
+        """Return the observed part of the change."""
+        self.asked.append((axis, constant, since_ns, settled_ns))
+        return self.share
+
+    def is_healthy(self, axis: int) -> bool:
+        """Return whether the gain is healthy."""
+        return self.healthy
+
+
+MINUTE = 60_000_000_000
+FULL = (0.1, 0.2, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("share", "fault", "healthy", "wrong"),
+    [
+        (0.39, CoilFault.OPEN, False, True),
+        (0.4, CoilFault.OPEN, True, False),
+        (None, CoilFault.OPEN, True, True),
+        (None, CoilFault.OPEN, False, False),
+        (None, CoilFault.A_HIGH, True, False),
+        (math.nan, CoilFault.OPEN, True, True),
+        (math.nan, CoilFault.OPEN, False, False),
+        (math.nan, CoilFault.B_HIGH, False, True),
+    ],
+)
+def test_the_motion_contradicts_a_verdict_whose_torque_it_does_not_show(
+    share: float | None, fault: CoilFault, healthy: bool, wrong: bool
+) -> None:
+    witness = MotionWitness(cast(Any, Motion(share, healthy)), FULL)
+    assert witness.contradicts(1, fault, 5, 9, MINUTE) is wrong
+
+
+@pytest.mark.parametrize(
+    ("fault", "carried"), [(CoilFault.OPEN, 0.0), (CoilFault.A_HIGH, 0.2), (CoilFault.B_HIGH, -0.2)]
+)
+def test_a_leg_stuck_high_is_expected_to_drive_its_coil_fully(fault: CoilFault, carried: float) -> None:
+    motion = Motion(1.0, True)
+    MotionWitness(cast(Any, motion), FULL).contradicts(1, fault, 5, 9, MINUTE)
+    assert motion.asked == [(1, carried, 5, 9)]
+
+
+@pytest.mark.parametrize(("since_ns", "wrong"), [(MINUTE - 1, True), (MINUTE, False)])
+def test_for_a_minute_after_a_false_verdict_the_monitor_is_not_believed_alone(
+    since_ns: int, wrong: bool
+) -> None:
+    witness = MotionWitness(cast(Any, Motion(None, False)), FULL)
+    witness.doubt_monitor("false", 7)
+    assert witness.doubt == "false"
+    assert witness.contradicts(0, CoilFault.OPEN, 0, 0, 7 + since_ns) is wrong
+    witness.trust_monitor()
+    assert witness.doubt == ""
+
+
+def test_without_the_motion_nothing_is_contradicted() -> None:
+    assert not MotionWitness(None, FULL).contradicts(0, CoilFault.OPEN, 0, 0, 0)

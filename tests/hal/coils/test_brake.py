@@ -114,3 +114,16 @@ def test_a_start_begins_without_brakes() -> None:
     rig.coils.start()
     assert rig.coils.state().braked == (False, False, False)
     assert rig.duties == [0.0] * 16
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_braked_bridge_is_reported_without_current_on_each_axis(axis: int) -> None:
+    rig = Rig()
+    rig.coils.start()
+    rig.command(0.1, 0.1, 0.1)
+    rig.coils.brake((axis == 0, axis == 1, axis == 2))
+    expected = [0.0 if number == axis else 0.1 for number in range(3)]
+    state = rig.coils.state()
+    assert state.current[axis] == 0.0
+    assert state.current.tolist() == pytest.approx(expected, abs=1e-4)
+    assert rig.currents() == pytest.approx(expected, abs=1e-4)

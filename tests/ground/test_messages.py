@@ -1,0 +1,111 @@
+"""Tracks of objects as CCSDS Tracking Data Messages (503.0-B-2), from hand-made packets."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ground import messages
+from knightcube.errors import UsageError
+from tests.support.packed_run import packed_run
+
+START_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z
+ARCSECOND = math.radians(1.0 / 3600.0)
+
+
+def sighting(time: float, number: int, ra: float, dec: float, **values: Any) -> tuple[float, dict[str, Any]]:
+    """Return a track packet of a sighting at angles in degrees."""
+    a, d = math.radians(ra), math.radians(dec)
+    direction = [math.cos(d) * math.cos(a), math.cos(d) * math.sin(a), math.sin(d)]
+    known = {"measured_sigma": 10.0 * ARCSECOND, "magnitude": math.nan, "magnitude_sigma": math.nan}
+    found = {"number": number, "middle_ns": round(time * 1e9), "measured": direction, **known}
+    return time, {**found, **values}
+
+
+UNSEEN = {"measured": [math.nan] * 3}
+LABEL = (0.0, {"utc_ns": START_NS})
+
+
+def test_a_tracking_message_has_the_angles_of_every_sighting_by_object(tmp_path: Path) -> None:
+    run = packed_run(
+        run=[LABEL],
+        track=[
+            sighting(
+                1.5, 2, 300.0, -20.0, magnitude=4.25, magnitude_sigma=0.1, measured_sigma=30.0 * ARCSECOND
+            ),
+            sighting(2.0, 1, 10.0, 45.0),
+            sighting(2.5, 2, 0.0, 0.0, **UNSEEN),
+            sighting(3.5, 2, 301.0, -21.0, magnitude_sigma=0.3),
+        ],
+    )
+    path = tmp_path / "new" / "tracks.tdm"
+    assert messages.write_tracking_data(run, path) == [path]
+    text = path.read_text(encoding="ascii")
+    assert text.endswith("\n")
+    lines = text.splitlines()
+    assert (lines[0], lines[2]) == ("CCSDS_TDM_VERS = 2.0", "ORIGINATOR = KNIGHTCUBE")
+    made = datetime.fromisoformat(f"{lines[1].removeprefix('CREATION_DATE = ')}+00:00")
+    assert abs((datetime.now(UTC) - made).total_seconds()) < 3600.0
+    assert [line for line in lines if line.startswith("PARTICIPANT_2")] == [
+        "PARTICIPANT_2 = OBJECT-1",
+        "PARTICIPANT_2 = OBJECT-2",
+    ]
+    second = lines[lines.index("PARTICIPANT_2 = OBJECT-2") - 10 :]
+    assert "START_TIME = 2026-01-01T00:00:01.500000" in second
+    assert "STOP_TIME = 2026-01-01T00:00:03.500000" in second
+    assert second[second.index("DATA_START") :] == [
+        "DATA_START",
+        "ANGLE_1 = 2026-01-01T00:00:01.500000 300.00000000",
+        "ANGLE_2 = 2026-01-01T00:00:01.500000 -20.00000000",
+        "MAG = 2026-01-01T00:00:01.500000 4.250",
+        "ANGLE_1 = 2026-01-01T00:00:03.500000 301.00000000",
+        "ANGLE_2 = 2026-01-01T00:00:03.500000 -21.00000000",
+        "DATA_STOP",
+    ]
+    assert "COMMENT Standard deviation of each angle on the sky 20.00 arcsec in the median," in text
+    assert "COMMENT 10.00 to 30.00 arcsec, the attitude's included." in text
+    assert "COMMENT Standard deviation of MAG 0.200 in the median, 0.300 at most:" in text
+    assert text.count("Standard deviation of MAG") == 1, "the first object has no magnitude"
+
+
+def test_a_run_without_sightings_has_no_message(tmp_path: Path) -> None:
+    for run in (
+        packed_run(run=[LABEL]),
+        packed_run(run=[LABEL], track=[sighting(1.0, 1, 0.0, 0.0, **UNSEEN)]),
+    ):
+        with pytest.raises(UsageError, match="no object was tracked"):
+            messages.write_tracking_data(run, tmp_path / "tracks.tdm")
+    with pytest.raises(UsageError, match="no object was tracked"):
+        messages.orbits_of(packed_run(run=[LABEL]))
+
+
+def test_a_message_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    run = packed_run(run=[LABEL], track=[sighting(1.0, 1, 0.0, 0.0)])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="the message cannot be written"):
+        messages.write_tracking_data(run, tmp_path / "file" / "tracks.tdm")
+
+
+@pytest.mark.parametrize(
+    ("utc_ns", "text"),
+    [
+        (0, "1970-01-01T00:00:00.000000"),
+        (START_NS + 1_999, "2026-01-01T00:00:00.000001"),
+        (START_NS + 59_123_456_789, "2026-01-01T00:00:59.123456"),
+    ],
+)
+def test_a_date_has_microseconds(utc_ns: int, text: str) -> None:
+    assert messages.ccsds_date(utc_ns) == text
+
+
+def test_too_few_sightings_with_a_position_give_a_reason_instead_of_an_orbit() -> None:
+    track = [
+        sighting(float(t), 7, 10.0 + t, 5.0, place=[7e6, 0.0, 0.0] if t else [math.nan] * 3) for t in range(3)
+    ]
+    (found,) = messages.orbits_of(packed_run(run=[LABEL], track=track))
+    assert (found.number, found.sightings, found.span, found.orbit) == (7, 3, 2.0, None)
+    assert found.reason.startswith("2 sightings with the satellite's position")
