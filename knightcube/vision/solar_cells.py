@@ -8,11 +8,11 @@ pattern if nadir is known, otherwise in the mean pattern over all directions. Th
 pattern.
 
 `FieldAndStrings` gives the attitude from the magnetic field and the strings, while any one string may fail in
-any way. The field leaves the rotation about it open. All rotations are tried at once: each predicts the light
-of Sun and Earth on the strings. A rotation is possible if there is one string without which the other strings
-agree with it, the same string in each reading; between readings the gyro propagates the rotations. The
-covariance covers all rotations that are possible (solution separation, as receivers check satellite
-navigation: Brown 1992, Navigation 39).
+any way. The field does not determine the rotation about itself. All rotations about the field are tried at
+once, and each predicts the light of Sun and Earth on the strings. A rotation is possible if all strings
+except at most one agree with it, with the same exception in each reading. Between readings, the gyro
+propagates the rotations. The covariance covers all rotations that are possible (solution separation, as
+receivers check satellite navigation: Brown 1992, Navigation 39).
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from knightcube.errors import UsageError
 
 _MOST_STEPS = 15
 _SOFT = 0.05
-"""Cosine over which a string's current sets in: the slope there determines a Sun normal to a face."""
+"""Range of the cosine in which a string's current rises smoothly from zero. Its slope there is needed for a
+Sun normal to a face."""
 _RARE = 3.09
 """Standard deviations that one reading in a thousand exceeds."""
 
@@ -162,7 +163,11 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
 
 
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the currents relative to their peaks at `cosines` (...), 0 from behind, and their slopes."""
+    """Return string currents relative to the peak current, and their derivatives, at cosines of incidence.
+
+    `cosines` (...) are the cosines of the angles between the Sun and the string's normals. The current is 0
+    if the Sun is behind the string.
+    """
     root = np.sqrt(cosines**2 + _SOFT**2)
     return 0.5 * (cosines + root), 0.5 * (1.0 + cosines / root)
 
@@ -186,11 +191,11 @@ _TURNS = 180
 _IMPROBABLE = 1e-4
 """Probability of the currents below which a rotation is impossible."""
 _MEMORY = 120.0
-"""Time (s) for which an impossible rotation stays impossible: the gyro drifts."""
+"""Time (s) for which a rejected rotation stays rejected, limited by the drift of the gyro."""
 _MOST_VIOLATION = 3.0
 """Largest violation of the bound that is remembered, as a multiple of the bound."""
 _CERTAIN = 5.0
-"""Distance from the attitude to the farthest possible rotation, in standard deviations of the result."""
+"""Distance from the result to the farthest possible rotation, in standard deviations of the result."""
 _COMMON = 0.02
 """Relative error that all strings have in common: the Sun's distance, temperature."""
 _STEP = 2.0 * math.pi / _TURNS
@@ -205,7 +210,7 @@ class KnownDirections:
         field: magnetic field (3,), T.
         sun, nadir: unit vectors (3,).
         light: brightness of an Earth that fills half the sky, relative to the Sun.
-        light_sigma: its standard deviation.
+        light_sigma: standard deviation of `light`.
     """
 
     field: FloatArray
@@ -309,7 +314,8 @@ class FieldAndStrings:
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # The shortest way is not unique: a half turn about any axis across comes first.
+            # For opposite directions the shortest rotation is not unique, so that a half turn about any
+            # normal axis is applied first.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))

@@ -55,7 +55,7 @@ class _Changes(NamedTuple):
 
     @property
     def squared(self) -> FloatArray:
-        """The squared change along the diameter: r_A or r_B of 3.10."""
+        """The squared intensity change along the diameter, r_A or r_B of Sease 3.10."""
         return np.asarray(self.ahead**2 + self.behind**2)
 
 
@@ -74,12 +74,15 @@ def trajkovic_response(
 
 
 def simple_response(image: FloatArray, neighbours: int) -> FloatArray:
-    """Return the minimum squared change over the diameters of 4 or 8 `neighbours` (3.9, 3.10)."""
+    """Return the minimum squared intensity change over the diameters (Sease 3.9, 3.10).
+
+    They connect opposite pixels of 4 or 8 `neighbours`.
+    """
     return np.asarray(np.min([changes.squared for changes in _changes(image, neighbours)], axis=0))
 
 
 def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
-    """Return the minimum squared change over all directions (3.11-3.13 corrected).
+    """Return the minimum squared intensity change over all directions (Sease 3.11-3.13, corrected).
 
     It is the minimum over all pairs of neighbouring diameters, which for four neighbours equals 3.11 with the
     smaller of B1 and B2 as B.

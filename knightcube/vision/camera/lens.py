@@ -229,7 +229,7 @@ class Lens:
         return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
-        """Return the distorted tangent at the reach: the edge of the image."""
+        """Return the distorted tangent of the edge of the image, where the true tangent is `reach`."""
         square = self.reach**2
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
@@ -252,7 +252,7 @@ class Lens:
             square = radius * radius
             value = radius * (1.0 + square * (k1 + square * k2)) - target
             step = value / (1.0 + square * (slope1 + square * slope2))
-            # No root is below zero, but a step from the inflection may be.
+            # A step from the inflection may lead below zero, but the root is not negative.
             radius = np.maximum(radius - step, 0.0)
             if np.vdot(step, step) < _LAST_STEP**2:
                 break

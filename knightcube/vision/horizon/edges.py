@@ -1,10 +1,10 @@
 """Edges along scan lines to a fraction of a pixel, in pixels and as directions.
 
-Columns and rows are read, normalised, made binary and filtered as in Meller 3.1. Every change of the binary
-line is then refined: the slope of the signal, smoothed by a Gaussian, has its peak where the brightness of
-the limb falls fastest. The scale is doubled as long as the edge is wider (Lindeberg 1998, Int. J.
-Comput. Vision 30, 117), so that a limb of one pixel and a limb of a hundred pixels are both located at their
-steepest point.
+Columns and rows are read, normalised, made binary and filtered as in Meller 3.1. The position of every change
+of the binary line is then refined: the slope of the signal, smoothed by a Gaussian, has its peak at the
+steepest point of the limb's profile. The width of the Gaussian is doubled as long as the edge is wider
+(Lindeberg 1998, Int. J. Comput. Vision 30, 117), so that limbs of one pixel and of a hundred pixels are
+located at their steepest points.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from knightcube.vision.camera.lens import CameraModel, Lens
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
-"""Window of the majority filter (px): shorter fluctuations are removed."""
+"""Window of the majority filter (px), which removes shorter fluctuations."""
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
@@ -43,21 +43,22 @@ _REACH = 3.0
 _TAIL = 3.5
 """Distance, in scales, at which the Gaussian is truncated."""
 _OUTGROWN = 1.4
-"""Gain above which a doubled scale still does not cover the edge: its spread is 1.4 scales."""
+"""Ratio of the step heights at the doubled and the present scale above which the edge is wider than the
+present scale."""
 _MARGIN = 4.0
 """Distance from the border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
-"""Prior error of an edge position: a constant (px) and a share of the scale."""
+"""Prior error of an edge position, as the sum of a constant (px) and a fraction of the scale."""
 _SAMPLES = 2048
-"""Number of pixels from which the brightness levels are estimated."""
+"""Number of pixels that determine the brightness levels."""
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
-"""Ratio of the standard deviation of one pixel to the median absolute difference of two, normal noise."""
+"""Ratio of a pixel's standard deviation to the median absolute difference of two pixels, for normal noise."""
 _STANDS_OUT = 6.0
-"""Threshold of lit pixels, in standard deviations of dark pixels."""
+"""Threshold above which a pixel counts as lit, in standard deviations of the dark pixels."""
 _LEAST_LIT = 16
-"""Least number of lit samples: fewer are a hot pixel or a star."""
+"""Minimum number of lit samples, because fewer lit samples may be a hot pixel or a star."""
 _PROFILE: IntArray = np.arange(-9, 6)
-"""Positions of the samples that are kept, px from the edge towards the bright side."""
+"""Positions of the stored profile samples, in px from the edge towards the bright side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +170,8 @@ def find_edges(
 def _levels(light: list[FloatArray]) -> Levels:
     """Return the brightness levels of lines; both levels are equal if no pixel is lit.
 
-    The median of the pixels above the noise of the dark pixels excludes the Sun's disc and hot pixels.
+    The bright level is the median of all pixels that exceed the noise of the dark pixels, so that the Sun's
+    disc and hot pixels have no effect.
     """
     samples, steps = [], []
     for lines in light:
@@ -192,7 +194,7 @@ def _levels(light: list[FloatArray]) -> Levels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BinaryChanges:
-    """Changes of the binary lines, whose pixels stand one line after another in a flat array.
+    """Changes of the binary lines, whose pixels are concatenated in a flat array.
 
     Attributes:
         light: brightness of all lines (s,).
@@ -269,7 +271,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
         left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
         bend = np.minimum(left - 2.0 * peak + right, -1e-300)
         place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-        # Noise can be steeper at a small scale than a wide edge: it must not end the search there.
+        # At a small scale, noise can be steeper than a wide edge, which must not end the search.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]

@@ -3,8 +3,8 @@
 The significance of a horizon is an upper bound of the expected number of cones, among all that differ in the
 image, near which chance edges lie as often and as closely. The density of chance edges is that of the edges
 beside the limb. These edges lie on curves: a coast or the rim of a cloud with radius R that touches the limb
-stays within the gate g of it over 2 sqrt(2 g R). Scan lines across one such piece are not independent, so
-that pieces are counted instead of scan lines.
+stays within the gate g of it over 2 sqrt(2 g R). Scan lines across one piece of such a curve are not
+independent, so that pieces are counted instead of scan lines.
 """
 
 from __future__ import annotations
@@ -42,19 +42,22 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Least cosine between a scan line and the normal of the limb: a more oblique line is inaccurate."""
+"""Minimum cosine of the angle between a scan line and the normal of the limb. More oblique lines are
+inaccurate."""
 _LOWEST_SUN = np.radians(1.0)
-"""Least elevation of the Sun at a limb point (rad): with a lower Sun the limb appears higher."""
+"""Minimum elevation of the Sun at a limb point (rad), because the limb appears higher if the Sun is lower."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size (m) below which the steepest point is used: the profile exceeds the samples that are kept."""
+"""Pixel size (m) below which the steepest point of an edge is used, because the profile extends beyond the
+stored samples."""
 _CORRELATED = 10.0
 """Correlation length (px) of the brightness behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
 """Standard deviation of the blur by a square pixel (px)."""
 _LEAST_SPREAD = 0.03
-"""Least error of a position fitted to the profile (px)."""
+"""Minimum error of a limb position that is fitted to a brightness profile (px)."""
 _OTHER_AIR = 500.0
-"""Shift of the limb (m) between bright and dark ground, in air thicker or thinner than assumed."""
+"""Difference (m) of the limb's apparent height between bright and dark ground that an unknown density of the
+air causes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +65,7 @@ class LimbPoints:
     """The edges assigned to the limb.
 
     Attributes:
-        index: numbers of the edges of the image (n,).
+        index: indices of the limb's edges among the edges of the image (n,).
         rays: directions (n, 3).
         sigma: standard deviations normal to the limb (n,), rad.
         pixel: size of a pixel normal to the limb (n,), rad.
@@ -119,7 +122,7 @@ def _placed_by_profile(
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
     rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
-    # Lines closer together than the features of the ground are not independent.
+    # Scan lines that are closer than the size of ground features are not independent.
     correlated = np.sqrt(max(1.0, _CORRELATED / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
     sigma = correlated * np.hypot(spread, least) * limb.inward * limb.pixel
@@ -127,7 +130,7 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Gates (px): the gate with the fewest chance cones counts."""
+"""Trial half widths (px) of the gate. The gate with the smallest expected number of chance cones is used."""
 _ROUND = 0.1
 """Radius of the curves on which chance edges lie, as a fraction of the image size."""
 _BESIDE = 0.05
@@ -174,11 +177,11 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the bound of the number of chance cones that fit as well as a limb.
+    """Return log10 of the bound of the number of chance cones that fit equally well as a limb.
 
     Args:
         limb: the limb in the image.
-        residuals: residuals of its edges (k,), px.
+        residuals: residuals of the limb's edges (k,), px.
         others: distances of all other edges from the limb (m,), px.
         camera: the camera.
         unknowns: number of fitted parameters: 2 for nadir, 3 with the altitude.
@@ -186,7 +189,7 @@ def log10_chance(
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge is added, so that the density is not zero if no edge lies beside the limb.
+    # One edge is added, so that the density of chance edges is positive if no edge lies beside the limb.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
@@ -222,8 +225,8 @@ class Hypothesis:
 
     Attributes:
         fit: the fitted limb.
-        members: which edges of the image lie on it (n,).
-        limb: these edges at their fitted positions.
+        members: which edges of the image lie on the fitted horizon (n,).
+        limb: members at their fitted positions.
         residual: rms distance of the members from the limb, px.
         guess: start of the fit.
         lighting: agreement with the brightness of the image.
@@ -231,8 +234,8 @@ class Hypothesis:
             the image.
         night: fraction of the members at which the Sun is well below the horizon.
         allowance: standard deviation per axis of unmodelled effects, rad.
-        chance: log10 of the expected number of chance cones that fit as well, see `log10_chance`.
-        breadth: median breadth of the members' edges, relative to that of the air.
+        chance: log10 of the expected number of chance cones that fit equally well, see `log10_chance`.
+        breadth: median width of the members' edges, relative to the width expected from the air.
         altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in its standard
             deviations; 0 for a known altitude.
     """

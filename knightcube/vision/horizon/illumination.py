@@ -1,8 +1,8 @@
-"""The brightness that a view of the Earth predicts, compared with an image; a coarse nadir from brightness.
+"""Comparison of images with the brightness that a view of the Earth predicts, and a coarse nadir.
 
-A correct view predicts the whole image: nothing bright in the sky or on the night side, and an edge all along
-the sunlit limb. A view fitted to the terminator does not. The paper leaves open how to distinguish the two
-(Meller 3.3).
+A correct view agrees with the whole image: sky and night side are dark, and the sunlit limb has edges along
+its entire length. A view that is fitted to the terminator does not agree. The paper does not state how to
+distinguish limb and terminator (Meller 3.3).
 
 If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller 4.1).
 `coarse_nadir` then tries directions all over the sphere. For each direction it predicts which samples of all
@@ -109,7 +109,7 @@ _DIRECTIONS = 2000
 _STRAY = 0.03
 """Probability that a sample is bright in the sky or dark on sunlit ground."""
 _WEIGHT = 0.2
-"""Weight of a sample: its error is correlated with that of its neighbours."""
+"""Weight of a sample, which is below 1 because the errors of neighbouring samples are correlated."""
 _WIDEST = math.radians(30.0)
 """Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
@@ -255,9 +255,10 @@ _DAY = DAYLIGHT + math.radians(12.0)
 _STRAY_LIGHT = math.radians(25.0)
 """Angle of a sample from the Sun (rad) within which stray light may cover the whole image."""
 _LEAST = 8
-"""Least number of samples, of 64, that a decision needs."""
+"""Minimum number of samples, out of 64, for a decision."""
 _MOST = 0.6
-"""Share of contradicting samples that no good image has: cloud shadows, seas and lens ghosts cause fewer."""
+"""Fraction of contradicting samples above which an image is false. Cloud shadows, seas and lens ghosts cause
+a smaller fraction."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:

@@ -1,16 +1,17 @@
 """The first guess of one horizon: a cone on which many edges agree, and the orientation about nadir.
 
 All rays u of a sphere's limb make the same angle rho with nadir n: u.g = 1 with g = n / cos rho, linear in g
-(Christian & Robinson 2016, for a sphere). If rho is known, two rays leave two directions for n; if rho is
-unknown, three rays leave one. Every pair of edges (every triple, if the altitude is unknown), thinned evenly
-if there are too many, gives a cone. An edge agrees with a cone if it lies near it and grows brighter towards
-nadir. The edges of the best cone are removed and the search continues, so that the terminator, a coast or a
-band of cloud becomes a candidate of its own. This is sample consensus (Fischler & Bolles 1981) without random
-choice.
+(Christian & Robinson 2016, for a sphere). If rho is known, two rays determine n up to two directions. If rho
+is unknown, three rays determine n and rho. Every pair of edges (every triple, if the altitude is unknown),
+thinned evenly if there are too many, gives a cone. An edge agrees with a cone if it lies near the cone and
+its bright side is towards nadir. The edges of the best cone are removed and the search continues, so that the
+terminator, a coast or a band of clouds gives a separate candidate. This is sample consensus (Fischler &
+Bolles 1981) without random choice.
 
 A horizon does not determine the rotation about nadir, but the flattening depends on the direction of the
-pole and the light on that of the Sun. A rough attitude, the coarse Sun and the magnetic field give that
-rotation. Each known direction also has a known angle from nadir: a nadir that contradicts it is wrong.
+pole and the light on that of the Sun. A rough attitude, the coarse direction of the Sun or the magnetic field
+gives this rotation. Because the angle of each known direction from nadir is known too, a nadir with another
+angle is rejected.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def best_cone(
         first, second = _pairs(len(chosen), tries)
         one, other = chosen[first], chosen[second]
         directions = nadirs_of_pairs(edges.rays[one], edges.rays[other], cosines[0])
-        # A pair that does not agree with its own cone need not be compared with others.
+        # A pair whose edges do not agree with the pair's own cone is dropped.
         sides = edges.brighter[one], edges.brighter[other]
         agrees = [np.einsum("kij,ij->ki", directions, side) > 0.0 for side in sides]
         directions = directions[agrees[0] & agrees[1]]
@@ -140,7 +141,7 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return three lists of indices below `count`, with strides of all sizes from every index."""
     number = np.arange(tries)
     first = number % count
-    # Multiples of the golden section and of the root of two give strides that cover all pairs evenly.
+    # Multiples of the golden ratio and of the square root of two give strides that cover all pairs evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -165,8 +166,8 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 MOST_MISMATCH = 4.0
 """Largest disagreement with a coarse sensor, in standard deviations."""
 _GUESS_SIGMA = math.radians(0.2)
-"""Error (rad) of a nadir by the cone through the edges, before the fit of a limb: 0.07 to 0.3 deg in frames
-of flights."""
+"""Error (rad) of a nadir from the cone through the edges, before the fit of a limb. In frames of flights it
+is 0.07 to 0.3 deg."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,7 +197,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
         known += [(matrix @ axis, axis, sigma) for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0])]
-    # Each direction leaves a ring of nadirs; two rings cross, and a third adds little.
+    # Each known direction restricts nadir to a ring, and the intersection of two rings is nearly unique.
     narrowest = sorted(math.hypot(sigma, _GUESS_SIGMA) for _, _, sigma in known)[:2]
     share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     down = _unit(nadir)
@@ -217,7 +218,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch, share)
 
 
-# Vectors of plain floats: for one vector numpy takes ten times as long.
+# For single vectors, Python floats are ten times as fast as numpy arrays.
 Vector = tuple[float, float, float]
 
 

@@ -20,8 +20,8 @@ within `HorizonSettings.limb_height_sigma`.
 
 Fit of the profile. The profile across an edge is background + a air(h) + b ground(h), where h falls by a
 known number of metres per pixel. The position of unit optical depth is fitted together with the three
-brightnesses. Unlike the steepest place, it is not shifted inwards by bright ground behind the limb or
-outwards by thinning haze.
+brightnesses. In contrast to the steepest point, this position is not shifted inwards by bright ground behind
+the limb or outwards by haze.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class LimbView:
 
 def turn(vector: FloatArray) -> FloatArray:
     """Return the matrix (3, 3) that rotates vectors by |vector| rad about `vector` (3,) (Rodrigues)."""
-    # Plain floats: for one vector numpy takes ten times as long.
+    # For a single vector, Python floats are ten times as fast as numpy arrays.
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 0.0 else 1.0
@@ -190,7 +190,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients[:, LIMB_HEIGHT] = (
         np.einsum("ij,ij->i", rays, by_ray[:, 6:]) - aside / (lengths * sine) + along * by_size
     )
-    # A change of altitude along the radius does not change the direction of the centre.
+    # A change of the altitude does not change the direction of the Earth's centre.
     gradients[:, ALTITUDE] = by_size * size / math.sqrt(view.position @ view.position)
     return np.arccos(cosine) - math.asin(1.0 / size), gradients
 
@@ -199,7 +199,7 @@ _MOST_STEPS = 10
 _LAST_STEP = 3e-5
 """Step (rad) that ends the iteration: an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
-"""Step (rad) below which the gradients change by less than a hundredth."""
+"""Step (rad) below which the gradients change by less than 1 % and are not computed again."""
 _HUBER, _BEYOND = 1.5, 5.0
 """Residuals, in standard deviations, from which Huber's weights fall and beyond which they are zero."""
 _MOST_CORRELATED = 0.8
@@ -382,7 +382,8 @@ UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
 _LOWEST, _HIGHEST, _STEP = -320e3, 240e3, 500.0
 """Tangent heights of the table: first, last and step (m)."""
 _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
-"""Standard deviations of blur in the table (m), spaced evenly in their logarithm, and their number."""
+"""Smallest and largest standard deviation of the blur in the table (m), and number of logarithmically spaced
+values."""
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:

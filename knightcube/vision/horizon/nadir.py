@@ -63,11 +63,11 @@ class HorizonStatus(Enum):
 
     FOUND = "found"
     AMBIGUOUS = "ambiguous"
-    """Several fits are possible, or one may be the terminator: see the candidates."""
+    """Several fits are possible, or the fit may be the terminator; see `candidates`."""
     NO_HORIZON = "no-horizon"
-    """Too few edges, or none that lie on one horizon."""
+    """The image has too few edges, or its edges lie on no common horizon."""
     REFUSED = "refused"
-    """A horizon was fitted but contradicts prior knowledge: see the reason."""
+    """A horizon was fitted but contradicts prior knowledge; see `reason`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ class NadirMeasurement:
         direction: unit vector (3,) towards the Earth's centre (geocentric nadir), camera axes.
         covariance: covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction.
         altitude: height above the ellipsoid, or the mean sphere, m; given, or fitted if unknown.
-        altitude_sigma: its standard deviation, m.
+        altitude_sigma: standard deviation of the altitude, m.
         residual: rms distance of the used points from the fitted horizon, px.
         used: number of points on the horizon.
     """
@@ -118,7 +118,7 @@ class HorizonSolution:
         points: all edges from dark to bright (n, 2), px.
         on_horizon: whether the fit used each edge (n,).
         limb: fitted directions of the used edges (k, 3), unit vectors in camera axes.
-        limb_sigma: their standard deviations normal to the limb (k,), rad.
+        limb_sigma: standard deviations of these directions normal to the limb (k,), rad.
         view: position and attitude of the camera by the best fit, accepted or not; None without a fit.
         pixels_read: number of pixels read.
     """
@@ -140,23 +140,24 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Factor by which the search for cones exceeds the range of an unknown altitude: three edges are
-inaccurate."""
+"""Ratio of the altitude range of the search for cones to the range of an unknown altitude. The search needs a
+wider range, because a cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
-"""Largest excess of the fitted altitude over that range, in standard deviations."""
+"""Largest distance of a fitted altitude from the range of an unknown altitude, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
-"""Largest fraction of bright sky and night, least coverage of the lit limb, largest fraction of points in the
-night."""
+"""Largest fraction of bright samples in sky and night, minimum coverage of the lit limb, and largest fraction
+of the limb's points that lie in the night."""
 _RIVAL = 0.3
-"""Fraction of the best horizon's edges with which a second horizon, or other cameras, make it ambiguous."""
+"""Fraction of the best horizon's edges from which a second horizon, or that of other cameras, makes the
+result ambiguous."""
 _SAME = np.radians(1.0)
-"""Angle (rad) below which two nadirs of one image are the same."""
+"""Angle (rad) below which two nadirs of one image count as the same."""
 _MOST_CHANCE = -6.0
-"""Largest log10 of the number of cones that chance edges would fit as well."""
+"""Largest log10 of the expected number of cones that chance edges fit equally well."""
 _BREADTH = 0.125, 2.0
-"""Least and largest ratio of the breadth of an edge of the limb to that of the air."""
+"""Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
 _GAIN = 1.5
-"""Least ratio of the edges on a horizon with three times the lines: fewer reject the horizon."""
+"""Minimum ratio by which the number of edges on a horizon must increase with three times as many lines."""
 
 
 def find_nadir(
@@ -309,7 +310,7 @@ def _hypotheses(
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
-        # Contradicted guesses are fitted only for the reason of the refusal.
+        # Guesses that contradict prior knowledge are fitted only to state the reason of the refusal.
         fitted = (examine(each, observation, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
@@ -340,7 +341,7 @@ def _is_limb(one: Hypothesis) -> bool:
 
 
 def _flaw(one: Hypothesis) -> str:
-    """Return the reason against a hypothesis; empty without one."""
+    """Return the reason against a hypothesis, or an empty string."""
     light = one.lighting
     if one.guess.orientation.mismatch > MOST_MISMATCH:
         return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"
@@ -372,11 +373,13 @@ def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residua
 _IMPROBABLE = 1e-6
 """Probability below which the nadirs of two cameras differ significantly."""
 _COMMON = 2.0
-"""Largest ratio of a difference's variance to the sum of both: unknown air shifts opposite limbs apart."""
+"""Largest ratio of the variance of the difference of two nadirs to the sum of their variances. It exceeds 1,
+because an unknown height of the air shifts the nadirs of opposite limbs in opposite directions."""
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation of an unknown rotation about nadir (rad)."""
 _OWN_AIR = 400.0
-"""Standard deviation (m) of a limb's height in one image relative to another: light and background differ."""
+"""Standard deviation (m) of the limb's height in one image relative to another image, due to different light
+and background."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -386,7 +389,7 @@ class JointNadir:
     Attributes:
         status, reason: the outcome, and why there is no nadir.
         nadir: the measurement in body axes; None unless the status is FOUND.
-        cameras: numbers of the cameras whose limb was used.
+        cameras: indices of the cameras whose limb was used.
         each: solution of each image, in the axes of its camera.
         limb_height: fitted height of the limb above the ellipsoid, m; NaN without a measurement.
     """

@@ -1,11 +1,12 @@
 """Tests whether stars explain the light of a region, and searches a region after its stars are removed.
 
 Explanation. Both hypotheses are sums of streaks of constant brightness with the camera's point spread: stars
-along the paths that the rotation gives them, and an object from one end straight to the other, either in the
-image or among the stars, whose frame a rotation about the boresight bends. Brightnesses come from
-non-negative least squares; the sum of squares decides. Overlapping, adjacent and successive streaks of two
-stars, and segments of a faint star's streak, are the light of stars. Light that no star path covers, or that
-ends where a star would continue, is not.
+along the paths that the rotation gives them, and an object that moves uniformly from one end to the other, on
+a straight line either in the image or relative to the stars. If the camera rotates about the boresight, these
+two paths differ. Brightnesses come from non-negative least squares; the sum of squares decides. Overlapping,
+adjacent and successive streaks of two stars, and segments of a faint star's streak, are the light of stars.
+Light that is not on the path of any star, or that ends although a star would continue, is not explained by
+stars.
 
 Removal. The streak of a star has one brightness from end to end, which cannot exceed that of its faintest
 segment. The erosion of the region by the path of a star is therefore an upper bound of the light of a star;
@@ -32,15 +33,18 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
-# Number of star paths per path length that are tried along a region, and the longest chain of stars.
+# Number of trial star paths per path length along a region, and largest length of a chain of stars in path
+# lengths.
 _PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
-# Distance (px) of the Gaussians that make up a streak: the ripple is 0.2 % at a point spread of 0.6 px.
+# Spacing (px) of the Gaussians whose sum is a streak.
+# The ripple is 0.2 % for a point spread of 0.6 px.
 _STEP_PX = 1.0
 # Distance from all paths, in sigmas of the point spread, beyond which light is ignored.
 _REACH = 3.0
-# Distance, in sigmas, at which the light of a point is truncated: 6e-7 of it lies beyond.
+# Distance, in standard deviations, at which the light of a point is truncated.
+# A fraction of 6e-7 lies beyond.
 _FARTHEST = 5.0
-# Relative error of the shape of a bright streak: ends, point spread, evenness.
+# Relative error of the modelled shape of a bright streak, from its ends, point spread and uniformity.
 SHAPE_ERROR = 0.1
 
 
@@ -176,9 +180,9 @@ def straight_path(ends: FloatArray) -> FloatArray:
 
 
 def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return points (m, 2), px, of a straight and even motion among the stars between two ends (2, 2).
+    """Return points (m, 2), px, of uniform motion relative to the stars between two ends (2, 2).
 
-    The order of time is the one with the slower motion.
+    Of the two possible orders of the ends in time, the order with the slower motion is used.
     """
     vectors = pinhole.unit_vectors(ends)
     both = [at_mid_exposure(pair, rotation) for pair in (vectors, vectors[::-1])]
@@ -289,11 +293,13 @@ _ROOM = 8
 _MOST_STARS = 12
 # Thresholds of a star and of the remainder, in standard deviations of the smoothed image.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
-# Excess over the stars, in standard deviations, from which a pixel is not used in their fit.
+# Excess over the light of the stars, in standard deviations, above which a pixel is excluded from the fit of
+# the stars.
 _NOT_THEIRS = 4.0
-# Largest step (px) of a fit, the step at which it has converged, and the largest number of steps.
+# Largest step (px) of a fit, step (px) at which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Least length (px) of a line; a shorter remainder is a point.
+# Minimum length (px) of a line.
+# A shorter remainder counts as a point.
 _LEAST_LINE_PX = 4.0
 # Widest gap (px) in a line.
 _WIDEST_GAP_PX = 12
@@ -389,7 +395,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
     least = np.full(seen.shape, np.inf)
     for number, (x, y) in enumerate(np.rint(offsets).astype(int)):
         part = wide[reach + y : reach + y + rows, reach + x : reach + x + columns]
-        # At its very end a streak has half of its brightness.
+        # At the end of a streak, the smoothed brightness is half of the brightness along it.
         np.minimum(least, 2.0 * part if number in (0, len(offsets) - 1) else part, out=least)
     return least
 

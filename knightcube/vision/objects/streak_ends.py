@@ -34,7 +34,7 @@ from knightcube.vision.objects.settings import EndpointSettings
 
 # Margin (px) around a region's box, which covers the window and the derivative kernel.
 _PADDING = 8
-# Ratio of a region's measured length to the minimum length of a streak from which the region is a candidate.
+# Minimum ratio of a region's measured length to the minimum length of a streak, for a candidate.
 _LENGTH_MARGIN = 0.75
 # Fraction of a streak's counts per px of length that lies in its brightest row, for a point spread of 1 px.
 _PEAK_FRACTION = 0.28
@@ -237,12 +237,12 @@ class StructureTensor(NamedTuple):
 
 
 def harris_cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
-    """Return the Harris response of an image (rows, columns), smoothed as the settings say."""
+    """Return the Harris response of an image (rows, columns) after the smoothing of the settings."""
     return harris_response(tensor_of(image, settings), settings.harris_k)
 
 
 def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
-    """Return the structure tensor of an image, smoothed as the settings say."""
+    """Return the structure tensor of an image after the smoothing of the settings."""
     image = smoothed(image, settings.smoothing_sigma)
     return structure_tensor(image, settings.derivative_sigma, settings.window_sigma)
 
@@ -326,8 +326,9 @@ def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntA
 def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> FloatArray:
     """Return the intensity-weighted centre (x, y) px of the (2 half_width + 1)^2 pixels around `pixel`.
 
-    Equation 3.15, whose printed sums lack the coordinate, and 3.16. Negative pixels have no weight. A window
-    that the border cuts is narrowed on both sides, so that it stays centred on `pixel` (x, y).
+    The centre is that of Sease 3.15 and 3.16, with the coordinate as a factor in the sums, which the printed
+    equation lacks. Negative pixels have no weight. A window that the border cuts is narrowed on both sides,
+    so that it stays centred on `pixel` (x, y).
     """
     x, y = int(pixel[0]), int(pixel[1])
     rows, columns = image.shape
