@@ -240,28 +240,30 @@ most another fraction, which the neighbours of a faint star reach."""
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Least brightness of two adjacent hot pixels, and the noise in the limit of the third brightest pixel, in
 standard deviations."""
+_REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
+"""Least brightness of a hot pixel that is replaced, and of one that is excluded, in standard deviations."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
-def repair_hot_pixels(signal: Image, noise: Image, sigmas: float = 10.0) -> int:
+def repair_hot_pixels(signal: Image, noise: Image) -> int:
     """Replace the hot pixels of `signal` (rows, columns) by the median of their neighbours; return how many.
 
-    Only pixels above `sigmas` times their `noise` (rows, columns) are examined.
+    Only pixels well above their `noise` (rows, columns) are examined.
     """
-    row, column = positions(signal > sigmas * noise)
+    row, column = positions(signal > _REPAIR_SIGMAS * noise)
     row, column, around = _hot(signal, row, column, noise[row, column])
     signal[row, column] = np.median(around, axis=0)
     return len(row)
 
 
-def find_hot_pixels(signal: Image, variance: Image, sigmas: float = 8.0) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the hot pixels of `signal` that exceed `sigmas` times their noise.
+def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels of `signal` that stand well above their noise.
 
     `variance` (rows, columns) is the squared noise.
     """
-    row, column = positions(signal > np.float32(sigmas * np.sqrt(variance.min())))
+    row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(variance.min())))
     noise = np.sqrt(variance[row, column])
-    bright = signal[row, column] > sigmas * noise
+    bright = signal[row, column] > _HOT_SIGMAS * noise
     row, column, _ = _hot(signal, row[bright], column[bright], noise[bright])
     return row, column
 
