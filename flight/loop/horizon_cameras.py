@@ -61,7 +61,6 @@ class HorizonCameraTask:
         self._services = services
         self._triggered_ns = 0
         self._waits = False
-        self._begun_ns = 0
         self._frames: dict[int, Frame] = {}
         self._seen_ns = [0] * len(cameras)
         self._sequences = [-1] * len(cameras)
@@ -71,7 +70,6 @@ class HorizonCameraTask:
 
     def begin(self, time_ns: int) -> None:
         """Measure the ages of frames from `time_ns` on, at which the first trigger is due."""
-        self._begun_ns = time_ns
         self._triggered_ns = time_ns - self._settings.fine_period_ns
         self._seen_ns = [time_ns] * len(self._cameras)
 

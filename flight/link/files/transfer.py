@@ -193,7 +193,6 @@ class Sender:
         self._save = save
         self._path = Path(record.path)
         self._wanted = Ranges([(0, record.size)] if fresh else [])
-        self._once = record.size if fresh else 0
         self._sum = FileSum(self._path, record.kind, record.size) if record.checksum is None else None
         self._metadata_due = self._end_due = True
         self._acknowledged = False
