@@ -1,1 +1,1 @@
-"""The sources' other methods, kept to compare with the ones in use."""
+"""Methods of the source publications that are not used in flight, for comparison with the methods in use."""

@@ -19,8 +19,8 @@ and nadir. The paper does not state the ratio of pixels to kilometres. Here it i
 satellite, which is exact to first order in the tilt for level cameras, and for any tilt about an optical
 axis.
 
-Vector Method (3.2.2, equation 6): a point on the horizon moves from Q to P. The shortest rotation from Q to P
-takes the old nadir to the new one. A rotation of the body about P is not observed.
+Vector Method (3.2.2, equation 6): if a point on the horizon moves from Q to P, the shortest rotation from Q
+to P rotates the old nadir to the new nadir. A rotation of the body about P is not observed.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
 
 
 LINES = 3
-"""Default number of scanned lines, that of the paper's example."""
+"""Default number of scanned lines, as in the example of Meller et al."""
 _ON_AXIS = 1e-6
 """Distance (px) between optical axis and centre below which nadir lies on the axis."""
 

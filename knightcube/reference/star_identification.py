@@ -272,7 +272,8 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # The rotation error by the two stars of the base acts on the lever; each star has an error of its own.
+    # A star's error is the sum of its own error and the rotation error of the two base stars times its lever
+    # arm.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -329,7 +330,7 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
 
 
 def _turns_left(corners: FloatArray) -> BoolArray:
-    """Return which triangles (k, 3, 3) turn left, seen from the centre of the sphere."""
+    """Return which triangles (k, 3, 3) have counterclockwise corners, seen from the centre of the sphere."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)
 
@@ -415,9 +416,9 @@ def _triangle_matches(
     """Return the triangles of the table that match the observed ones (t, 3)."""
     # An area grows as the square of the scale, a polar moment as its fourth power.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
-    # float32 rounds the table's values.
+    # The limits are widened by the rounding of the table's values to float32.
     reach = reach + 1e-7 * found.area
-    # The area of a flat triangle is too uncertain to be used.
+    # Flat triangles are excluded, because their areas are too uncertain.
     usable = np.flatnonzero(reach < 0.2 * found.area)
     low, high = found.area[usable] - reach[usable], found.area[usable] + reach[usable]
     place, owner = members(*table.area.ranges(low, high))
@@ -447,7 +448,8 @@ def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
     one, other = np.triu_indices(voters, 1)
     _, low, high = view.angles(one, other, settings.tolerance)
     ballot = _ballot(voters, one, other, low, high, sky)
-    # Several guide stars per observed star, because the true one does not always have the most votes.
+    # Several guide stars are kept for each observed star, because the true guide star does not always have
+    # the most votes.
     star = np.argpartition(-ballot, _KEPT, axis=1)[:, :_KEPT].ravel()
     observed = np.repeat(np.arange(voters), _KEPT)
     agrees = _agreement(view, sky, observed, star, settings.tolerance)
@@ -524,7 +526,7 @@ def _grid_matches(sky: KnownSky, cells: IntArray, centre: int, neighbour: int) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMotion:
-    """Motion of the points of a field.
+    """The motion of the observed points of a field.
 
     Attributes:
         velocity: (n, 3) 1/s, time derivatives of the directions, camera frame.
@@ -625,7 +627,8 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # Two close points give a poor rate with which many points agree: a fit to all must agree too.
+        # Two close points give an inaccurate rate, with which many points agree.
+        # The fit to all points must agree too.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
@@ -650,7 +653,7 @@ def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covaria
     """Return which points (n,) move with `rate` within both errors."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
-    # The largest variance across the line of sight by the error of the rate.
+    # This is the largest variance across the line of sight due to the error of the rate.
     spread = motion.sigma**2 + float(np.linalg.eigvalsh(covariance)[-1]) * (1.0 - direction[:, 2] ** 2)
     spread = spread + float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return np.asarray(np.sum(residual**2, axis=-1) <= _CHI_SQUARE * spread)

@@ -48,7 +48,7 @@ from knightcube.vision.startracker.index.sky_index import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KVector:
-    """Sorted keys and the counts that find them.
+    """Sorted keys, and a table of counts by which ranges of keys are found (k-vector).
 
     Attributes:
         key: (n,) floating, in ascending order.
@@ -241,7 +241,7 @@ def measured_planar_shape(corners: FloatArray, sigma: FloatArray) -> TriangleSha
 
 
 def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a, b, c: between corners 1-2, 2-3 and 1-3 (35b-35d)."""
+    """Return the sides a, b and c between corners 1-2, 2-3 and 1-3 (Michalski 35b-35d)."""
     p, q, r = np.moveaxis(corners, -2, 0)
     a, b, c = (np.linalg.norm(one - other, axis=-1) for one, other in ((p, q), (q, r), (p, r)))
     return a, b, c
@@ -406,7 +406,8 @@ def _triangles(pairs: PairTable, chosen: BoolArray, widest: float) -> IntArray:
 
 GRID_CELLS = 40
 BUFFER = 0.15
-"""Smallest distance of the aligning star, in pattern radii: a closer star aligns the plane badly."""
+"""Minimum distance of the aligning star, in pattern radii, because the direction to a closer star is
+inaccurate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -91,11 +91,11 @@ class SunStatus(Enum):
 
     FOUND = "found"
     PARTIAL = "partial"
-    """Found, but cut off by the edge of the image: see the covariance."""
+    """The Sun is found, but the edge of the image cuts its disc, which increases the covariance."""
     NO_SUN = "no-sun"
-    """Nothing is bright enough."""
+    """No part of the image is bright enough."""
     NOT_THE_SUN = "not-the-sun"
-    """Something is bright enough, but too small, too large or not round: see the reason."""
+    """A patch is bright enough, but too small, too large or not round; see `reason`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +185,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     # Towards its corners a pinhole camera stretches a disc by the squared secant of the angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch
-    # A disc cut by the edge of the image shows at least half its width, or too little of its rim.
+    # A disc that the edge of the image cuts must show at least half its width, or its rim is too short.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
     patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
     read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
@@ -207,7 +207,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons:
             return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
         return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
-    # There is one Sun: the largest of several round patches.
+    # Of several round patches, the largest is taken as the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
@@ -217,14 +217,14 @@ def _bright_patches(
 ) -> tuple[list[tuple[FloatArray, float]], bool]:
     """Return the bright patches on every `stride`th row, the largest first: middle (2,), px, half extent, px.
 
-    Patches narrower than `narrowest` px or wider than `widest` px are excluded. The second value is whether
-    any wide one was.
+    Patches narrower than `narrowest` px or wider than `widest` px are excluded. The second value states
+    whether a patch was excluded because of its width.
     """
     stride = settings.stride
     bright = image[stride // 2 :: stride] >= settings.level
     if not bright.any():
         return [], False
-    # Labelling takes time per pixel: only the box around all bright pixels is labelled.
+    # Only the box around all bright pixels is labelled, because labelling takes time per pixel.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
     labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
@@ -309,7 +309,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # Another tracing does not change a wrong radius into the Sun's.
+        # The tracing is not repeated for a disc of a wrong radius.
         wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if wrong or aside * disc.pixels_per_radian < _NEAR:
             break
@@ -329,7 +329,7 @@ def _trace(
     rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
     counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(_SPOKES, -1)
     inner, outer = counts[:, :-1], counts[:, 1:]
-    # Outside of the image the counts are NaN, for which both comparisons are false.
+    # Outside the image the counts are NaN, so that both comparisons are false.
     falls = (inner >= level) & (outer < level)
     crosses = falls.any(axis=1)
     at = falls.argmax(axis=1)[crosses]
@@ -358,7 +358,7 @@ def sample(strip: Image, first_row: int, points: FloatArray) -> FloatArray:
 
 
 def _flaw(disc: _Disc, settings: SunSettings) -> str:
-    """Return the reason why the disc is not the Sun; empty without one."""
+    """Return the reason why the disc is not the Sun, or an empty string."""
     circle, rim = disc.circle, disc.rim
     used = int(np.count_nonzero(circle.used))
     radius = np.degrees(circle.radius)
@@ -410,7 +410,8 @@ _MOST_CORRELATED = 0.9
 _TUKEY = 4.685
 """Cut-off of the biweight, in scales: 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Share of the best consensus with which a smaller circle is preferred: stray light enlarges the disc."""
+"""Fraction of the best consensus from which a smaller circle is preferred, because stray light enlarges the
+disc."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -461,7 +462,7 @@ def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     square = float(np.mean(left**2))
     if not (solution[2] > 0.0 and 0.0 < square < np.inf):
         return None
-    # Correlated errors average out less: by (1 + r)/(1 - r) for a first-order process.
+    # Correlated errors of a first-order process increase the variance of the mean by (1 + r)/(1 - r).
     correlation = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_CORRELATED)
     shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + correlation) / (1.0 - correlation))
     return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))
@@ -519,7 +520,7 @@ class CameraChoice:
     """A camera and whether it may have the Sun in its field.
 
     Attributes:
-        index: number of the camera.
+        index: index of the camera among all cameras.
         likely: whether the coarse Sun itself is in its field.
         possible: whether the Sun is in its field within three standard deviations.
         angle: angle between its boresight and the coarse Sun, rad.
@@ -532,11 +533,11 @@ class CameraChoice:
 
 
 def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[CameraChoice]:
-    """Return the cameras in the order in which they are to be read for the Sun; none if it is dark.
+    """Return the cameras in the order in which they are read for the Sun; no camera if it is dark.
 
-    Cameras with the coarse Sun in their field come first, then those that may have it, each group in the
-    order of the angle from the boresight. If the coarse Sun is uncertain, all cameras are possible, in their
-    given order.
+    Cameras with the coarse Sun in their field come first, followed by cameras that may have the Sun in their
+    field. Each group is sorted by the angle of the coarse Sun from the boresight. If the coarse Sun is
+    uncertain, all cameras are possible, in their given order.
     """
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
         if sun.status is CoarseSunStatus.DARK:
@@ -563,10 +564,10 @@ class SunOfCameras:
 
     Attributes:
         direction: unit vector (3,); None if neither a camera nor the strings have found the Sun.
-        covariance: covariance (3, 3) of its error, rad^2, zero along the direction.
-        camera: number of the camera that found it; None if the direction is that of the strings.
+        covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
+        camera: index of the camera that found the Sun; None if the direction is that of the solar strings.
         each: solutions of the cameras, in the order in which they were read.
-        reason: why no camera has found it; empty if one has.
+        reason: reason why no camera has found the Sun; empty if a camera has found it.
     """
 
     direction: FloatArray | None
@@ -584,8 +585,8 @@ def sun_of_cameras(
 ) -> SunOfCameras:
     """Return the Sun in body axes from the first camera that finds it, or else from the solar strings.
 
-    A camera that cannot have the Sun in its field, by the strings, is not read. A Sun that contradicts the
-    strings is rejected.
+    A camera is not read if, according to the solar strings, it cannot have the Sun in its field. A Sun that
+    contradicts the strings is rejected.
 
     Args:
         images: images (rows, columns) of one instant, by the numbers of their cameras.
@@ -625,7 +626,7 @@ def sun_of_cameras(
 
 
 def _contradicts(direction: FloatArray, strings: CoarseSun) -> bool:
-    """Return whether a direction is farther from the strings' Sun than their errors explain."""
+    """Return whether a direction differs from the Sun of the solar strings by more than their errors."""
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return False
     if float(direction @ strings.direction) <= 0.0:

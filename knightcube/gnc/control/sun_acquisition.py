@@ -1,4 +1,4 @@
-"""Aligns a body axis with the Sun by solar cells, gyro and magnetometer; no attitude is needed.
+"""Alignment of a body axis with the Sun by solar cells, gyro and magnetometer, without an attitude.
 
 The direction of the Sun s and the field B are measured in body axes, and propagated between measurements by
 the gyro. Only the component across the field of the wanted torque J (w^2 e - 2 z w rate), e the rotation from
@@ -9,8 +9,8 @@ less torque about the Sun is used.
 
 A Sun that is not visible is propagated through an eclipse (`PropagatedSun`); without a known Sun the body is
 only damped. The residual dipole, the largest torque on a light body, is estimated and cancelled
-(`ResidualDipole`). The coils pause while the field is measured. A single field starts nothing: two pauses in
-a row must agree.
+(`ResidualDipole`). The coils pause while the field is measured. The coils act only after the fields of two
+consecutive pauses agree.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class CommandHistory:
         self._times.append(time_ns)
         self._torquings.append(torquing)
         oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
-        if oldest > 64:  # in batches instead of each cycle
+        if oldest > 64:  # commands are deleted in batches, not in each cycle
             del self._times[:oldest], self._torquings[:oldest]
 
     def mark_unknown(self, since_ns: int) -> None:
@@ -89,12 +89,10 @@ class CommandHistory:
 
 
 _RATE_ONLY = {size: chi_square.bound(0.025, size) for size in (1, 3)}
-"""Normalised square of a gyro sample, by its size, above which it corrects the rate only.
-
-Through the model of the coils a sample corrects angle, disturbance and coil gain too. In the tenths of a
-second before a broken coil is detected this is wrong: the angle error reached 40 sigma while the rate was
-right. In a consistent filter one sample in forty exceeds the limit.
-"""
+"""Normalised square of a gyro sample, by its size, above which it corrects the rate only. Through the model
+of the coils a sample corrects angle, disturbance and coil gain too. In the tenths of a second before a broken
+coil is detected this is wrong: the angle error reached 40 sigma while the rate was right. In a consistent
+filter one sample in forty exceeds the limit."""
 
 
 @dataclass(slots=True, eq=False)

@@ -2,13 +2,14 @@
 
     found = detect_objects(image, camera, rate, exposure)
 
-Every star rotates about one axis by one angle. Three indicators show that a streak belongs to something else:
-its chord misses the common centre of rotation, it subtends another angle there, or it leaves a residual in
-OLAE (Sease 4.11-4.15, corrected). If the axis is nearly normal to the boresight, the centre recedes to
-infinity, and slope and length of the chord replace centre and angle. The projection of a pinhole changes
-slopes and lengths across a wide field by far more than their errors. Each indicator is therefore compared
-with a star at the same position, in units of the expected error of an endpoint. The strict rule of 2.5 sigma
-lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an object.
+In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak
+belongs to something else: its chord misses the common centre of rotation, it subtends another angle there, or
+it leaves a residual in OLAE (Sease 4.11-4.15, corrected). If the axis is nearly normal to the boresight, the
+centre recedes to infinity, and slope and length of the chord replace centre and angle. The projection of a
+pinhole changes slopes and lengths across a wide field by far more than their errors. Each indicator is
+therefore compared with a star at the same position, in units of the expected error of an endpoint. The strict
+rule of 2.5 sigma lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an
+object.
 
 A deviating streak is not yet an object: two stars whose streaks overlap, or a segment of a faint star's
 streak, deviate as well (Table 4.4: "overlapping streak"). `Judge` therefore tests whether stars explain the
@@ -165,7 +166,7 @@ def evaluate(
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
-    # Both differences from a star, in px across and along the streak at one end.
+    # The differences from a star are in px across and along the streak at one end.
     if degenerate:
         across = np.sin(slopes(endpoints) - slopes(expected)) * length
         along = length - lengths(expected)
@@ -177,8 +178,8 @@ def evaluate(
     deviations = np.stack([across / error, along / error, residual], axis=-1)
     fired = np.zeros((0, 3), dtype=np.bool_)
     if len(deviations):
-        # The median absolute deviation, because an object widens the standard deviation that is to find it:
-        # of ten streaks none could exceed 2.85 of it.
+        # The median absolute deviation is used, because an object increases the standard deviation.
+        # Of ten streaks, none can exceed 2.85 standard deviations.
         spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
         fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
     return Indicators(endpoints, deviations, fired, centre, degenerate)
@@ -214,18 +215,19 @@ def short_regions(
     for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
         row, column = positions(short.labels[top:bottom, left:right] == label)
         weight = segmented.signal[row + top, column + left].astype(float)
-        # Above half of the brightest pixel: the streak of a faint star under a point must not lengthen it.
+        # Only pixels above half of the maximum count, so that the streak of a faint star does not lengthen a
+        # point.
         bright = weight >= 0.5 * weight.max()
         points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
         weight = weight[bright] / weight[bright].sum()
         centre = weight @ points
         offset = points - centre
-        # Below the point spread the moments measure noise instead of length.
+        # If the region is smaller than the point spread, the moments are dominated by noise.
         lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX))
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
-    # Near the axis stars are points too.
+    # Near the axis of rotation, the images of stars are points too.
     streaked: BoolArray = np.linalg.norm(expected[:, 1] - expected[:, 0], axis=-1) >= settings.least_length
     return ends[streaked], sigma[streaked], short.label[streaked]
 
@@ -322,7 +324,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # A line cannot explain more light than the stars leave above the noise.
+            # A line cannot improve chi-square by more than its excess over the number of pixels.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -397,7 +399,8 @@ class Judge:
         """Return whether an object explains enough, most of the light that stars leave, and fits."""
         enough = light.chi_square - found.chi_square >= improvement
         most = found.misfit <= 0.5 * found.misfit_of_stars
-        # The position of a saturated point is known to a tenth of a pixel, its wings not to their noise.
+        # The position error of a saturated point is a tenth of a pixel, so that its wings do not fit within
+        # their noise.
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
         return enough and most and fits
 

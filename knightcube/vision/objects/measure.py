@@ -3,7 +3,7 @@
 If the stars are streaks, `detect` finds objects by indicators and pixels. If the stars are points, an object
 is a point or a short streak too. Every area of light that stands well above the noise and is not at the
 position of a catalogue star may be an object, and so may light beside a star that the star does not explain.
-One image cannot show which of them moves; tracks over several images do.
+One image does not show which of these candidates moves; tracks over several images do.
 
 All pixels of an object are fitted together with the known stars nearby. An object is a short trail of
 constant brightness with the camera's point spread. Gauss-Newton fits position, extent and brightness of the
@@ -156,11 +156,14 @@ def _fit_object(
 
 
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
-"""Largest brightness of a star as a multiple of that by the catalogue: the excess is not the star's."""
+"""Largest ratio of a star's brightness to its catalogue brightness. Light above this ratio is not attributed
+to the star."""
 _LEAST_SHARE = 0.15
-"""Least brightness of an object relative to the stars beside it: star images are known to about a tenth."""
+"""Minimum brightness of an object relative to the stars beside it, because the model of star images has
+errors of about a tenth."""
 _APART = 1.0
-"""Least distance (px) from the nearest star: a closer object cannot be distinguished from a close pair."""
+"""Minimum distance (px) of an object from the nearest star. A closer object cannot be distinguished from a
+close pair of stars."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
 """Ratio of the noise of a pixel to the median step between neighbouring pixels."""
 _MISFIT = 3.0
@@ -224,7 +227,7 @@ class FramePatches:
 
         Args:
             point: middle of the merged light (2,), px.
-            length: its length, px.
+            length: length of the merged light, px.
             significance: least light of the object, in standard deviations.
         """
         patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
@@ -372,7 +375,7 @@ def _among_streaks(
 def _among_points(
     seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
 ) -> list[tuple[FittedObject, float]]:
-    """Return light at no star, and excess light beside a star, each with the magnitude of one count."""
+    """Return objects apart from stars and in excess light beside stars, with the magnitude of one count."""
     areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
     ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
     strong = np.flatnonzero(ratio >= settings.significance)
@@ -409,7 +412,7 @@ def _among_points(
 
 
 def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an area that no fit explains, at its centre of light."""
+    """Return an area that no fit explains as an object at the area's centre of light."""
     sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
     error = np.hypot(settings.centre_sigma, sigma)
     return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)

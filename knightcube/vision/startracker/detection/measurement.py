@@ -55,7 +55,7 @@ _MANY = 8
 _LEAST_LONE = 3
 # Minimum height of a hot pixel, in units of the noise of a pixel.
 _LEAST_HOT = 10.0
-# Distance (px) of two windows of the first look that do not overlap.
+# Minimum distance (px) between two windows of the first look that do not overlap.
 _APART = 2 * _HALF_OF_FIRST + 1
 
 
@@ -101,7 +101,8 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths are those of the first noise model, which tolerates other shapes.
+    # The errors of the widths follow from the first noise model, which includes deviations from a Gaussian
+    # shape.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
