@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from flight.app.cli import main
 from flight.link.commands import LoadParameters, unpack
-from flight.link.telemetry.definitions import COMMAND, PARAMETERS
+from flight.link.telemetry.definitions import COMMAND, PARAMETER_KEYS, PARAMETERS, crc_of
 from flight.link.telemetry.log import Recorder
 from flight.link.telemetry.packets import Packer
 from flight.loop.commanding import OnboardParameters
@@ -120,3 +120,33 @@ def test_a_mistake_is_named_with_what_would_be_right(
     assert main(["parameters", "--to", str(tmp_path / "s"), word]) == 2
     assert complaint in capsys.readouterr().err
     assert not flight.modes
+
+
+def test_the_table_is_printed_with_units_bounds_and_earlier_values(
+    flight: Answering, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["parameters", "--to", str(tmp_path / "s"), "modes.tumble_rate=0.25"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    by_key = {line.split()[0]: line.split()[1:] for line in lines}
+    before = demo_config(4.0).modes
+    assert by_key["modes.tumble_rate"] == [
+        "0.25",
+        "rad/s",
+        "0.001",
+        "to",
+        "10",
+        "was",
+        f"{before.tumble_rate:g}",
+    ]
+    assert by_key["modes.arrived_for"] == [f"{before.arrived_for:g}", "s", "0.1", "to", "600"]
+    assert len(lines) == len(PARAMETER_KEYS) + 1
+    crc = crc_of([*flight.task._values.values()])
+    assert lines[-1] == (
+        f"table {crc:08x}, from the loaded, 1 loads so far; not kept: this flight has no state folder"
+    )
+
+
+@pytest.mark.parametrize("timeout", ["0", "-1", "inf", "nan"])
+def test_a_timeout_must_be_positive(tmp_path: Path, capsys: pytest.CaptureFixture[str], timeout: str) -> None:
+    assert main(["parameters", "--to", str(tmp_path / "s"), "--timeout", timeout]) == 2
+    assert "must be a positive number of seconds" in capsys.readouterr().err
