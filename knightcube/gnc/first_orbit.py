@@ -204,7 +204,8 @@ def _within(
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the interval in which chi-square is within `_DEGREES_95` of its minimum.
 
-    The first pair are the outermost scanned points inside, the second the interpolated ends.
+    The first pair are the outermost scanned points inside the interval, the second pair its interpolated
+    ends.
     """
     excess = chi_square - chi_square.min() - _DEGREES_95
     first, last = (int(position) for position in np.flatnonzero(excess < 0.0)[[0, -1]])

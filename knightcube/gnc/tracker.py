@@ -39,7 +39,7 @@ class FrameSightings:
     """The n detected objects of a frame at one instant, false detections included.
 
     Attributes:
-        time_ns: of mid-exposure.
+        time_ns: time of mid-exposure.
         directions: (n, 3) unit vectors, ICRS, corrected for stellar aberration.
         covariance: (n, 3, 3) rad^2 of the positions in the image, ICRS axes, without that of the attitude.
         magnitudes: (n,) calibrated by the frame's stars; NaN if unknown.
@@ -67,7 +67,8 @@ class MotionModel:
             this density the errors of position and rate agree with their covariance in passes of 0.05 to 0.6
             deg/s at up to 5,000 km.
         residual_wander: 1/s^3, the same density if the gravity gradient is known, from the same passes.
-        bend: fraction of rate^2 by which the closing rate changes other than on a straight line.
+        bend: change of the closing rate per time that a straight line does not explain, as a fraction of
+            rate^2.
     """
 
     rate: float = 0.01
@@ -82,7 +83,7 @@ class LineOfSightState:
     """A line of sight and its motion at one time.
 
     Attributes:
-        time_ns: of the state.
+        time_ns: time of the state.
         direction: (3,) unit vector, ICRS.
         velocity: (3,) 1/s, z: its component across the line is the angular rate, that along it the closing
             rate.
@@ -224,8 +225,8 @@ class TrackSettings:
 
     Attributes:
         motion: the model of the motion.
-        needed: sightings needed to confirm a track,
-        within: in this many frames.
+        needed: number of sightings, within `within` frames, that confirm a track.
+        within: number of frames in which `needed` sightings confirm a track.
         missed: probability that the gate rejects the object's own sighting.
         moving: standard deviations of the rate by which a confirmed track must differ from the stars.
         minimum_rate: rad/s, below which an object cannot be distinguished from an uncatalogued star.
@@ -261,8 +262,8 @@ class Track:
         history: one bit per frame, the newest lowest; set for a sighting.
         measured: (3,) direction of the sighting in the newest frame, NaN without one.
         measured_sigma: rad along each axis of that direction, including the attitude's share.
-        chi_square: of the sightings relative to their predictions, two degrees of freedom each after the
-            first.
+        chi_square: chi-square of the sightings relative to their predictions, with two degrees of freedom per
+            sighting after the first.
     """
 
     number: int

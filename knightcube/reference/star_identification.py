@@ -272,8 +272,7 @@ def _support(
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # A star's error is the sum of its own error and the rotation error of the two base stars times its lever
-    # arm.
+    # A star's error consists of its own error, and of the base's rotation error times the lever arm.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -448,8 +447,8 @@ def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
     one, other = np.triu_indices(voters, 1)
     _, low, high = view.angles(one, other, settings.tolerance)
     ballot = _ballot(voters, one, other, low, high, sky)
-    # Several guide stars are kept for each observed star, because the true guide star does not always have
-    # the most votes.
+    # Several guide stars are kept per observed star, because the true one does not always have the most
+    # votes.
     star = np.argpartition(-ballot, _KEPT, axis=1)[:, :_KEPT].ravel()
     observed = np.repeat(np.arange(voters), _KEPT)
     agrees = _agreement(view, sky, observed, star, settings.tolerance)
@@ -628,7 +627,6 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         if agrees.sum() <= shares.sum():
             continue
         # Two close points give an inaccurate rate, with which many points agree.
-        # The fit to all points must agree too.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():

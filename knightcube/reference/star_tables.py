@@ -195,7 +195,7 @@ def angles(one: FloatArray, other: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleShape:
-    """Properties of t triangles.
+    """Shape parameters of t triangles, with standard deviations.
 
     Attributes:
         area: (t,) sr.

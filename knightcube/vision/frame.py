@@ -211,8 +211,8 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
     xx = np.bincount(owner, light * dx * dx, count) / whole
     yy = np.bincount(owner, light * dy * dy, count) / whole
     xy = np.bincount(owner, light * dx * dy, count) / whole
-    # The point spread increases both principal moments by the same amount, so their difference is free of it;
-    # that of a line of length L is L^2/12.
+    # The point spread increases both principal moments by the same amount.
+    # The difference of the moments is therefore that of a line of length L, L^2/12.
     spread = np.hypot(xx - yy, 2.0 * xy)
     return Moments(
         flux,

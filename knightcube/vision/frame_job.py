@@ -51,8 +51,8 @@ _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 _SCALE_TOLERANCE = 0.01
 # Motion (px) over the exposure below which a star is a point.
 _POINT_PX = 1.0
-# Predicted length (px) of streaks below which they are measured like points if the frame gives no motion: in
-# a crowded sky, regions merge and look longer than they are.
+# Predicted streak length (px) below which stars are measured as points if the frame gives no motion.
+# In a crowded sky, merged regions look like streaks.
 _SHORT_PX = 4.0
 # Uncertainty (px) of a trail up to which it is part of the model of a star's light.
 _KNOWN_PX = 0.3
@@ -74,7 +74,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Another estimator of streaks, to compare with; it can be pickled."""
+    """Alternative estimator of streaks, for comparison; it can be pickled."""
 
     def motion(
         self,

@@ -314,8 +314,7 @@ class FieldAndStrings:
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # For opposite directions the shortest rotation is not unique, so that a half turn about any
-            # normal axis is applied first.
+            # For opposite directions, a half turn about any normal axis is applied first.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))

@@ -1,4 +1,4 @@
-"""The star tracker as one class: an image of the sky in, an attitude or the reason for none out.
+"""The star tracker as one class, which returns the attitude from an image, or the reason for a failure.
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
@@ -86,7 +86,7 @@ class StarSolution:
             predicted rate.
         sky_map: conversion between pixels and ICRS directions; None unless solved.
         frame: all results of the star tracker, which include the points that are not catalogue stars.
-        index: the sky index at the epoch of the image; `frame.star` counts its stars.
+        index: the sky index at the epoch of the image; The star numbers in `frame.star` refer to it.
     """
 
     status: str

@@ -155,8 +155,7 @@ def aligned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1.0:  # more than 120 deg: the prediction is not corrected
         return fields
-    # The rotation is the product of two half turns, about the middle of both directions and about the final
-    # one.
+    # The rotation is the product of two half turns, about the bisector and about the final direction.
     halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
     back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
     return np.asarray(fields @ (back @ halves).T)

@@ -242,7 +242,7 @@ class PathConditions:
 
     @cached_property
     def around(self) -> FloatArray:
-        """Field, position, air and light as rows (n + 1, 4, 3)."""
+        """Field, position, and pressures of air and sunlight, as rows (n + 1, 4, 3)."""
         around = np.empty((len(self.field), 4, 3))
         around[:, 0], around[:, 1] = self.field, self.position
         around[:, 2], around[:, 3] = self.pressures.air, self.pressures.light
@@ -360,8 +360,8 @@ def best_path(
 ) -> tuple[PlannedMotion, MotionGains]:
     """Return the path from the start of `initial` (n + 1,) and its gains; `initial` leads into the law.
 
-    `initial` need not be feasible with coils. Takes 0.3 ms per instant and sweep. Raises PlanningError if the
-    body rotates too far in a step to be propagated.
+    The motion `initial` need not be feasible with coils. Takes 0.3 ms per instant and sweep. Raises
+    PlanningError if the body rotates too far in a step to be propagated.
     """
     rest = PlannedMotion(initial.quaternion, initial.rate, np.zeros((len(initial.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))

@@ -26,15 +26,11 @@ from knightcube.gnc.estimation.replay import Checkpoint, PropagationModel
 
 _DEPARTURES = {1: 5.5, 4: 5.5, 16: 7.5}
 """Largest mean departure, in its standard deviations, by the number of consecutive samples that are averaged.
-
 Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
-more samples the errors of the model add up.
-"""
+more samples the errors of the model add up."""
 _BEFORE_NS = 500_000_000
-"""Time (ns) before the first sample of a departure from which the currents are unknown.
-
-The effects of a weak fault on the other states before its detection are undone.
-"""
+"""Time (ns) before the first sample of a departure from which the currents are unknown. The effects of a weak
+fault on the other states before its detection are undone."""
 _MAXIMUM_CHANGE = 3.0
 """Largest explained departure, as a multiple of the largest change of the rate by the coils: a reversed coil
 departs by two, and the age of a sample is uncertain."""
@@ -46,8 +42,8 @@ _PROOF = 1.0
 _SHARE_SIGMA = 0.2
 """Largest standard deviation of the fitted share that proves something."""
 _WHITE = 0.5
-"""Least ratio of half the mean square of successive differences of the residuals to their mean square: one
-for white noise (von Neumann 1941), near zero for a drift."""
+"""Minimum ratio of half the mean squared successive difference of the residuals to their mean square. The
+ratio is one for white noise (von Neumann 1941) and near zero for a drift."""
 _SCALE_OVER = 64.0
 """Number of samples over which the scale of the departures is averaged."""
 _SHARE_ERROR = 0.15

@@ -276,8 +276,7 @@ class FieldRate:
         self._rate, self._field, self._change = _floats(rate), _floats(last), _NONE
         along = np.outer(last, last) / square
         across = 2.0 * (settings.field_sigma / span) ** 2 / square + settings.torque_walk**2 * span
-        # Between the samples, the rate across the field changes, because it rotates about the field in body
-        # axes.
+        # Between the samples, the rate across the field rotates about the field in body axes.
         across += (float(rate @ rate) * span) ** 2
         self._covariance[RATE, RATE] = (
             across * np.eye(3) + (settings.rate_start**2 + float(rate @ rate)) * along
@@ -314,8 +313,7 @@ class FieldRate:
         transition = _EYE + flow + 0.5 * (flow @ flow)
         covariance = transition @ self._covariance @ transition.T
         settings = self._settings
-        # The error of the gyroscopic torque rotates with the body and keeps its sign while the body rotates
-        # by a radian.
+        # The error of the gyroscopic torque keeps its sign while the body rotates by a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
         gyroscopic = self._unexplained * self._differences

@@ -322,7 +322,7 @@ class FreeFilter:
         )
 
     def recall(self, then: FreeMemory) -> None:
-        """Return to an earlier estimate."""
+        """Restore an earlier estimate from its copy `then`."""
         self.changes += 1
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
@@ -468,8 +468,7 @@ class FreeFilter:
         settings, motion, square = self._settings, self.motion, float(dipole @ dipole)
         coils = LASTING * (settings.coil_error**2 * square / 3.0 + doubt**2)
         coils += settings.coil_noise**2 if square else 0.0
-        # The error of the gyroscopic torque rotates with the body and keeps its sign while the body rotates
-        # by two radians.
+        # The error of the gyroscopic torque keeps its sign while the body rotates by two radians.
         speed = math.sqrt(float(self.rate @ self.rate))
         gyroscopic = speed**2 * settings.inertia_error * motion.largest_difference
         lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed

@@ -188,7 +188,7 @@ class Replay:
         return not self._pending
 
     def add(self, measurement: Measurement) -> None:
-        """Append a measurement, neither older than the others nor a mean over an exposure."""
+        """Append a measurement that is not older than the others and is not a mean over an exposure."""
         self._pending.append(measurement)
 
     def advance(self, maximum: int | None = None) -> None:

@@ -251,9 +251,10 @@ def propagate(
 
 
 def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
-    """Return the rows (6, 19) of attitude and rate of I + F dt + (F dt)^2 / 2; the other rows are those of I.
+    """Return the rows (6, 19) of attitude and rate of I + F dt + (F dt)^2 / 2.
 
-    F is the dynamics of the error: rotation' = -w x rotation + rate error, and so on.
+    The other rows equal the rows of I. F is the dynamics of the error: rotation' = -w x rotation + rate
+    error, and so on.
     """
     x, y, z = rate
     flow = _FLOW.copy()

@@ -191,8 +191,9 @@ class Orientation:
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
     """Return the orientation about `nadir` (3,), camera axes, which is `inertial_nadir` (3,)."""
     base = shortest_turn(inertial_nadir, nadir)
-    # Pairs of directions, camera and inertial, with their standard deviations. Of a rough attitude, nadir
-    # itself tests the tilt, and a direction normal to it gives the rotation.
+    # Each known direction is a pair of camera and inertial direction with a standard deviation.
+    # A rough attitude is used as two directions: nadir tests the tilt, and a normal direction gives the
+    # rotation.
     known = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma

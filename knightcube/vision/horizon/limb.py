@@ -172,8 +172,8 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     lengths = np.sqrt(np.einsum("ij,ij->i", stretched, stretched))
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
-    # The derivative by the stretched ray is mapped back through the stretching into camera axes. The columns
-    # y, z, x and z, x, y, which a cross product needs, are computed at once.
+    # The derivative by the stretched ray is transformed into camera axes.
+    # The permuted columns for a cross product are computed at the same time.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(

@@ -77,7 +77,7 @@ class NadirMeasurement:
     Attributes:
         direction: unit vector (3,) towards the Earth's centre (geocentric nadir), camera axes.
         covariance: covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction.
-        altitude: height above the ellipsoid, or the mean sphere, m; given, or fitted if unknown.
+        altitude: height above the ellipsoid, or above the mean sphere, m. It is fitted if it is unknown.
         altitude_sigma: standard deviation of the altitude, m.
         residual: rms distance of the used points from the fitted horizon, px.
         used: number of points on the horizon.

@@ -215,8 +215,7 @@ def short_regions(
     for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
         row, column = positions(short.labels[top:bottom, left:right] == label)
         weight = segmented.signal[row + top, column + left].astype(float)
-        # Only pixels above half of the maximum count, so that the streak of a faint star does not lengthen a
-        # point.
+        # Only pixels above half of the maximum are used, so that a faint streak does not lengthen a point.
         bright = weight >= 0.5 * weight.max()
         points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
         weight = weight[bright] / weight[bright].sum()
@@ -399,8 +398,7 @@ class Judge:
         """Return whether an object explains enough, most of the light that stars leave, and fits."""
         enough = light.chi_square - found.chi_square >= improvement
         most = found.misfit <= 0.5 * found.misfit_of_stars
-        # The position error of a saturated point is a tenth of a pixel, so that its wings do not fit within
-        # their noise.
+        # A saturated point has a position error of 0.1 px, so that its wings do not fit within their noise.
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
         return enough and most and fits
 

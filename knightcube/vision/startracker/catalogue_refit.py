@@ -43,7 +43,7 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Distance, in reaches of the fit, within which a streak overlaps the pixels of a bright one.
+# Distance, relative to the fit's half width, below which a streak overlaps the pixels of a bright streak.
 _NEAR = 1.4
 # Distance (px) below which two stars are not fitted separately.
 _TWIN = 2.0
@@ -59,8 +59,7 @@ _AT_ONCE = 25
 _INSTANTS = 9
 # Ratio of the number of pixels of the second fit to that of the first, because faint stars are fitted too.
 _ROOM = 1.7
-# Chi-square with 3 degrees of freedom, exceeded by chance once in 100,000: larger differences are different
-# motions.
+# Chi-square of the difference of two fits of one motion, exceeded by chance once in 100,000 cases.
 _ONE_MOTION = 25.9
 # Increase (px) of the uncertainty of the previous attitude.
 _PRIOR_PX = 1.0

@@ -349,8 +349,8 @@ class IdentificationSettings:
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
-# Factor of tolerance and of verified candidates for triangles spread over many stars: some of these may be
-# missed, because there are many, and the true ones have many votes.
+# Factor on tolerance and on verified candidates for triangles that are spread over many stars.
+# Both may be smaller, because many true triangles vote for the same stars.
 _OF_SPREAD = 0.6
 # Factor by which a match of the mirrored field, or against a hint, must be less likely by chance.
 _RARE = 10.0

@@ -48,7 +48,7 @@ class Chance:
 
     Attributes:
         observed: number of observed stars.
-        spread: sigma^2 of a star over the area of the field.
+        spread: variance of a star's direction along one axis, divided by the area of the field.
         fields: number of such fields in the searched part of the sky.
         scales: ln of the highest over the lowest scale.
         choices: number of gates from which the matching chooses.
@@ -161,8 +161,7 @@ _FEW_MISSED = 0.8
 # A larger share indicates a wrong fit of the lens, because a foreground hides stars but adds no stars near
 # them.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess of the chance probability over its limit, in powers of ten, above which a candidate is rejected
-# without refinement.
+# Excess of log10 of the chance probability above which a candidate is rejected without refinement.
 _HOPELESS = 7.0
 
 
@@ -256,8 +255,8 @@ def expected_stars(
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # Search twice as many of the brightest stars as an even sky would need for `count` stars in the field:
-    # the density varies between the Milky Way and the galactic poles.
+    # For `count` stars in the field, twice the mean number of the brightest stars is searched.
+    # The density of stars varies between the Milky Way and the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
     x, y, z = matrix @ sky.stars.direction[near].T
@@ -417,8 +416,7 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # Because of errors of roll and scale, the shifts of stars at the image edge differ from the shift at the
-    # centre.
+    # Errors of roll and scale change the shifts of stars at the image edge.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])

@@ -266,8 +266,7 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # A wrong rotation angle leaves much of a star's light unexplained at one end, or models light that is
-    # absent.
+    # A wrong rotation angle leaves light unexplained at one end, or models absent light.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
     good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels

@@ -113,8 +113,7 @@ def sampled(
     multiples of `unit`, for fast and exact summation. If the circles are complete, the columns include `room`
     samples on either side of the detector.
     """
-    # A direction divided by the sine of its polar angle is the sum of a term of the azimuth and a term of
-    # the circle.
+    # Direction over sine of the polar angle is the sum of a term of the azimuth and a term of the circle.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
@@ -326,7 +325,8 @@ def standing_peaks(
 ) -> tuple[FloatArray, FloatArray]:
     """Return fractional rows and columns of the peaks that no stronger peak explains, strongest first.
 
-    Only the flat indices `place` (p,) are searched. `span` is that of `RunningSums`.
+    Only the flat indices `place` (p,) are searched. `span` (r, 2) is the range of existing samples, as in
+    `RunningSums`.
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
@@ -335,8 +335,7 @@ def standing_peaks(
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # A crowded frame has hundreds of thousands of pairs of peaks, and most pairs are too far apart to
-    # overlap.
+    # A crowded frame has hundreds of thousands of pairs of peaks, most of them too far apart to overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
@@ -362,8 +361,7 @@ def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntA
     """Return rows and columns of the flat indices `place` (p,) that are local maxima, highest first."""
     flat, columns = values.reshape(-1), values.shape[1]
     value = flat[place]
-    # The flat index after the last column is on the next circle, close to the last column if the circles
-    # are complete.
+    # The index after the last column is on the next circle, a neighbour if the circles are complete.
     for down, beside in _NEIGHBOURS:
         summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
         place, value = place[summit], value[summit]
@@ -454,8 +452,7 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
     """Return the 3 x 3 sums (rows * columns,) of the frame without `modelled` light and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Residuals of bright stars are attenuated, because they are mostly photon noise of the stars
-    # themselves.
+    # Residuals of bright stars, which are mostly the stars' own photon noise, are attenuated.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
@@ -579,8 +576,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * _ACROSS
     )
-    # The ridge regularises stars that nearly coincide; the right-hand side compensates its effect on other
-    # stars.
+    # The ridge regularises nearly coincident stars; the right-hand side compensates it for other stars.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(

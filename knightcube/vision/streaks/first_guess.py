@@ -383,8 +383,7 @@ def motion_by_course(
     """Return a guess with a known motion, its stars being the brightest regions of similar length."""
     time = np.linspace(-0.5, 0.5, _INSTANTS)
     progress = course.progress(time)
-    # The second moment of a region is the variance of the star's positions, at times uniform over the
-    # exposure.
+    # The second moment of a region is the variance of the star's positions over the exposure.
     wide = np.sqrt(12.0 * np.var(progress))
     length = path_lengths(pinhole, course, regions.centre) * wide
     likely = np.abs(regions.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length

@@ -256,8 +256,7 @@ def sensitivities_and_velocity(
     if isinstance(pinhole, DistortedPinhole):
         jacobian = pinhole.jacobian(_pixels(pinhole, there))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
-        # The star's pixel at mid-exposure is a distorted position, so that its derivative needs the inverse
-        # Jacobian.
+        # The star's pixel at mid-exposure is distorted, so that its derivative needs the inverse Jacobian.
         change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(pinhole.undistorted(stars)))
     return change, pace
 

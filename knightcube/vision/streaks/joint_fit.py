@@ -138,7 +138,7 @@ LAST = IterationLimits(7, clipped=True, tolerance=0.003, settled=SETTLED, conjug
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """A frame with everything known about its exposure.
+    """A frame with all data and settings for its fit.
 
     Attributes:
         frame: the frame.

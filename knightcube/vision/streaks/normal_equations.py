@@ -648,8 +648,7 @@ def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> Flo
     alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
-        # The right-hand side is scaled for a solution of order one, so that one tolerance suits all
-        # components.
+        # The right-hand side is scaled for a solution of order one, so that one tolerance suits all.
         unit = np.zeros(SHARED)
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
@@ -825,8 +824,7 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # The uncertainty of the median is included, so that a star with a smaller error than all others is
-        # kept.
+        # The uncertainty of the median keeps a star with a smaller error than all others.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree

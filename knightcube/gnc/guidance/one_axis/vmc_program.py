@@ -361,8 +361,8 @@ class PathProgram:
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # NLopt reports a problem that starts at its optimum as limited by rounding. The whitened gradient
-        # distinguishes that from a failure: half its square is the energy still to be saved.
+        # NLopt reports a problem that starts at its optimum as limited by rounding, which is not a failure.
+        # In this case half the square of the whitened gradient, the remaining energy saving, is small.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 

@@ -231,7 +231,7 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that aligns `axis` (3,) with a `passing` object and does not rotate about `axis`.
 
-    Its roll is that of the attitude (4,) after the shortest rotation to `direction`.
+    The roll is that of the attitude (4,) after the shortest rotation of `axis` to `direction`.
     """
     shown = attitude_matrix(quaternion)
     normal = np.cross(direction, velocity)
@@ -263,8 +263,8 @@ def approach(
         share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
-        # The derivative of the rotation vector `left` for the relative rate: the inverse of the left Jacobian
-        # of the rotation group, for quaternions that rotate inertial into body axes.
+        # The inverse of the left Jacobian of the rotation group relates the relative rate to the derivative
+        # of `left`.
         angle, relative = float(np.linalg.norm(left)), rate - shown
         second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
         crossed = np.cross(left, relative)

@@ -305,7 +305,7 @@ class SlewOrder:
 
     @property
     def held(self) -> PointingTarget:
-        """The start target with its roll."""
+        """The start target of the slew, with a given roll."""
         is_free = self.start.goal is not Goal.INERTIAL and self.start.roll is None
         return replace(self.start, roll=0.0) if is_free else self.start
 
@@ -451,7 +451,8 @@ def plan_slew(
         duration: duration of the slew, s.
         longest: s to which the slew may be stretched if no slew over `duration` is found; None for three
             times `duration`.
-        window: s within which the slew begins, at the time of least energy.
+        window: s, duration of the interval in which the slew may begin; the start time of minimum energy is
+            chosen.
         time_cost: W; the duration is optimised too, for minimum energy plus `time_cost` times the duration;
             infinity gives the shortest slew. None keeps the duration.
         pointing_axis: (3,) unit vector, body axis that points to the targets.

@@ -388,7 +388,7 @@ _HALVINGS = 7
 _CORRECTED, _CORRECTIONS = 4, 2
 """Number of step halvings with a second-order correction, and number of corrections per halving."""
 _HEAVIER = 1.2
-"""Weight of the equations in the merit, as a multiple of the largest multiplier."""
+"""Weight of the equations in the merit function, relative to the largest multiplier."""
 _FAR = 0.03
 """Sum of the constraint violations beyond which the curvature of the equations is omitted."""
 _DAMPED = 3e-3
@@ -534,8 +534,8 @@ class SlewProgram:
             change = size * step.change
             for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
                 if correction:
-                    # The second-order correction removes the residuals due to curvature with the factors of
-                    # the Newton matrix.
+                    # The second-order correction removes residuals due to curvature with the factored Newton
+                    # matrix.
                     back = np.zeros(len(change))
                     back[equal] = (1.0 - size) * missed - left
                     change = change + step.factors.solve(back)

@@ -44,8 +44,9 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half width of a window, in sigmas of the PSF; its limits are `LEAST_HALF` and `MOST_HALF`, px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Mismatch of the second fit. With the first noise model bright stars are fitted by their wings alone, and the
-# residuals of their cores are as large as those of a wrong PSF.
+# Mismatch between PSF and Gaussian that the second fit assumes, as a fraction of the light.
+# A smaller value is needed, because with the first noise model only the wings of bright stars determine the
+# fit.
 _NEXT_MISMATCH = 0.02
 # Mismatch that is assumed if no star determines it.
 _UNKNOWN_MISMATCH = 0.02
@@ -101,8 +102,7 @@ def first_look(targets: StarTargets, gain: float | None = None) -> Shapes:
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
         fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
-    # The errors of the widths follow from the first noise model, which includes deviations from a Gaussian
-    # shape.
+    # The errors of the widths include the deviations from a Gaussian that the first noise model assumes.
     return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 

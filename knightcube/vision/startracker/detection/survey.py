@@ -146,8 +146,8 @@ def measure_sky(pixels: Image) -> SkyBackground:
     tail, cut_off = _tails(lone, single.level, single.noise)
     smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
     noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
-    # Faint stars lengthen the upper tail too, and more so in a sum of pixels, but do not add noise to the
-    # position of a star. The tails determine the noise only where it is clipped at zero.
+    # Faint stars widen the upper tail, mostly of sums of pixels, but do not add noise to star positions.
+    # The upper tail determines the noise only if the lower tail is clipped at zero.
     own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return SkyBackground(
         level,
