@@ -41,7 +41,8 @@ class FrameSightings:
     Attributes:
         time_ns: time of mid-exposure.
         directions: (n, 3) unit vectors, ICRS, corrected for stellar aberration.
-        covariance: (n, 3, 3) rad^2 of the positions in the image, ICRS axes, without that of the attitude.
+        covariance: (n, 3, 3) rad^2, covariance of the directions due to the positions in the image, ICRS
+            axes, without the error of the attitude.
         magnitudes: (n,) calibrated by the frame's stars; NaN if unknown.
         attitude: (3, 3) rad^2, of the small rotation, ICRS axes, that is common to all directions of the
             frame.

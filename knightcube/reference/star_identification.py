@@ -83,8 +83,8 @@ class ClassicalSettings:
         brightest: number of the brightest observed stars from which patterns are made.
         tolerance: of an angle, an area or a moment, in its sigmas.
         patterns: largest number of triangles or pivots that are looked up in a table.
-        joins: largest number of triangles made of pairs, over all scales. Each takes half a millisecond, and
-            a list without a match needs all of them.
+        joins: largest number of triangles made of pairs, over all scales. A join takes half a millisecond,
+            and a list of stars without a match needs all joins.
         candidates: largest number of candidates of all patterns that are compared with the field.
         screened: number of the brightest observed stars with which a candidate is compared first.
         verified: largest number of candidates of a pattern that are verified with the whole field.

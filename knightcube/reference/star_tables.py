@@ -479,7 +479,7 @@ TRIANGLE_STARS_IN_FIELD = 9
 
 
 class KnownSky:
-    """The guide stars that a field of view shows, and the tables made of them.
+    """The guide stars that a field of view shows, and the tables of their pairs, triangles and patterns.
 
     Attributes:
         index: all guide stars; identifications refer to their indices.

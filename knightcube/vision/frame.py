@@ -179,7 +179,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
     length = np.diff(first, append=len(pixel))
     start, stop = pixel[first], pixel[first] + length
-    # A run touches those of the next row from one column before it to one column after it.
+    # A run touches each run of the next row that lies between one column before it and one column after it.
     low = np.searchsorted(stop, start + columns)
     count = np.searchsorted(start, stop + columns, side="right") - low
     one = np.repeat(np.arange(len(first)), count)

@@ -37,7 +37,8 @@ class MatchedStars:
     """The catalogue stars that were identified in an image, the brightest in the image first.
 
     Attributes:
-        hip: Hipparcos numbers (m,); of stars that the image cannot resolve, that of the brightest.
+        hip: Hipparcos numbers (m,). For a group of stars that the image cannot resolve, it is the number of
+            the brightest star.
         magnitude: Johnson V magnitudes (m,); the joint magnitude of unresolved stars.
         directions: unit vectors (m, 3), ICRS, at the epoch of the image.
         points: measured positions (m, 2), px, x and y; of a streaked star the position at mid-exposure.

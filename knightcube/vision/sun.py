@@ -421,8 +421,8 @@ class Circle:
     Attributes:
         centre: centre (2,).
         radius: radius, positive.
-        used: which of the points it was fitted to (n,).
-        residual: rms distance of these points from it.
+        used: which points determine the circle (n,).
+        residual: rms distance of the used points from the circle.
         shape: covariance (2, 2) of the centre for unit variance of each point, with the measured correlation
             of neighbouring errors.
     """
@@ -565,7 +565,7 @@ class SunOfCameras:
     Attributes:
         direction: unit vector (3,); None if neither a camera nor the strings have found the Sun.
         covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
-        camera: index of the camera that found the Sun; None if the direction is that of the solar strings.
+        camera: index of the camera that found the Sun; None if the solar strings gave the direction.
         each: solutions of the cameras, in the order in which they were read.
         reason: reason why no camera has found the Sun; empty if a camera has found it.
     """

@@ -144,7 +144,5 @@ PROPER_NAMES: dict[int, str] = {
     112029: "Homam", 112122: "Tiaki", 112158: "Matar", 113368: "Fomalhaut", 113881: "Scheat",
     113963: "Markab",
 }  # fmt: skip
-"""Proper names of bright stars by Hipparcos number, as approved by the IAU Working Group on Star Names.
-
-Each number is that of the brightest entry of the star.
-"""
+"""Proper names of bright stars by Hipparcos number, as approved by the IAU Working Group on Star Names. Each
+Hipparcos number is the number of the star's brightest entry."""

@@ -27,7 +27,7 @@ class Allocation:
 
     Attributes:
         currents: (3,) A, zero on axes that are not available.
-        torque: (3,) N m of these currents.
+        torque: (3,) N m, torque of the allocated currents.
         share: fraction of the requested torque that is made in its direction, 0 .. 1.
     """
 

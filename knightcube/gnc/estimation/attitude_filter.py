@@ -363,7 +363,7 @@ class AttitudeFilter:
         return mine.used
 
     def _count(self, kind: type[Measurement], used: bool) -> None:
-        """Count rejections and restart after too many of them.
+        """Count consecutive rejections, and restart the filter after too many rejections.
 
         Mean rates are too rare to restart the filter.
         """

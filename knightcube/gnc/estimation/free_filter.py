@@ -277,8 +277,8 @@ class FreeFilter:
     ) -> None:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro rate (3,) rad/s.
 
-        The slow states are kept. If the estimate was contradicted (`doubted`), their covariance is that of
-        the settings again, and implausible values are zeroed.
+        The slow states are kept. If the estimate was contradicted (`doubted`), their covariance is reset to
+        the values of the settings, and implausible values are set to zero.
         """
         self.changes += 1
         if doubted:

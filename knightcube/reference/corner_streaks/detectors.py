@@ -48,7 +48,7 @@ def minimum_eigenvalue(tensor: StructureTensor) -> FloatArray:
 
 
 class _Changes(NamedTuple):
-    """Intensities at the two ends of a diameter, minus that of the centre; each (rows, columns)."""
+    """Intensities at the two ends of a diameter, minus the intensity of the centre; each (rows, columns)."""
 
     ahead: FloatArray
     behind: FloatArray

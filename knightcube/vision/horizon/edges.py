@@ -283,7 +283,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
     """Return offsets (w,), px, and the matrix (w, p) from the brightness there to slopes at p places near 0.
 
-    The third value is the distance of the outermost of these places, px. A sharp unit step has the slope 1 at
+    The third value is the distance of the outermost place from zero, px. A sharp unit step has the slope 1 at
     every scale `size`, px.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
@@ -353,7 +353,7 @@ def observe(
 ) -> Observation:
     """Return edges and samples as directions, without edges that the lens does not image.
 
-    `samples` replace those of the lines, if they are given.
+    If `samples` are given, they replace the samples of the scan lines.
     """
     count = len(edges)
     right, below = edges.points + np.array([1.0, 0.0]), edges.points + np.array([0.0, 1.0])

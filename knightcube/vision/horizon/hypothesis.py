@@ -159,8 +159,8 @@ def limb_in_view(
 
     Args:
         points: a closed limb (n, 2), px.
-        inside: which of its points are inside of the image (n,).
-        due: which of them should show an edge (n,).
+        inside: which points of the limb are inside the image (n,).
+        due: which points of the limb should show an edge (n,).
         space: distance between the columns that are read, and between the rows, px.
     """
     with np.errstate(invalid="ignore"):

@@ -44,7 +44,7 @@ class RoughAttitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HorizonKnowledge:
-    """Data of GPS, ephemerides and coarse sensors for one image, all of them optional.
+    """Optional data from GPS, ephemerides and coarse sensors for one image.
 
     Attributes:
         position: position (3,), m from the Earth's centre, inertial axes. It gives the altitude and, with

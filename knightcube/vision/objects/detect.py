@@ -269,7 +269,7 @@ class ObjectReport:
 
     Attributes:
         indicators: indicators of all streaks with two ends, then of the short regions.
-        verdicts: verdict on each of them.
+        verdicts: verdict on each streak and each short region.
         crowded: verdicts on the regions with more than two corners.
         objects: the objects, the brightest first.
         rotation: the rotation that was used (3,), rad, camera axes.

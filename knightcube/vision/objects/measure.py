@@ -313,7 +313,7 @@ def measure_objects(
         fits = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
     else:
         fits = _among_points(seen, stars, settings)
-    # The fits of two areas may converge to the same light; the first of them counts.
+    # The fits of two areas may converge to the same light; only the first fit is kept.
     middles = np.array([fit.middle for fit, _ in fits]).reshape(-1, 2)
     away = np.linalg.norm(middles[:, None] - middles, axis=2)
     again = np.any(np.tril(away < _SAME, -1), axis=1)

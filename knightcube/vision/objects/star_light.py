@@ -67,8 +67,8 @@ class Explanation:
 class StarLight:
     """The pixels around one region, and the stars that may illuminate them.
 
-    The pixels are those along all star paths and all lines between the corners. A star may begin or end at
-    each corner, and pass the midpoint of the corners anywhere on its path.
+    The pixels lie along all star paths and all lines between the corners. A star may begin or end at each
+    corner, and pass the midpoint of the corners anywhere on its path.
 
     Args:
         segmented: the frame.

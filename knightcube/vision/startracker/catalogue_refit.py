@@ -57,7 +57,8 @@ _LIGHT_ERROR = 0.15
 _AT_ONCE = 25
 # Number of instants at which a star is tested for being in the frame.
 _INSTANTS = 9
-# Ratio of the number of pixels of the second fit to that of the first, because faint stars are fitted too.
+# Ratio of the pixel limits of the second and the first fit.
+# The second fit includes faint stars.
 _ROOM = 1.7
 # Chi-square of the difference of two fits of one motion, exceeded by chance once in 100,000 cases.
 _ONE_MOTION = 25.9

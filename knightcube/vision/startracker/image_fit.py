@@ -60,7 +60,7 @@ class Unknowns:
             the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
-        scatter: whether a common variance may be added to those of the positions.
+        scatter: whether a common variance may be added to the variances of the positions.
     """
 
     scale: bool = False
@@ -152,8 +152,8 @@ class _FittedPose:
 class _Seen:
     """Stars observed at `observed` (n, 3), camera frame, whose catalogue directions are `reference` (n, 3).
 
-    `slopes` (n, 3, 2) are the derivatives of direction by position, and `covariance` (n, 2, 2), px^2, that of
-    the positions.
+    `slopes` (n, 3, 2) are the derivatives of direction by position, and `covariance` (n, 2, 2), px^2, is the
+    covariance of each position.
     """
 
     observed: FloatArray

@@ -101,7 +101,7 @@ class Pointing:
     Attributes:
         right_ascension, declination: of the boresight, ICRS; right ascension in [0, 2 pi).
         roll: position angle of the image's upward direction (-y), from north towards east, [0, 2 pi).
-            At a celestial pole north is that of right ascension zero.
+            At a celestial pole, north is the direction of the meridian of right ascension zero.
     """
 
     right_ascension: float

@@ -426,7 +426,7 @@ class Iterate:
 class NewtonStep:
     """A Newton step: `change` of all unknowns (size,), and `dual` of the limits.
 
-    `off` are the residuals of the slacks, `factors` those of the Newton matrix.
+    `off` are the residuals of the slacks, and `factors` is the factorisation of the Newton matrix.
     """
 
     change: FloatArray

@@ -445,7 +445,8 @@ def _local_maxima(index: IntArray, smooth: FloatArray, columns: int) -> BoolArra
     return best
 
 
-# Number of the brightest areas that decide; a rotation streaks all of them, except those on its axis.
+# Number of the brightest areas that decide between points and streaks.
+# A rotation streaks all stars except near its axis.
 _LOOKED_AT = 20
 _LEAST_PIXELS = 4
 _SHORTEST_STREAK = 5.0

@@ -296,7 +296,8 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
-    # Most circles find enough among the brightest stars of the sky, the others among all.
+    # Most circles contain enough of the brightest stars of the sky; for other circles, all stars are
+    # searched.
     brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
     for count in sorted({brightest, len(direction)}):
