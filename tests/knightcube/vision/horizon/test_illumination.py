@@ -10,8 +10,15 @@ import pytest
 from knightcube.astro.arrays import FloatArray, Image
 from knightcube.astro.quaternion import attitude_matrix, normalise
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
-from knightcube.vision.horizon.illumination import image_brightness, why_false
-from knightcube.vision.horizon.limb import MEAN_RADIUS
+from knightcube.vision.horizon.edges import Samples
+from knightcube.vision.horizon.illumination import (
+    ImageBrightness,
+    agreement,
+    coarse_nadir,
+    image_brightness,
+    why_false,
+)
+from knightcube.vision.horizon.limb import MEAN_RADIUS, LimbView, mean_sphere
 from knightcube.vision.horizon_camera_job import SUNLIT_COUNTS
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.earth_camera.image import EarthCameraModel
@@ -66,3 +73,138 @@ def test_what_is_under_the_camera_decides() -> None:
     assert judged(dark, down, 500e3, down) == "", "the Sun is beneath the ground"
     assert judged(dark, overhead, 500e3, beside) == "", "the camera sees the sky"
     assert "bright" in judged(lit, overhead, 500e3, beside)
+
+
+ALTITUDE = 500e3
+LIMB = math.asin(MEAN_RADIUS / (MEAN_RADIUS + ALTITUDE))
+DOWN = np.array([0.0, 0.0, 1.0])
+
+
+def at(angle: float, count: int = 1) -> FloatArray:
+    """Return rays (count, 3) at an angle, rad, from nadir."""
+    return np.tile([math.sin(angle), 0.0, math.cos(angle)], (count, 1))
+
+
+def ground_angle(angle: float) -> float:
+    """Return the angle at the Earth's centre, rad, between nadir and the ground at `angle` from nadir."""
+    return math.asin(math.sin(angle) * (1.0 + ALTITUDE / MEAN_RADIUS)) - angle
+
+
+def sun_at(elevation: float, angle: float) -> FloatArray:
+    """Return the Sun (3,) at `elevation`, rad, above the ground seen at `angle`, rad, from nadir."""
+    zenith = ground_angle(angle) - (0.5 * math.pi - elevation)
+    # The ground's normal is opposite to nadir, turned by the angle at the Earth's centre.
+    return np.array([math.sin(zenith), 0.0, -math.cos(zenith)])
+
+
+@pytest.mark.parametrize(("elevation_deg", "false"), [(19.0, False), (21.0, True)])
+def test_dark_ground_is_false_under_a_sun_of_twenty_degrees(elevation_deg: float, false: bool) -> None:
+    look = ImageBrightness(at(0.5, 8), np.zeros(8, dtype=bool))
+    sun = sun_at(math.radians(elevation_deg), 0.5)
+    assert bool(why_false(look, DOWN, ALTITUDE, sun)) is false
+
+
+@pytest.mark.parametrize(("elevation_deg", "false"), [(-16.0, False), (-18.0, True)])
+def test_bright_ground_is_false_in_the_night_beyond_twilight(elevation_deg: float, false: bool) -> None:
+    look = ImageBrightness(at(0.5, 8), np.ones(8, dtype=bool))
+    sun = sun_at(math.radians(elevation_deg), 0.5)
+    assert bool(why_false(look, DOWN, ALTITUDE, sun)) is false
+
+
+@pytest.mark.parametrize(
+    ("beyond_deg", "bright", "false"),
+    [(4.0, True, False), (6.0, True, True), (-4.0, False, False), (-6.0, False, True)],
+)
+def test_five_degrees_on_either_side_of_the_limb_are_excluded(
+    beyond_deg: float, bright: bool, false: bool
+) -> None:
+    look = ImageBrightness(at(LIMB + math.radians(beyond_deg), 8), np.full(8, bright))
+    assert bool(why_false(look, DOWN, ALTITUDE, -DOWN)) is false
+
+
+@pytest.mark.parametrize(
+    ("wrong", "count", "false"), [(7, 7, False), (8, 8, True), (6, 10, False), (7, 10, True)]
+)
+def test_most_of_eight_samples_must_contradict(wrong: int, count: int, false: bool) -> None:
+    look = ImageBrightness(at(0.3, count), np.arange(count) >= wrong)
+    assert bool(why_false(look, DOWN, ALTITUDE, -DOWN)) is false
+    sky = ImageBrightness(at(2.0, count), np.arange(count) < wrong)
+    assert bool(why_false(sky, DOWN, ALTITUDE, -DOWN)) is false
+
+
+@pytest.mark.parametrize(("apart_deg", "false"), [(24.0, False), (26.0, True)])
+def test_stray_light_of_the_sun_excuses_a_bright_sky(apart_deg: float, false: bool) -> None:
+    look = ImageBrightness(at(2.0, 8), np.ones(8, dtype=bool))
+    sun = at(2.0 + math.radians(apart_deg))[0]
+    assert bool(why_false(look, DOWN, ALTITUDE, sun)) is false
+
+
+@pytest.mark.parametrize(
+    ("angle", "elevation_deg", "dark", "lit"),
+    [
+        (0.5, 7.0, 0, 0),
+        (0.5, 9.0, 0, 1),
+        (0.5, -11.0, 0, 0),
+        (0.5, -13.0, 1, 0),
+        (LIMB - 0.009, 40.0, 0, 0),
+        (LIMB - 0.011, 40.0, 0, 1),
+        (LIMB + 0.022, 40.0, 0, 0),
+        (LIMB + 0.026, 40.0, 1, 0),
+    ],
+)
+def test_samples_are_compared_by_day_by_night_and_above_the_air(
+    angle: float, elevation_deg: float, dark: int, lit: int
+) -> None:
+    """The air reaches 60 km above a limb that is 2,575 km away: 0.0233 rad."""
+    view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
+    sun = sun_at(math.radians(elevation_deg), min(angle, LIMB - 1e-9))
+    for bright in (True, False):
+        found = agreement(view, sun, Samples(at(angle), np.array([bright])))
+        assert (found.dark_samples, found.lit_samples) == (dark, lit)
+        assert (found.stray, found.missing) == (float(bright and dark == 1), float(not bright and lit == 1))
+
+
+@pytest.mark.parametrize(("apart_deg", "count"), [(11.0, 0), (13.0, 1)])
+def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: int) -> None:
+    view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
+    sun = at(2.0 + math.radians(apart_deg))[0]
+    assert agreement(view, sun, Samples(at(2.0), np.array([True]))).dark_samples == count
+    assert agreement(view, None, Samples(at(2.0), np.array([True]))).dark_samples == 1
+
+
+def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
+    """800 even directions under the Sun overhead: ground is bright, sky dark."""
+    number = np.arange(800) + 0.5
+    z, turn = 1.0 - 2.0 * number / 800, math.pi * (3.0 - math.sqrt(5.0)) * number
+    rays = np.column_stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z])
+    nadir = normalise(np.array([0.3, -0.5, 0.8]))
+    bright = rays @ nadir > math.cos(LIMB)
+    found = coarse_nadir([ImageBrightness(rays, bright)], ALTITUDE, -nadir)
+    assert found is not None
+    error = math.acos(min(1.0, float(found.direction @ nadir)))
+    assert math.degrees(error) < 2.0
+    # Directions 4.5 deg apart have a rounding error of 4.5 / sqrt(12) deg on each axis.
+    assert found.sigma > math.radians(4.5 / math.sqrt(12.0))
+    assert error < 2.0 * found.sigma < math.radians(6.0)
+    assert found.covariance @ found.direction == pytest.approx(np.zeros(3), abs=1e-6)
+    assert 0.9 < found.explained < 1.0
+    # Without the Sun a dark sample may be ground.
+    blind = coarse_nadir([ImageBrightness(rays, bright)], ALTITUDE)
+    assert blind is not None
+    assert blind.explained < found.explained
+    assert coarse_nadir([ImageBrightness(rays, np.zeros(800, dtype=bool))], ALTITUDE, -nadir) is None
+    few = [ImageBrightness(nadir[None], np.ones(1, dtype=bool))]
+    assert coarse_nadir(few, ALTITUDE, -nadir) is None, "one sample leaves most of the sky"
+
+
+def test_the_samples_of_an_image_stand_in_the_middle_of_its_cells() -> None:
+    """Cells of 16 px: the rays of the pixels 8, 24, ... on columns and rows."""
+    image = np.zeros((128, 128), np.uint8)
+    image[:64, 40] = 31
+    image[64:, 40] = 30
+    look = image_brightness(image, CAMERA, 30.0)
+    places = np.stack(np.meshgrid(np.arange(8, 128, 16), np.arange(8, 128, 16), indexing="ij"), axis=-1)
+    points = places.reshape(-1, 2).astype(float)
+    assert look.rays == pytest.approx(PINHOLE.unit_vectors(points))
+    assert look.bright.tolist() == ((points[:, 0] == 40.0) & (points[:, 1] < 64.0)).tolist()
+    assert look.share == 4.0 / 64.0
