@@ -1,0 +1,112 @@
+"""The ground's terminal: new keys, lines, and the reports on one command."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flight.link.process.commanding import Stage
+from flight.link.security import Vault
+from flight.link.telemetry.definitions import HEALTH, VERIFICATION
+from flight.link.telemetry.packets import Packer
+from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, make_keys, open_terminal, report_of
+from knightcube.errors import FlightError, UsageError
+from tests.flight.link.telemetry.samples import plain_contents
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    """Return the ground's keys."""
+    make_keys(tmp_path / "keys")
+    return tmp_path / "keys" / "ground"
+
+
+def test_both_ends_get_the_same_new_keys_that_only_their_owner_can_read(tmp_path: Path) -> None:
+    ends = make_keys(tmp_path / "a" / "keys")
+    assert [end.name for end in ends] == ["satellite", "ground"]
+    vaults = [Vault(end) for end in ends]
+    for spi in (1, 2, 3, 4):
+        first, second = (vault.read(spi) for vault in vaults)
+        assert first is not None
+        assert second is not None
+        assert (first.key, first.generation, first.unused) == (second.key, 1, 0)
+        assert [vault.copies(spi) for vault in vaults] == [2, 2]
+    read = [vaults[0].read(spi) for spi in (1, 2, 3, 4)]
+    assert len({one.key for one in read if one is not None}) == 4
+    for folder in (tmp_path / "a" / "keys", *ends):
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    with pytest.raises(UsageError, match="keys are never overwritten"):
+        make_keys(tmp_path / "a" / "keys")
+
+
+def test_the_defaults_are_those_of_the_configuration() -> None:
+    assert (TerminalSettings().spacecraft, TerminalSettings().frame_bytes) == (0x1A5, 1115)
+    assert (DEFAULTS.spacecraft, DEFAULTS.frame_bytes) == (0x1A5, 1115)
+
+
+@contextlib.contextmanager
+def listening() -> Iterator[socket.socket]:
+    """Yield a TCP socket that listens."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield server
+
+
+def test_a_tcp_line_waits_for_its_bytes_and_ends_with_its_peer(keys: Path) -> None:
+    with listening() as server:
+        terminal = open_terminal(f"tcp:127.0.0.1:{server.getsockname()[1]}", keys)
+        peer, _ = server.accept()
+        with contextlib.closing(terminal), peer:
+            assert os.get_blocking(terminal.fileno())
+            peer.sendall(b"no frame")
+            assert list(terminal.take()) == []
+            peer.shutdown(socket.SHUT_WR)
+            with pytest.raises(FlightError, match="the line was closed"):
+                list(terminal.take())
+
+
+@pytest.mark.parametrize("address", ["nowhere", "tcp:1.2.3.4", "127.0.0.1:x", "/dev/null@fast"])
+def test_an_address_of_another_form_is_refused(keys: Path, address: str) -> None:
+    with pytest.raises((UsageError, FlightError)):
+        open_terminal(address, keys)
+
+
+def report(counter: int, spi: int, stage: Stage, text: str = "") -> bytes:
+    """Return a verification packet."""
+    values: dict[str, Any] = {"name": "ping", "packet": 0x1A01, "sequence": 6, "text": text}
+    return Packer().pack(VERIFICATION, 0, spi=spi, counter=counter, stage=int(stage), **values)
+
+
+def test_a_report_has_the_fields_of_its_packet() -> None:
+    found = report_of(report(5, 2, Stage.REFUSED, "too far"))
+    assert (found.spi, found.counter, found.stage, found.name, found.text) == (
+        2,
+        5,
+        Stage.REFUSED,
+        "ping",
+        "too far",
+    )
+    assert (found.request.packet, found.request.sequence) == (0x1A01, 6)
+
+
+def test_only_the_reports_on_the_own_command_are_followed_up_to_the_final_one(
+    keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received = [
+        Packer().pack(HEALTH, 1, plain_contents(HEALTH)),
+        report(5, 1, Stage.ACCEPTED),
+        report(6, 1, Stage.COMPLETED),
+        report(5, 2, Stage.COMPLETED),
+        report(5, 1, Stage.COMPLETED),
+        report(5, 1, Stage.FAILED),
+    ]
+    monkeypatch.setattr(Terminal, "packets", lambda self, seconds: ((0, packet) for packet in received))
+    with contextlib.closing(open_terminal("127.0.0.1:9", keys)) as terminal:
+        assert [one.stage for one in terminal.follow(5, 1, 1.0)] == [Stage.ACCEPTED, Stage.COMPLETED]
+        assert terminal.lost_frames == 0
