@@ -158,3 +158,28 @@ def test_a_target_that_nothing_can_point_to_is_refused(
 ) -> None:
     with pytest.raises(UsageError, match=why):
         PointingTarget(goal, numbers, roll)
+
+
+def test_each_command_is_printed_with_its_values() -> None:
+    """A ping has the number 0 unless it is given another one."""
+    table = LoadParameters(0x1234, tuple(float(k + 1) for k in range(len(PARAMETER_FIELDS))))
+    assert [
+        Ping().text,
+        Ping(7).text,
+        ChangeMode(Mode.HOLD).text,
+        ChangeMode(Mode.SAFE, "end\x07").text,
+        Slew(0.25).text,
+        Slew(math.nan).text,
+        Clear("too-hot").text,
+        DumpParameters().text,
+    ] == [
+        "ping 0",
+        "ping 7",
+        "mode hold",
+        "mode safe: end\\x07",
+        "slew to q2 +0.2500",
+        "slew",
+        "clear too-hot",
+        "dump-parameters",
+    ]
+    assert table.text.endswith(" replacing 00001234")

@@ -92,7 +92,8 @@ def test_a_table_in_place_of_another_one_or_with_a_wrong_value_is_refused() -> N
     board = begun()
     assert "dump it and look again" in board.parameters.load(board.values(), board.records[-1]["crc"] ^ 1, 6)
     assert "must lie within" in board.load(modes__tumble_rate=99.0)
-    assert board.modes == board.noted == []
+    assert board.modes == []
+    assert board.noted == []
     assert len(board.records) == 1
 
 
