@@ -10,7 +10,7 @@ import pytest
 from knightcube.astro.quaternion import angle_between, attitude_matrix
 from knightcube.vision.startracker.attitude_fit import MatchStatus, StarField, StarMatch
 from knightcube.vision.startracker.index.build import default_index
-from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
+from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify, neighbours, triples
 from tests.pace import ordinary_seconds
 from tests.support.star_lists import ListKind, StarList, configurations, draw, draw_random
 
@@ -216,3 +216,25 @@ def test_a_field_of_a_single_repeated_direction_names_nothing() -> None:
     direction = np.tile([0.0, 0.0, 1.0], (6, 1))
     field = StarField(direction, np.full(6, 1e-4), (0.1, 0.1), (0.99, 1.01))
     assert identify(field, SKY).status is MatchStatus.NO_MATCH
+
+
+def test_the_triangles_of_neighbours_join_a_star_with_two_of_its_five_nearest() -> None:
+    """Stars along a great circle at growing distances: the nearest stars of each are counted by hand."""
+    angle = np.cumsum(np.arange(1, 46)) * 1e-4
+    direction = np.stack([np.sin(angle), np.zeros(45), np.cos(angle)], axis=1)
+    field = StarField(direction, np.full(45, 1e-5), (0.2, 0.2))
+    expected = set()
+    # Only the 40 brightest stars are centres.
+    for centre in range(40):
+        near = sorted(range(45), key=lambda other: abs(angle[other] - angle[centre]))[1:6]
+        expected |= {tuple(sorted((centre, a, b))) for a in near for b in near if a < b}
+    found = neighbours(field)
+    assert {tuple(row) for row in found.tolist()} == expected
+    assert len(found) == len(expected)
+
+
+def test_all_triangles_of_a_field_come_once_the_brightest_first() -> None:
+    found = triples(6)
+    assert len({tuple(row) for row in found.tolist()}) == len(found) == 20
+    assert all(a < b < c for a, b, c in found.tolist())
+    assert found[:, 2].tolist() == sorted(found[:, 2].tolist())

@@ -1,0 +1,81 @@
+"""Windows around stars, and the noise model, from drawn pixels whose noise is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.vision.startracker.detection.psf_fit import NoiseModel, cut, measure_noise, smoothed
+
+
+def test_a_window_holds_the_counts_above_the_sky_and_marks_pixels_that_cannot_be_used() -> None:
+    pixels = np.arange(100.0).reshape(10, 10)
+    middle, level = np.array([[4, 5], [0, 9]]), np.array([10.0, 20.0])
+    windows = cut(pixels, middle, 2, level, np.array([1.0, 2.0]), 57.0)
+    assert len(windows) == 2
+    assert windows.light.shape == windows.good.shape == (2, 5, 5)
+    assert windows.light[0].tolist() == (pixels[3:8, 2:7] - 10.0).tolist()
+    # 57 counts and more are saturated, but keep their light.
+    assert windows.good[0].tolist() == (pixels[3:8, 2:7] < 57.0).tolist()
+    # The second star stands in the lower left corner: nine pixels are in the frame, all saturated.
+    assert windows.light[1, :3, 2:].tolist() == (pixels[7:, :3] - 20.0).tolist()
+    assert np.count_nonzero(windows.light[1]) == 9
+    assert not windows.good[1].any()
+    assert windows.trail.tolist() == [[0.0, 0.0], [0.0, 0.0]]
+    assert windows.without(windows.light).light.tolist() == np.zeros((2, 5, 5)).tolist()
+    second = windows.select(np.array([1]))
+    assert second.noise.tolist() == [2.0]
+    assert second.half == 2
+
+
+def test_smoothing_spreads_a_point_as_one_two_one_on_both_axes() -> None:
+    light = np.zeros((1, 7, 7))
+    light[0, 3, 2] = 1.0
+    expected = np.zeros((7, 7))
+    expected[2:5, 1:4] = np.outer([1.0, 2.0, 1.0], [1.0, 2.0, 1.0])
+    assert smoothed(light)[0].tolist() == expected.tolist()
+    border = smoothed(np.ones((1, 5, 5)))[0]
+    assert border[1:-1, 1:-1].tolist() == np.full((3, 3), 16.0).tolist()
+    assert float(border.sum()) == 9 * 16.0
+
+
+@pytest.mark.parametrize(("photon", "mismatch"), [(0.5, 0.0), (0.0, 0.05), (0.5, 0.03), (0.0, 0.0)])
+def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
+    photon: float, mismatch: float
+) -> None:
+    """Residuals with the variance s^2 + p m + q^2 m^2, of which the fit has absorbed a fifth."""
+    draw = np.random.default_rng(1)
+    noise = draw.uniform(2.0, 4.0, 300)
+    light = draw.uniform(0.0, 1.0, (300, 7, 7)) ** 3 * draw.uniform(50.0, 3000.0, (300, 1, 1))
+    floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
+    true = floor + photon * light + (mismatch * light) ** 2
+    leverage = np.full(light.shape, 0.2)
+    residual = draw.normal(size=light.shape) * np.sqrt(true * (1.0 - leverage))
+    found = measure_noise(residual, floor, leverage, light, noise, None)
+    assert found.photon == pytest.approx(photon, rel=0.1, abs=0.02)
+    assert found.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
+    # Hot pixels beyond five standard deviations do not count.
+    spoilt = residual.copy()
+    spoilt[:, 3, 3] += 40.0 * np.sqrt(true[:, 3, 3])
+    other = measure_noise(spoilt, floor, leverage, light, noise, None)
+    assert other.photon == pytest.approx(photon, rel=0.3, abs=0.1)
+    if photon > 0.0:
+        # A known gain gives the photon noise, and the mismatch is the median over the stars.
+        known = measure_noise(residual, floor, leverage, light, noise, 1.0 / photon)
+        assert known.photon == pytest.approx(photon)
+        assert known.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
+
+
+def test_few_bright_pixels_give_no_measure_noise() -> None:
+    light, leverage = np.full((1, 2, 2), 100.0), np.full((1, 2, 2), 0.2)
+    found = measure_noise(light, light, leverage, light, np.ones(1), None)
+    assert (found.photon, found.mismatch) == (0.0, 0.0)
+    known = measure_noise(light, light, leverage, light, np.ones(1), 4.0)
+    assert (known.photon, known.mismatch) == (0.25, 0.0)
+
+
+def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> None:
+    """Noise of 3 counts, 0.5 counts^2 per count, 10 % of 20 counts: 9 + 10 + 4; no light is negative."""
+    light = np.array([[[20.0, -20.0]]])
+    variance = NoiseModel(photon=0.5, mismatch=0.1).variance(light, np.array([3.0]))
+    assert variance[0, 0] == pytest.approx([23.0, 9.0])
