@@ -1,0 +1,21 @@
+"""Planned motions as references."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.gnc.control.pointing_path import PlannedMotion
+
+
+def test_references_have_the_accelerations_that_lead_from_rate_to_rate() -> None:
+    """Four rates half a second apart; the last acceleration holds on."""
+    rate = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0], [1.0, 3.0, -2.0]])
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
+    times = np.array([10.0, 10.5, 11.0, 11.5])
+    found = PlannedMotion(quaternion, rate, np.zeros((3, 4))).references(times)
+    expected = [[2.0, 0.0, 0.0], [0.0, 6.0, 0.0], [0.0, 0.0, -4.0], [0.0, 0.0, -4.0]]
+    assert found.acceleration.tolist() == expected
+    assert found.acceleration[:-1] * 0.5 == pytest.approx(np.diff(found.rate, axis=0))
+    assert found.times.tolist() == times.tolist()
+    assert found.quaternion.shape == (4, 4)
