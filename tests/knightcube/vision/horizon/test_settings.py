@@ -1,0 +1,66 @@
+"""Knowledge and settings at both sides of their limits, and the logarithmic response by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.errors import UsageError
+from knightcube.vision.horizon.settings import (
+    EdgeSettings,
+    HorizonKnowledge,
+    HorizonSettings,
+    LogarithmicResponse,
+    light_of,
+)
+
+
+def test_a_logarithmic_detector_adds_equal_counts_for_each_decade_of_light() -> None:
+    """50 counts a decade above 20: no light, 9 and 99 times the dark current."""
+    response = LogarithmicResponse(20.0, 50.0)
+    counts = np.array([[20, 70, 120]], dtype=np.uint8)
+    assert light_of(counts, response) == pytest.approx(np.array([[0.0, 9.0, 99.0]]))
+    assert light_of(counts.astype(np.float64), response) == pytest.approx(np.array([[0.0, 9.0, 99.0]]))
+    assert light_of(np.array([[255]], dtype=np.uint8), response)[0, 0] == pytest.approx(10.0**4.7 - 1.0)
+    assert light_of(counts, None).tolist() == [[20.0, 70.0, 120.0]]
+
+
+def test_a_camera_is_above_the_air() -> None:
+    """The equator is at 6,378.1 km; a limb is visible from 50 km above it."""
+    HorizonKnowledge(position=np.array([0.0, 6_428.2e3, 0.0]), altitude=50e3)
+    with pytest.raises(ValueError, match="inside the Earth"):
+        HorizonKnowledge(position=np.array([0.0, 6_428.0e3, 0.0]))
+    for altitude in (49.9e3, np.inf, np.nan):
+        with pytest.raises(ValueError, match="metres above the Earth"):
+            HorizonKnowledge(altitude=altitude)
+
+
+@pytest.mark.parametrize(
+    ("sound", "wrong"),
+    [
+        ({"lines": 2}, {"lines": 1}),
+        ({"run": 1}, {"run": -1}),
+        ({"run": 7}, {"run": 6}),
+        ({"run": 3}, {"run": 0}),
+    ],
+)
+def test_lines_and_windows_have_their_limits(sound: dict[str, int], wrong: dict[str, int]) -> None:
+    EdgeSettings(**sound)  # type: ignore[arg-type]  # whole numbers only
+    with pytest.raises(UsageError, match=next(iter(wrong))):
+        EdgeSettings(**wrong)  # type: ignore[arg-type]  # whole numbers only
+
+
+@pytest.mark.parametrize("name", ["threshold", "contrast"])
+def test_fractions_lie_between_nothing_and_all(name: str) -> None:
+    for sound in (0.001, 0.999):
+        EdgeSettings(**{name: sound})  # type: ignore[arg-type]  # fractions only
+    for wrong in (0.0, 1.0, -0.1, np.nan):
+        with pytest.raises(UsageError, match="between 0 and 1"):
+            EdgeSettings(**{name: wrong})  # type: ignore[arg-type]  # fractions only
+
+
+def test_the_range_of_altitudes_increases_from_fifty_kilometres() -> None:
+    HorizonSettings(altitudes=(50e3, 51e3))
+    for wrong in ((49e3, 1e6), (6e5, 6e5), (1e5, np.inf)):
+        with pytest.raises(UsageError, match="increasing range from 50 km"):
+            HorizonSettings(altitudes=wrong)
