@@ -119,7 +119,7 @@ def test_years_and_places_that_no_model_knows_are_refused() -> None:
 
 
 def test_the_builder_refuses_a_text_that_is_not_a_table_of_the_field() -> None:
-    with pytest.raises(UsageError, match="no table of IGRF-14"):
+    with pytest.raises(UsageError, match="not a table of IGRF-14"):
         build_igrf.parse("# nothing\n1 13 27 2 1 1900.0 2030.0\n 2020.0 2025.0 2030.0\n 1 0 1 2 3\n")
     rows = "\n".join(f"{n} {m} 1 2 3" for n, m in build_igrf.order())
     with pytest.raises(UsageError, match="the dipole of 2025"):
