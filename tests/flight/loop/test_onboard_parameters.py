@@ -44,7 +44,7 @@ class Board:
         }
 
     def load(self, now_ns: int = 5, **changes: float) -> str:
-        """Load a table with changes in place of the one in force."""
+        """Load a table with changes instead of the one in force."""
         return self.parameters.load(self.values(**changes), self.records[-1]["crc"], now_ns)
 
 
