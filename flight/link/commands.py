@@ -1,14 +1,14 @@
-"""Telecommands: the table of their packets, their values and words, and the channels that receive them.
+"""Telecommands: packet definitions, conversion between commands, packets and text, and receiving sockets.
 
-Telecommands are CCSDS space packets of type 1. `time_ns` of the secondary header is a number that the sender
-uses once, such as its UTC, so that a packet which a network duplicates is executed once. States and ranges of
-arguments are checked from the table, on the ground and on board; the words of `flight command` are made
-from it.
+Telecommands are CCSDS space packets of type 1. The field `time_ns` of the secondary header must be unique per
+command, for example the sender's UTC, so that a packet duplicated by the network is executed only once.
+Ground and satellite check the arguments of a command against the states and ranges in its packet definition.
+The command line `flight command` takes its words from the same definitions.
 
-The queue of a socket is short: an unknown sender that is faster than the loop would fill it, and a peer's
-command would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop datagrams that
-do not begin as a command does or that come from no peer. The filter sees a UDP datagram from its UDP header
-on, and a UNIX datagram from its first byte on.
+The receive queue of a socket is short, so that an unknown sender could fill it between two polls and commands
+from known peers would be lost. A classic BPF filter (linux/filter.h) therefore makes the kernel drop
+datagrams that come from unknown senders or do not begin with the packet identifier of a command. The data
+that the filter can inspect begin with the UDP header for UDP sockets, and with the payload for UNIX sockets.
 """
 
 from __future__ import annotations
@@ -123,31 +123,32 @@ LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
 
 
 class CommandError(FlightError):
-    """Raised for bytes or values that are not a valid command; the text states the reason."""
+    """Raised for bytes or values that are not a valid command. The error text states the reason."""
 
 
 class MalformedError(CommandError):
     """Raised for bytes that are not a command packet.
 
-    Such bytes are never answered, so that two flights cannot answer each other without end.
+    The flight software never answers malformed bytes, so that two flight processes cannot answer each other
+    endlessly.
     """
 
 
 class _Plain:
-    """Command whose attributes have the names of the packet's fields."""
+    """Command class whose attributes have the same names as the fields of its packet."""
 
     __slots__ = ()
     packet: ClassVar[Packet]
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name."""
+        """Values of the packet's fields by field name."""
         return {field.name: getattr(self, field.name) for field in self.packet.fields}
 
 
 @dataclass(frozen=True, slots=True)
 class Ping(_Plain):
-    """Answer."""
+    """Command to answer with the same number."""
 
     number: int = 0
     packet = PING
@@ -160,19 +161,19 @@ class Ping(_Plain):
 
 @dataclass(frozen=True, slots=True)
 class ChangeMode:
-    """Go into a mode; `reason` is for the log."""
+    """Command to change the mode. The text `reason` is written to the log."""
 
     mode: Mode
     reason: str = ""
 
     @property
     def packet(self) -> Packet:
-        """The packet of the command: SAFE has its own packet."""
+        """Packet definition of the command. Safe mode is commanded by a packet of its own."""
         return SAFE if self.mode is Mode.SAFE else MODE
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name."""
+        """Values of the packet's fields by field name."""
         return {"reason": self.reason} if self.mode is Mode.SAFE else {"mode": int(self.mode)}
 
     @property
@@ -183,7 +184,7 @@ class ChangeMode:
 
 @dataclass(frozen=True, slots=True)
 class Slew(_Plain):
-    """Go to an attitude."""
+    """Command to slew to an attitude."""
 
     q2: float
     packet = SLEW
@@ -196,7 +197,7 @@ class Slew(_Plain):
 
 @dataclass(frozen=True, slots=True)
 class Clear(_Plain):
-    """Clear a latched event, so that it can be raised again."""
+    """Command to clear a latched event, so that the event can be raised again."""
 
     event: str
     packet = CLEAR
@@ -209,14 +210,14 @@ class Clear(_Plain):
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Point to a goal."""
+    """Command to point to a target."""
 
     target: PointingTarget
     packet = POINT
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name; spare numbers and a free roll are NaN."""
+        """Values of the packet's fields by field name. Unused numbers and a free roll angle are NaN."""
         target = self.target
         return {
             "goal": int(target.goal),
@@ -232,7 +233,12 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class LoadParameters:
-    """Replace the table of parameters whose CRC is `replaced` by `values`, in the order of the table."""
+    """Command to replace the parameter table.
+
+    Attributes:
+        replaced: CRC-32 of the parameter table to be replaced.
+        values: new parameter values, in the order of the table.
+    """
 
     replaced: int
     values: tuple[float, ...]
@@ -240,12 +246,12 @@ class LoadParameters:
 
     @property
     def by_key(self) -> dict[str, float]:
-        """The values by their keys in a configuration."""
+        """New parameter values by configuration key."""
         return dict(zip(PARAMETER_KEYS, self.values, strict=True))
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The packet's fields, by name."""
+        """Values of the packet's fields by field name."""
         named = {field.name: value for field, value in zip(PARAMETER_FIELDS, self.values, strict=True)}
         return {"replaced": self.replaced, "crc": crc_of(self.values), **named}
 
@@ -257,7 +263,7 @@ class LoadParameters:
 
 @dataclass(frozen=True, slots=True)
 class DumpParameters(_Plain):
-    """Report the table of parameters."""
+    """Command to report the parameter table in use."""
 
     packet = DUMP_PARAMETERS
 
@@ -271,13 +277,16 @@ Command = Ping | ChangeMode | Slew | Clear | Point | LoadParameters | DumpParame
 
 
 def shown(text: str) -> str:
-    """Return a text in which characters that do not print are replaced by escapes."""
+    """Return a text with its unprintable characters replaced by escape sequences."""
     escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     return "".join(escaped)
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the target of a packet's fields; a roll of NaN means a free roll. Raises CommandError."""
+    """Return the pointing target in the fields of a POINT packet, in which a roll of NaN means a free roll.
+
+    Raises CommandError for fields that do not define a target.
+    """
     goal = Goal(number)
     try:
         counts = NUMBERS.get(goal, (0,))
@@ -290,7 +299,10 @@ def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
 
 
 def _table(fields: Mapping[str, Any]) -> LoadParameters:
-    """Return the table in a packet's fields. Raises CommandError if its CRC is wrong."""
+    """Return the parameter table in the fields of a packet.
+
+    Raises CommandError if the table's CRC is wrong.
+    """
     values = tuple(fields[field.name] for field in PARAMETER_FIELDS)
     if fields["crc"] != crc_of(values):
         raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
@@ -307,25 +319,28 @@ MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
     LOAD_PARAMETERS.name: _table,
     DUMP_PARAMETERS.name: lambda _: DumpParameters(),
 }
-"""Functions that make a command from the fields of a packet, by packet name."""
+"""Functions by packet name; each creates a command from the fields of such a packet."""
 
 
 LONGEST = max(layout.length for layout in LAYOUTS.values())
-"""Length (bytes) of the longest command; longer packets are refused."""
+"""Length (bytes) of the longest command packet. Longer packets are refused."""
 
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 IDENTIFIERS = tuple(_BY_IDENTIFIER)
-"""First 16 bits of all command packets."""
+"""Packet identifiers of the commands. An identifier is the first 16 bits of a packet."""
 
 
 def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
-    """Return the command of a packet's fields. Raises CommandError for values outside the table."""
+    """Return the command in the fields of a packet.
+
+    Raises CommandError for values that the packet definition forbids.
+    """
     check(packet, fields)
     return MAKERS[packet.name](fields)
 
 
 def check(packet: Packet, fields: Mapping[str, Any]) -> None:
-    """Refuse fields outside the states and ranges of the table. Raises CommandError."""
+    """Raise CommandError if a field of a packet is outside the states or range of its definition."""
     for field in packet.fields:
         value = fields[field.name]
         if field.states and value not in dict(field.states):
@@ -339,13 +354,16 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
 
 
 class CommandPacker:
-    """Makes the packets of commands with their sequence counts."""
+    """Encoder of commands as packets, which counts the packets of each type."""
 
     def __init__(self) -> None:
         self._packer = Packer(LAYOUTS)
 
     def pack(self, command: Command, utc_ns: int) -> bytes:
-        """Return the packet of a command. Raises CommandError for values outside the table."""
+        """Return a command encoded as a packet.
+
+        Raises CommandError for values that the definition forbids.
+        """
         check(command.packet, command.fields)
         try:
             return self._packer.pack(command.packet, utc_ns, command.fields)
@@ -381,9 +399,10 @@ def unpack(data: bytes) -> Command:
 def command_of_words(text: str) -> Command:
     """Return the command of a line such as `slew 0.2`, `mode hold`, `safe end of pass` or `point sun`.
 
-    A line has the name of the command, then its fields in order, in the units of the table. States are given
-    by their labels. Missing numbers at the end are NaN, and a text field takes the rest of the line. Raises
-    CommandError, also for a number outside the range of its field.
+    The line consists of the command's name and the values of its fields, in the order and units of the packet
+    definition. A state is written as its label. Omitted real numbers at the end of the line become NaN, and a
+    text field takes the rest of the line. Raises CommandError for an unknown command, for superfluous words
+    and for values out of range.
     """
     name, *words = text.split() or [""]
     if name not in LAYOUTS:
@@ -421,19 +440,21 @@ def _number(field: Field, word: str) -> float | int:
 
 
 _SO_ATTACH_FILTER = 26
-_SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF: the source address of the IPv4 header
+_SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF plus the offset of the IPv4 source address
 _UDP_HEADER_BYTES = 8
 _LOAD_WORD, _LOAD_HALF, _AND, _EQUAL, _RETURN = 0x20, 0x28, 0x54, 0x15, 0x06
 _DROP, _WHOLE = (_RETURN, 0, 0, 0), (_RETURN, 0, 0, 0xFFFF)
 
 _Instruction = tuple[int, int, int, int]
-"""Operation, instructions to skip if the condition is true and if it is false, and operand."""
+"""BPF instruction: operation code, jump offset if true, jump offset if false, and operand."""
 
 
 def _filter_datagrams(
     bound: socket.socket, identifiers: Sequence[int], peers: Sequence[IPv4Network] | None = None
 ) -> None:
-    """Let a socket receive only datagrams that begin with one of `identifiers`, from `peers` if given.
+    """Attach a kernel filter that drops datagrams which do not begin with one of `identifiers`.
+
+    With `peers`, the filter also drops datagrams from addresses outside these networks.
 
     If the kernel refuses the filter, the socket receives all datagrams, and its reader must check them.
     """
@@ -447,39 +468,39 @@ def _filter_datagrams(
         program += [(_LOAD_WORD, 0, 0, _SOURCE), (_AND, 0, 0, int(peer.netmask)), network, _WHOLE]
     program.append(_WHOLE if peers is None else _DROP)
     code = array("B", b"".join(struct.pack("@HBBI", *instruction) for instruction in program))
-    # struct sock_fprog: the number of instructions and a pointer to the first
+    # The kernel expects struct sock_fprog: the number of instructions and a pointer to the first instruction.
     with suppress(OSError):
         packed = struct.pack("@HP", len(program), code.buffer_info()[0])
         bound.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, packed)
 
 
 AT_MOST = 16
-"""Maximum number of datagrams read per call, so that a flood does not delay the loop."""
+"""Maximum number of datagrams read per poll, so that a flood of datagrams does not delay the control loop."""
 
 _LOOK_EVERY = 10
-"""Polls between two checks that the socket's file exists: one second in flight."""
+"""Number of polls between two checks that the socket file exists. In flight, ten polls take one second."""
 
 
 class Channel(Protocol):
-    """Source of datagrams, each with the address for its answer."""
+    """Receiver of datagrams that also returns the address of each sender for the answer."""
 
     name: str
 
     def poll(self) -> list[tuple[bytes, Any]]:
-        """Return the received datagrams, oldest first. Never waits, never raises."""
+        """Return the received datagrams with their senders, oldest first. Never blocks, never raises."""
 
     def news(self) -> str:
         """Return a description of events since the last call, or an empty text."""
 
     def answer(self, data: bytes, sender: Any) -> None:
-        """Answer a sender that has an address and listens. Never waits, never raises."""
+        """Send an answer to a sender that has an address. Never blocks, never raises."""
 
     def close(self) -> None:
-        """Close. Safe to call twice."""
+        """Close the channel. A second call has no effect."""
 
 
 class DatagramChannel:
-    """Bound datagram socket. A UNIX socket whose file was removed is bound again."""
+    """Channel of a bound datagram socket. A UNIX socket whose file was removed is bound again."""
 
     def __init__(
         self,
@@ -488,7 +509,14 @@ class DatagramChannel:
         path: Path | None = None,
         peers: Sequence[IPv4Network] | None = None,
     ) -> None:
-        """Use a bound socket; remove `path` at the end, and ignore senders outside `peers` if given."""
+        """Use a bound socket.
+
+        Args:
+            name: name of the channel.
+            bound: bound datagram socket, which the channel closes.
+            path: file of a UNIX socket, removed when the channel closes; None for a UDP socket.
+            peers: networks of the accepted senders, None to accept all senders.
+        """
         self.name = name
         self._socket = bound
         self._path = path
@@ -500,7 +528,7 @@ class DatagramChannel:
         self._file = _identity(path)
 
     def poll(self) -> list[tuple[bytes, Any]]:
-        """Return the received datagrams, oldest first, cut to one byte more than the longest command."""
+        """Return the received datagrams, oldest first, each cut to one byte more than the longest command."""
         self._polls += 1
         if self._path is not None and not self._closed and self._polls % _LOOK_EVERY == 0:
             self._look(self._path)
@@ -508,7 +536,7 @@ class DatagramChannel:
         for _ in range(AT_MOST):
             try:
                 data, sender = self._socket.recvfrom(LONGEST + 1)
-            except OSError:  # no datagram waits, or ICMP reports that an earlier answer found no listener
+            except OSError:  # no datagram is waiting, or an ICMP error for an earlier answer
                 break
             if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
                 found.append((data, sender))
@@ -520,7 +548,7 @@ class DatagramChannel:
         return news
 
     def answer(self, data: bytes, sender: Any) -> None:
-        """Answer a sender that has an address."""
+        """Send an answer to a sender if it has an address."""
         if sender:
             with contextlib.suppress(OSError):
                 self._socket.sendto(data, sender)
@@ -534,7 +562,10 @@ class DatagramChannel:
                 self._path.unlink()
 
     def _look(self, path: Path) -> None:
-        """Bind the socket again if its file was removed or replaced; retry at the next check."""
+        """Bind the socket again if its file was removed or replaced.
+
+        After a failure the next check retries.
+        """
         if self._file is not None and _identity(path) == self._file:
             return
         try:
@@ -551,9 +582,10 @@ class DatagramChannel:
 
 
 def open_unix(path: Path) -> DatagramChannel:
-    """Bind a UNIX datagram socket that owner and group may write to. Raises UsageError.
+    """Bind a UNIX datagram socket that owner and group may write to.
 
-    A stale socket file, to which no process listens, is replaced; any other file is left unchanged.
+    A stale socket file without a listening process is replaced. Raises UsageError if another file has this
+    path, if a process listens at this path, or if the socket cannot be bound.
     """
     try:
         bound = _bound_unix(path)
@@ -564,7 +596,7 @@ def open_unix(path: Path) -> DatagramChannel:
 
 
 def _bound_unix(path: Path) -> socket.socket:
-    """Return a bound socket. Raises OSError."""
+    """Return a UNIX datagram socket bound to `path`. Raises OSError if it cannot be bound."""
     bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         with contextlib.suppress(FileNotFoundError):
@@ -586,7 +618,10 @@ def _bound_unix(path: Path) -> socket.socket:
 
 
 def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
-    """Bind a UDP socket to HOST:PORT; ignore senders outside `peers` if given. Raises UsageError."""
+    """Bind a UDP socket to HOST:PORT, which accepts only senders in `peers` unless `peers` is None.
+
+    Raises UsageError if the address cannot be bound.
+    """
     host, _, port = address.rpartition(":")
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -608,7 +643,7 @@ def _identity(path: Path | None) -> tuple[int, int] | None:
 
 
 def _is_served(path: Path) -> bool:
-    """Return whether a process listens to a socket file."""
+    """Return whether a process is bound to a socket file."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(str(path))

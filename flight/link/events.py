@@ -15,7 +15,7 @@ class Severity(IntEnum):
 
 
 class Reaction(IntEnum):
-    """Reaction to an event in addition to its record."""
+    """Action of the flight software after an event, in addition to recording the event."""
 
     NOTE = 0
     COILS_OFF = 1
@@ -28,7 +28,7 @@ class Reaction(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class EventKind:
-    """One row of the table. A code is never used for another event."""
+    """Kind of event: one row of the event table. The code of a removed event is never used again."""
 
     code: int
     name: str

@@ -1,14 +1,15 @@
 """Transfer frames of telecommands (CCSDS 232.0-B-4) and telemetry (132.0-B-3), and streams of frames.
 
 A telecommand frame has a header of 5 bytes, one space packet and a CRC of 2 bytes. All telecommand frames are
-of type BD (bypass, data), which the frame layer neither acknowledges nor retransmits; there is no segment
-header. Telemetry frames have a fixed length and contain space packets end to end. Their header of 6 bytes
-contains the first header pointer, the offset of the first packet that begins in the frame, by which a reader
-finds the next packet after a lost frame. Gaps are filled with idle packets. Both kinds carry the security
-header and trailer of CCSDS 355.0-B (`flight.link.security`).
+of type BD (bypass, data), which the frame layer neither acknowledges nor retransmits, and have no segment
+header. Telemetry frames have a fixed length and contain consecutive space packets. The telemetry frame header
+of 6 bytes contains the first header pointer: the offset of the first packet that begins in the frame. After a
+lost frame, the receiver finds the next packet by this pointer. An incomplete telemetry frame is filled up
+with an idle packet. Telecommand and telemetry frames carry the security header and trailer of CCSDS 355.0-B
+(`flight.link.security`).
 
-In a stream of bytes (serial line, TCP) each frame follows an attached sync marker (CCSDS 131.0-B), 1ACFFC1D
-in both directions. A radio that transmits CLTUs must create them itself.
+In a byte stream (serial line, TCP) each frame follows the attached sync marker 1ACFFC1D (CCSDS 131.0-B), in
+both directions. This software does not create CLTUs. A radio that transmits CLTUs must create them.
 """
 
 from __future__ import annotations
@@ -23,37 +24,40 @@ from knightcube.errors import FlightError
 TELECOMMAND_HEADER = struct.Struct(">HHB")
 LONGEST_FRAME = 1024
 TELECOMMAND_MASK = bytes((0, 0, 0xFC, 0, 0))
-"""Bits of the header that the MAC covers, those of the virtual channel (355.0-B-2, 2.3.2.3.3)."""
+"""Telecommand header bits covered by the MAC: the virtual channel (CCSDS 355.0-B-2, 2.3.2.3.3)."""
 
 _BYPASS = 1 << 13
 _CHANNEL_BITS = 10
 
 
 class FrameError(FlightError):
-    """Raised for bytes that are not a frame of this link; the text states the reason."""
+    """Raised for bytes that are not a frame of this link. The error text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class TelecommandHeader:
-    """The fields of the header that differ from frame to frame."""
+    """Fields of a telecommand frame header that differ between frames."""
 
     spacecraft: int
     channel: int
     sequence: int
 
     def pack(self, length: int) -> bytes:
-        """Return the header of a frame of `length` bytes."""
+        """Return the header of a telecommand frame of `length` bytes."""
         second = self.channel << _CHANNEL_BITS | (length - 1)
         return TELECOMMAND_HEADER.pack(_BYPASS | self.spacecraft, second, self.sequence % 256)
 
 
 def stated_length(header: bytes) -> int:
-    """Return the length (bytes) of a frame from its header of 5 bytes."""
+    """Return the frame length (bytes) that a telecommand frame header of 5 bytes states."""
     return (int.from_bytes(header[2:4], "big") & 0x3FF) + 1
 
 
 def open_telecommand(frame: bytes, spacecraft: int) -> bytes:
-    """Return a frame without its CRC. Raises FrameError for another spacecraft and for invalid frames."""
+    """Return a telecommand frame without its CRC.
+
+    Raises FrameError if the frame is for another spacecraft, is not of type BD or has a wrong length.
+    """
     if len(frame) < TELECOMMAND_HEADER.size + CRC_BYTES or stated_length(frame) != len(frame):
         raise FrameError("its length is wrong")
     first = int.from_bytes(frame[:2], "big")
@@ -63,13 +67,13 @@ def open_telecommand(frame: bytes, spacecraft: int) -> bytes:
 
 
 def close_frame(body: bytes) -> bytes:
-    """Return a frame with its CRC."""
+    """Return a frame with its CRC appended."""
     return body + crc16(body).to_bytes(CRC_BYTES, "big")
 
 
 TELEMETRY_HEADER = struct.Struct(">HBBH")
 TELEMETRY_MASK = bytes((0, 0x0E, 0, 0, 0, 0))
-"""Bits of the header that the MAC covers, those of the virtual channel (355.0-B-2, 2.3.2.3.3)."""
+"""Telemetry header bits covered by the MAC: the virtual channel (CCSDS 355.0-B-2, 2.3.2.3.3)."""
 
 NO_HEADER = 0x7FF
 """First header pointer of a frame in which no packet begins."""
@@ -77,48 +81,48 @@ NO_HEADER = 0x7FF
 IDLE = 0x7FF
 """APID of idle packets."""
 
-_STATUS = 0b11 << 11  # segment length identifier of packets, all flags zero
+_STATUS = 0b11 << 11  # frame status field: segment length identifier 11, all flags zero
 _LEAST_IDLE = HEADER_BYTES + 1
 
 Seal = Callable[[bytes, bytes], bytes]
-"""Function from header and data to the protected frame without CRC."""
+"""Function that returns the protected frame, without CRC, of a frame header and data."""
 
 
 @dataclass(slots=True)
 class MasterCount:
-    """Master channel frame count: the count of frames of all virtual channels."""
+    """Master channel frame count, which counts the frames of all virtual channels."""
 
     value: int = 0
 
 
 class TelemetryFramer:
-    """Packs the packets of one virtual channel into frames. Not thread-safe."""
+    """Framer that packs the packets of one virtual channel into telemetry frames. Not thread-safe."""
 
     def __init__(
         self, spacecraft: int, channel: int, data_bytes: int, master: MasterCount, seal: Seal
     ) -> None:
-        """Make frames with `data_bytes` bytes of packets each."""
+        """Make frames that each contain `data_bytes` bytes of packets."""
         self._first = spacecraft << 4 | channel << 1
         self._room = data_bytes
         self._master = master
         self._seal = seal
         self._count = 0
         self._data = bytearray()
-        self._starts: list[int] = []  # of packets, in _data
+        self._starts: list[int] = []  # offsets of packets in _data
 
     @property
     def waits(self) -> bool:
-        """Whether packets wait for a frame to fill up."""
+        """Whether an incomplete frame contains data."""
         return bool(self._data)
 
     def add(self, packet: bytes) -> list[bytes]:
-        """Add a packet and return the frames that are full."""
+        """Add a packet and return the frames that it completes."""
         self._starts.append(len(self._data))
         self._data += packet
         return [self._take() for _ in range(len(self._data) // self._room)]
 
     def flush(self) -> list[bytes]:
-        """Fill up the frame with an idle packet and return the full frames."""
+        """Fill the current frame with an idle packet and return the completed frames."""
         gap = self._room - len(self._data) % self._room
         length = gap if gap >= _LEAST_IDLE else gap + self._room
         return self.add(idle_packet(length))
@@ -135,23 +139,23 @@ class TelemetryFramer:
 
 
 def idle_packet(length: int) -> bytes:
-    """Return an idle packet of `length` bytes, at least 7."""
+    """Return an idle packet of `length` bytes. The minimum length is 7 bytes."""
     size = length - HEADER_BYTES
     return struct.pack(">HHH", IDLE, UNSEGMENTED, size - 1) + bytes(size)
 
 
 class PacketAssembler:
-    """Finds the packets of one virtual channel in the data of its frames."""
+    """Decoder that extracts the packets of one virtual channel from telemetry frames."""
 
     def __init__(self) -> None:
         self._count: int | None = None
-        self._rest: bytes | None = None  # begin of an incomplete packet; None until a packet begins
+        self._rest: bytes | None = None  # received bytes of an incomplete packet
         self.lost_frames = 0
 
     def add(self, header: bytes, data: bytes) -> list[bytes]:
-        """Return the packets that end in a frame, without idle packets.
+        """Return the packets that end in a frame, except idle packets.
 
-        A gap in the frame count loses the packets that continue across the gap.
+        If frames were lost, packets that began before or in the lost frames are discarded.
         """
         _, _, count, status = TELEMETRY_HEADER.unpack(header)
         if self._count is not None and (gap := (count - self._count - 1) % 256):
@@ -180,7 +184,10 @@ class PacketAssembler:
 
 
 def open_telemetry(frame: bytes, spacecraft: int) -> tuple[bytes, bytes, int]:
-    """Return header, protected rest and virtual channel of a frame. Raises FrameError."""
+    """Return the header, the protected data and the virtual channel of a telemetry frame.
+
+    Raises FrameError for a frame that is too short or comes from another spacecraft.
+    """
     if len(frame) < TELEMETRY_HEADER.size + CRC_BYTES:
         raise FrameError("its length is wrong")
     (first,) = struct.unpack_from(">H", frame)
@@ -193,18 +200,23 @@ SYNC = bytes.fromhex("1ACFFC1D")
 
 
 class FrameStream:
-    """Finds the frames in received bytes. Not thread-safe."""
+    """Decoder that extracts frames from a byte stream by their sync markers. Not thread-safe."""
 
     def __init__(self, length_of: Callable[[bytes], int], header_bytes: int) -> None:
-        """Find frames whose length (bytes) `length_of` computes from their first `header_bytes` bytes."""
+        """Find frames in a byte stream.
+
+        Args:
+            length_of: function that returns the length (bytes) of a frame from its header.
+            header_bytes: length (bytes) of the header that `length_of` needs.
+        """
         self._length_of = length_of
         self._header_bytes = header_bytes
         self._data = b""
 
     def add(self, data: bytes) -> list[bytes]:
-        """Return the frames that end in `data`, including frames with a wrong CRC.
+        """Add received bytes and return the frames that are now complete, including frames with a wrong CRC.
 
-        After a wrong CRC the search continues inside that frame.
+        If the CRC of a frame is wrong, the search for the next sync marker continues inside that frame.
         """
         self._data += data
         found: list[bytes] = []
@@ -224,10 +236,10 @@ class FrameStream:
 
 
 def telecommand_stream() -> FrameStream:
-    """Return a stream of telecommand frames, whose header states their length."""
+    """Return a decoder of telecommand frames, whose headers state the frame length."""
     return FrameStream(stated_length, TELECOMMAND_HEADER.size)
 
 
 def telemetry_stream(frame_bytes: int) -> FrameStream:
-    """Return a stream of telemetry frames of `frame_bytes` bytes."""
+    """Return a decoder of telemetry frames of `frame_bytes` bytes."""
     return FrameStream(lambda _: frame_bytes, 0)

@@ -1,4 +1,4 @@
-"""Modes of the satellite, with their names in packets, commands and configurations."""
+"""Modes of the satellite with their names and packet values."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from enum import IntEnum
 
 
 class Mode(IntEnum):
-    """Mode of the satellite; the values are those of the mode packet."""
+    """Mode of the satellite. The enumeration values are the values in the mode packet."""
 
     BOOT = 0
     """The coils are at zero until the devices deliver valid data."""
     SAFE = 1
-    """The testbed's coils are at zero. A satellite detumbles and turns to the Sun by its solar strings."""
+    """A testbed sets its coils to zero; a satellite detumbles and points its solar cells to the Sun."""
     DETUMBLE = 2
-    """The coils reduce the rate by the magnetometer alone."""
+    """The coils reduce the body rate by magnetometer measurements alone."""
     HOLD = 3
     """The body holds an attitude."""
     SLEW = 4
     """The body slews to a commanded attitude."""
     TESTBED_DEMO = 5
-    """The testbed flies the configured steps."""
+    """The testbed executes the configured sequence of demonstration steps."""
     ACQUIRE = 6
-    """The coils are at zero while the attitude of the slowly rotating body is determined."""
+    """The coils are at zero while the satellite, which rotates slowly, determines its attitude."""
     SUN = 7
     """The satellite points to the Sun."""
     POINT = 8
@@ -29,12 +29,12 @@ class Mode(IntEnum):
 
     @property
     def label(self) -> str:
-        """The mode's name for people, configurations and commands."""
+        """Name of the mode in configurations, commands and reports."""
         return self.name.lower().replace("_", "-")
 
     @classmethod
     def named(cls, label: str) -> Mode:
-        """Return the mode of a label. Raises ValueError for an unknown label."""
+        """Return the mode with a given label. Raises ValueError for an unknown label."""
         for mode in cls:
             if mode.label == label:
                 return mode
@@ -42,13 +42,13 @@ class Mode(IntEnum):
 
 
 COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO, Mode.SUN, Mode.POINT)
-"""The modes that can be commanded; BOOT ends by itself, and detumbling leads to ACQUIRE."""
+"""Modes that can be commanded. The modes BOOT and ACQUIRE are entered only automatically."""
 
 POINTING = frozenset({Mode.SUN, Mode.POINT})
-"""The modes of a satellite that knows its attitude."""
+"""Modes that require a known attitude of the satellite in its orbit."""
 
 ORBITAL = POINTING | {Mode.ACQUIRE}
-"""The modes of a body that must acquire its attitude."""
+"""Modes that exist only on a satellite in orbit, which must first acquire its attitude."""
 
 STEERING = POINTING | {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
-"""The modes in which planner and controller rotate the body."""
+"""Modes in which the planner and the controller steer the attitude."""

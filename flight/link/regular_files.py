@@ -1,6 +1,7 @@
-"""Bounded reading, durable writing and locking of regular files.
+"""Reading regular files with a size limit, durable writing and file locks.
 
-Opening a FIFO at the path of a file would block, and reading a sparse file would exhaust the memory.
+A FIFO at the path of an expected file would block the reader, and a huge sparse file would exhaust the
+memory.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from knightcube.errors import UsageError
 def read_regular(path: Path, most: int) -> bytes | None:
     """Return the content of a file of at most `most` bytes, None if the file does not exist.
 
-    Type and size are checked before reading. Raises OSError for a longer file and for a path that is not a
-    regular file.
+    The file's type and size are checked before reading. Raises OSError for a file longer than `most` bytes
+    and for a path that is not a regular file.
     """
     try:
         file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -43,7 +44,7 @@ def read_regular(path: Path, most: int) -> bytes | None:
 
 
 def make_lasting(folder: Path) -> None:
-    """Sync a folder, so that the names of its files survive a loss of power. Raises OSError."""
+    """Sync a folder to disk, so that the names of its files survive a power loss. Raises OSError."""
     names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(names)
@@ -52,7 +53,7 @@ def make_lasting(folder: Path) -> None:
 
 
 def overwrite(path: Path, data: bytes) -> bool:
-    """Overwrite a file in place durably, and return whether this succeeded."""
+    """Overwrite a file in place and sync it to disk. Return whether this succeeded."""
     try:
         new = not path.exists()
         # Without O_NONBLOCK, opening a FIFO at this path would block.
@@ -73,7 +74,10 @@ def overwrite(path: Path, data: bytes) -> bool:
 
 @contextmanager
 def locked(path: Path, problem: str) -> Iterator[None]:
-    """Hold the lock of a file. Raises UsageError with `problem` if another process holds it."""
+    """Hold the lock of a file.
+
+    Raises UsageError with the text `problem` if another process holds the lock.
+    """
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         try:

@@ -1,17 +1,18 @@
-"""Security of the link (CCSDS 355.0-B-2): keys and counters on disk, authentication, replay protection.
+"""Link security (CCSDS 355.0-B-2): stored keys and counters, encryption, authentication, replay protection.
 
-Frames use AES-256-GCM in both directions: security header (SPI 2 bytes, IV 12 bytes), ciphertext, MAC (16
-bytes). The IV is the frame's counter, which is used only once under a key. The MAC covers the virtual
-channel, the SPI and the data; the IV is the nonce. Yamcs covers the same bits.
+Frames in both directions are protected by AES-256-GCM. A protected frame contains the SPI (2 bytes), the IV
+(12 bytes), the ciphertext and the MAC (16 bytes). The IV, which is the nonce, is a counter that is never
+repeated under the same key. The MAC covers the virtual channel, the SPI and the data, as in Yamcs.
 
-Key and counter of each SPI are stored in two copies. A copy is a record of fixed size that ends in its
-CRC-32. Both copies are overwritten in place, one after the other: this needs no space on a full disk, and a
-crash damages one copy at most. The newer copy is valid; it has the later key or the higher counter. A
-folder holds the associations of one end of the link, and only its owner may read the files.
+The key and counter of each SPI are stored in two files. Each file is a record of fixed size that ends with a
+CRC-32. Both files are overwritten in place, one after the other, so that a full disk does not prevent the
+update and a crash damages at most one copy. If the two copies differ, the copy with the newer key or the
+higher counter is used. One folder holds the security associations of one end of the link, and only the
+folder's owner may read them.
 
-A gate checks CRC, spacecraft, SPI, MAC and counter in this order. A frame that fails a check changes only the
-count of refusals for that cause. The counter of a frame is durable before its data are used, so that a crash
-cannot lead to a second acceptance of the frame.
+A gate checks the CRC, spacecraft, SPI, MAC and counter of a frame in this order. A refused frame has no
+effect except on the count of refusals by cause. The counter of an accepted frame is stored durably before the
+frame's data are used, so that the same frame cannot be accepted again after a crash.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def _authenticated(header: bytes, mask: bytes, spi: bytes) -> bytes:
 
 
 def protect(cipher: AESGCM, spi: int, counter: int, header: bytes, mask: bytes, data: bytes) -> bytes:
-    """Return header, security header, ciphertext and MAC; `mask` selects the header bits of the MAC."""
+    """Return header, security header, ciphertext and MAC. The MAC covers the header bits in `mask`."""
     index, iv = spi.to_bytes(SPI_BYTES, "big"), counter.to_bytes(IV_BYTES, "big")
     return header + index + iv + cipher.encrypt(iv, data, _authenticated(header, mask, index))
 
@@ -64,12 +65,12 @@ def spi_of(protected: bytes) -> int:
 
 
 def counter_of(protected: bytes) -> int:
-    """Return the counter of a frame, which is authentic only if `unprotect` succeeds."""
+    """Return the counter of a frame. The counter is authentic only if `unprotect` accepts the frame."""
     return int.from_bytes(protected[SPI_BYTES:SECURITY_HEADER_BYTES], "big")
 
 
 def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> bytes | None:
-    """Return the data of a frame that begins with its security header, None if the MAC is wrong."""
+    """Return the decrypted data of a protected frame, None if the MAC is wrong."""
     index, iv = protected[:SPI_BYTES], protected[SPI_BYTES:SECURITY_HEADER_BYTES]
     try:
         return cipher.decrypt(iv, protected[SECURITY_HEADER_BYTES:], _authenticated(header, mask, index))
@@ -78,13 +79,13 @@ def unprotect(cipher: AESGCM, header: bytes, mask: bytes, protected: bytes) -> b
 
 
 COMMAND_SPIS = (1, 2)
-"""Primary and reserve SPI of commands."""
+"""Primary and reserve SPI of command frames."""
 
 TELEMETRY_SPIS = (3, 4)
-"""Primary and reserve SPI of telemetry."""
+"""Primary and reserve SPI of telemetry frames."""
 
 HIGHEST_COUNTER = 2**63
-"""Largest accepted counter. A sender of a thousand frames per second reaches it in 292 million years."""
+"""Largest accepted counter. A sender of 1000 frames per second reaches this value after 292 million years."""
 
 COPIES = ("a", "b")
 
@@ -96,7 +97,7 @@ _LOCK, _OWNER = "lock", "owner"
 
 @dataclass(frozen=True, slots=True, order=True)
 class Association:
-    """Key and counter of an SPI: `unused` is the lowest unused counter of this key."""
+    """Security association: the key of an SPI and the lowest counter that is unused with this key."""
 
     spi: int
     generation: int
@@ -105,21 +106,21 @@ class Association:
 
     @property
     def cipher(self) -> AESGCM:
-        """AES-256-GCM under this key."""
+        """AES-256-GCM cipher with the key of this association."""
         return AESGCM(self.key)
 
 
 def encode(association: Association) -> bytes:
-    """Return the bytes of a stored copy."""
+    """Return the record that stores an association."""
     a = association
     record = _RECORD.pack(_MAGIC, a.spi, a.generation, a.unused, a.key)
     return record + zlib.crc32(record).to_bytes(_CRC_BYTES, "big")
 
 
 def decode(data: bytes) -> Association | None:
-    """Return the association of a stored copy, None for bytes that `encode` does not produce.
+    """Return the association in a stored record, None if the record is damaged or invalid.
 
-    A copy with a counter beyond `HIGHEST_COUNTER` is invalid, because no gate or sealer produces one.
+    A record with a counter above `HIGHEST_COUNTER` is invalid, because no such counter is ever used.
     """
     record, crc = data[: _RECORD.size], data[_RECORD.size :]
     if len(record) != _RECORD.size or zlib.crc32(record).to_bytes(_CRC_BYTES, "big") != crc:
@@ -130,10 +131,10 @@ def decode(data: bytes) -> Association | None:
 
 
 class Vault:
-    """Stored associations of a folder, which several processes of one user may share."""
+    """Folder of stored security associations, which several processes of the same user may share."""
 
     def __init__(self, folder: Path) -> None:
-        """Open a folder. Raises UsageError if it does not exist or if others may read its files."""
+        """Open a folder. Raises UsageError if it does not exist or if other users may read its files."""
         self._folder = folder
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder; `python -m ground keys` makes keys")
@@ -143,12 +144,15 @@ class Vault:
 
     @property
     def folder(self) -> Path:
-        """Folder of the associations."""
+        """Path of the folder of associations."""
         return self._folder
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against writes of other processes. Raises FlightError if it cannot be written."""
+        """Lock the folder against writes by other processes.
+
+        Raises FlightError if the lock file cannot be opened.
+        """
         with ExitStack() as stack:
             try:
                 file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -160,12 +164,15 @@ class Vault:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Lock the folder against a second link process. Raises UsageError if another process owns it."""
+        """Lock the folder against a second link process.
+
+        Raises UsageError if another link process uses it.
+        """
         with locked(self._folder / _OWNER, f"{self._folder}: another link process has these counters"):
             yield
 
     def read(self, name: int | str) -> Association | None:
-        """Return the newest valid copy of an association, None if both copies are lost."""
+        """Return the newest valid copy of an association, None if both copies are missing or damaged."""
         return max(self._copies(name), default=None)
 
     def copies(self, name: int | str) -> int:
@@ -174,15 +181,15 @@ class Vault:
         return found.count(max(found)) if found else 0
 
     def write(self, association: Association, name: int | str | None = None) -> int:
-        """Write both copies and return the number of durable copies, 0 if the disk fails. Never raises."""
+        """Write both copies of an association and return how many writes succeeded. Never raises."""
         data = encode(association)
         spi = association.spi if name is None else name
         return sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
 
     def advance(self, association: Association) -> int:
-        """Write both copies unless another process wrote a newer one; return the number of durable copies.
+        """Write both copies of an association unless another process has stored a newer association.
 
-        The number is 0 if the disk fails or is read-only.
+        Returns the number of valid stored copies, 0 if the disk fails or is read-only.
         """
         try:
             with self.locked():
@@ -194,7 +201,7 @@ class Vault:
             return 0
 
     def remove(self, name: int | str) -> None:
-        """Remove an association."""
+        """Delete both copies of an association."""
         for copy in COPIES:
             self._path(name, copy).unlink(missing_ok=True)
 
@@ -215,14 +222,14 @@ class Vault:
 
 
 WINDOW = 65_536
-"""Largest lead of a command's counter over the highest accepted counter, which telemetry shows."""
+"""Largest accepted gap between the counter of a command frame and the lowest unused counter."""
 
 NEXT = "next"
-"""Suffix of the name of an SPI's next key, which the other end may already use."""
+"""Suffix of the name under which the next key of an SPI is stored during a key change."""
 
 
 class Refusal(Enum):
-    """Cause of the refusal of a frame."""
+    """Reason why a frame was refused."""
 
     CRC = "its CRC is wrong"
     HEADER = "it is not a frame of this spacecraft"
@@ -235,7 +242,7 @@ class Refusal(Enum):
 
 
 class RefusedError(FlightError):
-    """Raised for a refused frame; `counter` is the counter of an authentic frame, else None."""
+    """Raised for a refused frame. The attribute `counter` is None unless the frame is authentic."""
 
     def __init__(self, cause: Refusal, spi: int = 0, counter: int | None = None) -> None:
         super().__init__(cause.value)
@@ -246,7 +253,7 @@ class RefusedError(FlightError):
 
 @dataclass(frozen=True, slots=True)
 class Admitted:
-    """Data of an accepted frame."""
+    """Content of an accepted frame: SPI, counter, header and decrypted data."""
 
     spi: int
     counter: int
@@ -255,14 +262,14 @@ class Admitted:
 
 
 Parse = Callable[[bytes], tuple[bytes, bytes]]
-"""Function that splits a frame of valid CRC into its header and protected rest; raises FrameError."""
+"""Function that splits a frame with valid CRC into header and protected data, or raises FrameError."""
 
 
 class Gate:
-    """Authenticates frames of one direction and rejects replays.
+    """Receiver that authenticates frames of one direction and rejects replays.
 
     Attributes:
-        refused: number of refused frames by cause.
+        refused: number of refused frames for each cause.
         admitted: number of accepted frames.
     """
 
@@ -275,9 +282,10 @@ class Gate:
         window: int = WINDOW,
         store_every: int = 1,
     ) -> None:
-        """Accept frames of `spis`; a lost copy of an association is restored from the other copy.
+        """Accept frames of the given SPIs and restore lost copies of their associations.
 
-        With `store_every` above 1, for telemetry on the ground, only every such counter is made durable.
+        If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground uses
+        this for telemetry.
         """
         self._vault = vault
         self._parse = parse
@@ -294,11 +302,14 @@ class Gate:
         self.admitted = 0
 
     def association(self, spi: int) -> Association | None:
-        """Return the current association of an SPI, None if both copies are lost."""
+        """Return the current association of an SPI, None if both stored copies are lost."""
         return self._open[spi]
 
     def admit(self, frame: bytes) -> Admitted:
-        """Return the data of a frame, whose repetition is refused from now on. Raises RefusedError."""
+        """Return the content of an accepted frame; raise RefusedError for a refused frame.
+
+        The same frame is refused if it is received again.
+        """
         try:
             admitted = self._admit(frame)
         except RefusedError as error:
@@ -308,7 +319,7 @@ class Gate:
         return admitted
 
     def replace_key(self, spi: int, generation: int, key: bytes) -> bool:
-        """Change the key of an SPI and reset its counter to 0; return whether the change is durable."""
+        """Change the key of an SPI and reset the SPI's counter to 0. Return whether the change was stored."""
         changed = Association(spi, generation, 0, key)
         if self._vault.write(changed) == 0:
             return False
@@ -317,7 +328,7 @@ class Gate:
         return True
 
     def close(self) -> None:
-        """Make all counters durable."""
+        """Store all counters durably."""
         for entry in self._open.values():
             if entry is not None and entry.unused > self._stored[entry.spi]:
                 self._vault.advance(entry)
@@ -350,7 +361,7 @@ class Gate:
         return Admitted(spi, counter, header, data)
 
     def _read_again(self, spi: int) -> Association:
-        """Read an association that could not be read before. Raises RefusedError if it is lost."""
+        """Try again to read a missing association. Raises RefusedError if both stored copies are lost."""
         entry = self._vault.read(spi)
         if entry is None:
             raise RefusedError(Refusal.LOST, spi)
@@ -364,7 +375,10 @@ class Gate:
         return known
 
     def _by_next_key(self, spi: int, header: bytes, protected: bytes) -> tuple[Association, bytes]:
-        """Return association and data of a frame under the next key, if the other end already uses it."""
+        """Return the association and the data of a frame if the sender already uses the next key.
+
+        Raises RefusedError if the frame does not authenticate with the next key either.
+        """
         following = self._vault.read(f"{spi}-{NEXT}") if self._store_every > 1 else None
         if following is not None:
             data = unprotect(following.cipher, header, self._mask, protected)
@@ -376,12 +390,12 @@ class Gate:
 
 
 class Sealer:
-    """Protects sent frames under one SPI; each counter is reserved on disk before its frame is made."""
+    """Sender that protects frames of one SPI. A counter is reserved on disk before it is used in a frame."""
 
     def __init__(self, vault: Vault, name: int | str, mask: bytes, block: int = 1) -> None:
-        """Use the SPI, or the name of its next key, and reserve `block` counters at a time.
+        """Protect frames with the association `name`, and reserve `block` counters at a time.
 
-        Counters that are reserved but unused at a crash are never used.
+        Counters that were reserved but not used before a crash are skipped.
         """
         self._vault = vault
         self._name = name
@@ -393,14 +407,17 @@ class Sealer:
         self._cipher: AESGCM | None = None
 
     def replace_key(self, generation: int, key: bytes) -> bool:
-        """Change the key and reset the counter to 0; return whether the change is durable."""
+        """Change the key and reset the counter to 0. Return whether the change was stored."""
         if self._vault.write(Association(self._spi, generation, 0, key)) == 0:
             return False
         self._next = self._end = 0
         return True
 
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
-        """Return a protected frame without CRC, and its counter. Raises FlightError if no counter is free."""
+        """Return a protected frame, without CRC, and its counter.
+
+        Raises FlightError if no further counter can be reserved.
+        """
         if self._next == self._end:
             self._reserve()
         assert self._cipher is not None
@@ -423,5 +440,5 @@ class Sealer:
 
 
 def new_key() -> bytes:
-    """Return a new key from the system's random numbers."""
+    """Return a new key from the random number generator of the operating system."""
     return secrets.token_bytes(KEY_BYTES)

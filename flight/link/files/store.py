@@ -1,6 +1,7 @@
-"""Durable state of file transfers: records of open transfers, last number, last endings, received files.
+"""State of file transfers on disk: open transfers, transaction numbers, ended transfers and received files.
 
-A record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new record.
+Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the new
+record.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ from flight.link.regular_files import locked, make_lasting, read_regular
 from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
-"""Maximum length (bytes) of a file name, including the zero at its end in a command."""
+"""Maximum length (bytes) of a file name in a command, including the terminating zero byte."""
 _PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,63}")
 _MOST_PARTS = 4
 _KEPT_ENDINGS = 64
 _FREE_BYTES = 64 << 20
 """Free disk space (bytes) that received files must not use."""
 _LONGEST_RECORD = 4 << 20
-"""Maximum length (bytes) of a record. A file of 64 MiB without every second unit needs less than 1 MB."""
+"""Maximum length (bytes) of a stored record.
+
+The record of a 64 MiB file of which every second segment is missing needs less than 1 MB.
+"""
 
 _Entity = Annotated[int, Meta(ge=0, le=(1 << 16) - 1)]
 _Long = Annotated[int, Meta(ge=0, le=HIGHEST_NUMBER)]
@@ -37,11 +41,15 @@ T = TypeVar("T")
 
 
 class FileError(FlightError):
-    """Raised if a file or transfer is not possible; the text states the reason."""
+    """Raised if a file operation or transfer is not possible. The error text states the reason."""
 
 
 class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Outgoing transfer of the file `path` under `name`; `origin` identifies its command."""
+    """Stored state of an outgoing transfer.
+
+    The receiver stores the file `path` under the name `name`. The attribute `origin` identifies the command
+    that started the transfer.
+    """
 
     number: _Long
     destination: _Entity
@@ -55,7 +63,7 @@ class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Incoming transfer: its metadata and EOF as received, the ranges on disk, and its end."""
+    """Stored state of an incoming transfer: received metadata and EOF, byte ranges on disk, and result."""
 
     source: _Entity
     number: _Long
@@ -68,7 +76,7 @@ class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """End of an incoming transfer, which answers repeated units of its sender."""
+    """Result of an ended incoming transfer, stored to answer units that the sender repeats."""
 
     source: _Entity
     number: _Long
@@ -83,7 +91,10 @@ class _Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def problem_of_name(name: str) -> str:
-    """Return why a file name is not allowed, or an empty text; no allowed name leaves its folder."""
+    """Return why a file name is not allowed, or an empty text.
+
+    An allowed name never leads out of the folder of received files.
+    """
     parts = name.split("/")
     if len(name.encode()) >= LONGEST_NAME or len(parts) > _MOST_PARTS:
         return f"{name[:LONGEST_NAME]!r} is too long for the name of a file"
@@ -93,21 +104,21 @@ def problem_of_name(name: str) -> str:
 
 
 def files_folder(keys: Path) -> Path:
-    """Return the folder of the files of one end of the link, beside its folder of keys."""
+    """Return the folder for transferred files, which is a sibling of the folder of keys."""
     return keys.absolute().parent / "files"
 
 
 class Store:
-    """Folder of one entity, which only one process may use.
+    """Folder with the state of one CFDP entity. Only one process may use the folder.
 
     Attributes:
         received: folder of received files.
         last: last assigned transaction number.
-        endings: ends of incoming transfers, oldest first.
+        endings: results of ended incoming transfers, oldest first.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Create the folder if it does not exist. Raises UsageError."""
+        """Create the folder if it does not exist. Raises UsageError if it cannot be created."""
         self._folder = folder / "transfers"
         self.received = folder / "received"
         try:
@@ -125,26 +136,29 @@ class Store:
             yield
 
     def new_number(self, utc_ns: int) -> int:
-        """Reserve a number durably, above all earlier numbers even if their record was lost."""
+        """Reserve and store a new transaction number.
+
+        The number is at least the UTC in seconds, so that it is new even if the last number was lost.
+        """
         self._write_numbers(max(self.last + 1, utc_ns // 10**9) & HIGHEST_NUMBER or 1, self.endings)
         return self.last
 
     def add_ending(self, ending: Ending) -> None:
-        """Store the end of a transfer."""
+        """Store the result of an ended incoming transfer."""
         self._write_numbers(self.last, (*self.endings, ending)[-_KEPT_ENDINGS:])
 
     def outgoing(self) -> list[Outgoing]:
-        """Return the open outgoing transfers; damaged records are ignored."""
+        """Return the open outgoing transfers, ignoring damaged records."""
         found = (_read(path, Outgoing) for path in sorted(self._folder.glob("out-*.json")))
         return [record for record in found if record is not None]
 
     def incoming(self) -> list[Incoming]:
-        """Return the open incoming transfers; damaged records are ignored."""
+        """Return the open incoming transfers, ignoring damaged records."""
         found = (_read(path, Incoming) for path in sorted(self._folder.glob("in-*.json")))
         return [record for record in found if record is not None]
 
     def save(self, record: Outgoing | Incoming) -> None:
-        """Make a record durable. Raises FileError."""
+        """Store a record durably. Raises FileError if the disk cannot be written."""
         write_whole(self._path(record), msgspec.json.encode(record))
 
     def remove(self, record: Outgoing | Incoming) -> None:
@@ -155,11 +169,11 @@ class Store:
                 self.part(record).unlink(missing_ok=True)
 
     def part(self, record: Incoming) -> Path:
-        """Return the path of the data of an incoming file until it is complete."""
+        """Return the path of the data of an incomplete incoming file."""
         return self._path(record).with_suffix(".part")
 
     def place(self, record: Incoming) -> None:
-        """Move a complete file to the path of its name. Raises FileError."""
+        """Move a completely received file to its final path. Raises FileError if it cannot be moved."""
         assert record.name is not None
         target = self.received / record.name
         try:
@@ -170,7 +184,7 @@ class Store:
             raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
 
     def room(self) -> int:
-        """Return the free disk space (bytes) for a received file."""
+        """Return the disk space (bytes) available for received files."""
         return max(0, shutil.disk_usage(self._folder).free - _FREE_BYTES)
 
     def _path(self, record: Outgoing | Incoming) -> Path:
@@ -184,7 +198,7 @@ class Store:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file durably. Raises FileError."""
+    """Replace a file atomically and durably. Raises FileError if the disk cannot be written."""
     beside = path.with_name(path.name + "~")
     try:
         with beside.open("wb") as file:
@@ -198,7 +212,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def _read(path: Path, shape: type[T]) -> T | None:
-    """Return a record, None if it is missing or damaged."""
+    """Return the record stored in a file, None if the file is missing or damaged."""
     try:
         data = read_regular(path, _LONGEST_RECORD)
         return None if data is None else msgspec.json.decode(data, type=shape)

@@ -1,11 +1,12 @@
-"""File transfers by CFDP, class 2 (CCSDS 727.0-B-5): sender, receiver, and the entity that runs them.
+"""File transfers by CFDP class 2 (CCSDS 727.0-B-5): sender, receiver, and the entity that manages them.
 
-The receiver writes data to disk before the record says so, and writes the record once a second. A killed
-process therefore requests at most one second of data again. Each EOF is acknowledged, also a repeated one.
+Once a second, the receiver syncs the received data to disk and then stores the record of received ranges.
+After a kill, at most one second of data is requested again. Each EOF is acknowledged, including repeated
+EOFs.
 
-An entity is one end of all file transfers. Its owner requests a unit whenever the line has room for one.
-Replies come first, then units of the transfers in turn. An entity never waits and has no clock. The store
-holds the state that survives a restart of the process.
+An entity is one end of all file transfers. The caller asks the entity for the next unit whenever a unit can
+be sent. Replies are sent first, followed by units of the open transfers in round-robin order. An entity never
+blocks and gets the time from its caller. State that survives a restart of the process is kept in the store.
 """
 
 from __future__ import annotations
@@ -49,15 +50,18 @@ _PORTION = 1 << 20
 
 
 class FileSum:
-    """Checksum (CCSDS 727.0-B-5, 4.2.5) of the first `size` bytes of a file, one portion per `step`."""
+    """Checksum of a file (CCSDS 727.0-B-5, 4.2.5), computed in steps of limited duration."""
 
     def __init__(self, path: Path, kind: int, size: int) -> None:
-        """Begin a checksum of type `kind`, one of `TYPES`."""
+        """Prepare the checksum of type `kind` of the first `size` bytes of the file."""
         self._path, self._kind, self._left = path, kind, size
         self._at = self._value = 0
 
     def step(self) -> int | None:
-        """Read a portion; return the checksum after the last portion, else None. Raises OSError."""
+        """Process the next 1 MiB and return the checksum at the end of the file, None before.
+
+        Raises OSError if the file cannot be read or is too short.
+        """
         if self._left:
             with self._path.open("rb") as file:
                 file.seek(self._at)
@@ -71,7 +75,10 @@ class FileSum:
 
 
 def add(kind: int, value: int, data: bytes) -> int:
-    """Return the checksum `value` continued over `data`; all pieces except the last are whole words."""
+    """Return the checksum `value` updated by `data`.
+
+    For the modular checksum, the length of all blocks except the last must be a multiple of 4 bytes.
+    """
     if kind == CRC32:
         return zlib.crc32(data, value)
     words = np.frombuffer(data + bytes(-len(data) % 4), dtype=">u4")
@@ -79,7 +86,7 @@ def add(kind: int, value: int, data: bytes) -> int:
 
 
 class Ranges:
-    """Set of bytes of a file, stored as sorted, disjoint, half-open ranges."""
+    """Set of byte offsets in a file, stored as sorted, disjoint, half-open ranges."""
 
     def __init__(self, pairs: Iterable[tuple[int, int]] = ()) -> None:
         self._begins: list[int] = []
@@ -92,7 +99,7 @@ class Ranges:
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """The ranges (begin, end), in order."""
+        """Byte ranges (begin, end) in ascending order."""
         return list(zip(self._begins, self._ends, strict=True))
 
     @property
@@ -102,11 +109,11 @@ class Ranges:
 
     @property
     def end(self) -> int:
-        """End of the last range, 0 for an empty set."""
+        """End of the last byte range, 0 for an empty set."""
         return self._ends[-1] if self._ends else 0
 
     def add(self, begin: int, end: int) -> None:
-        """Add a range and merge it with adjacent ranges."""
+        """Add a byte range and merge it with overlapping or adjacent ranges."""
         if begin >= end:
             return
         first = bisect_left(self._ends, begin)
@@ -116,7 +123,10 @@ class Ranges:
         self._begins[first:last], self._ends[first:last] = [begin], [end]
 
     def take(self, most: int) -> tuple[int, int]:
-        """Remove and return the first range, at most `most` bytes. Raises IndexError if the set is empty."""
+        """Remove and return at most `most` bytes at the beginning of the first range.
+
+        Raises IndexError if the set is empty.
+        """
         begin, end = self._begins[0], min(self._ends[0], self._begins[0] + most)
         self._begins[0] = end
         if end == self._ends[0]:
@@ -124,7 +134,7 @@ class Ranges:
         return begin, end
 
     def gaps(self, size: int) -> list[tuple[int, int]]:
-        """Return the ranges of 0 to `size` that are not in the set."""
+        """Return the byte ranges between 0 and `size` that are missing from the set."""
         edges = [0, *(edge for pair in self.pairs for edge in pair), size]
         between = [(edges[i], min(edges[i + 1], size)) for i in range(0, len(edges), 2)]
         return [(begin, end) for begin, end in between if begin < end]
@@ -135,12 +145,13 @@ _LONGEST_NS = 60_000_000_000
 
 
 class Timer:
-    """Retry timer: due after each silent period, which doubles after a few retries.
+    """Retry timer, which expires if nothing is received for one period.
 
-    The other end may be out of sight for long, so that retries become rare.
+    After a few retries the period doubles with each retry, up to one minute, because the other end may be out
+    of radio contact for hours.
 
     Attributes:
-        times: number of retries since the last unit of the other end.
+        times: number of retries since the other end last sent a unit.
     """
 
     def __init__(self, period_ns: int, now_ns: int) -> None:
@@ -154,38 +165,39 @@ class Timer:
         return now_ns - self._since_ns >= min(max(self._period_ns, _LONGEST_NS), longer)
 
     def asked(self, now_ns: int) -> None:
-        """Count a retry and begin the next period."""
+        """Count a retry and restart the period."""
         self._since_ns = now_ns
         self.times += 1
 
     def heard(self, now_ns: int) -> None:
-        """Reset the timer after a unit of the other end."""
+        """Reset the timer because a unit was received from the other end."""
         self._since_ns = now_ns
         self.times = 0
 
 
 ASK_NS = 5_000_000_000
 _EOF_TRIES = 20
-"""Maximum number of EOF units that announce a cancelled transfer."""
+"""Maximum number of unacknowledged EOF units that a sender sends for a cancelled transfer."""
 
 
 class Sender:
-    """Source side of one transfer.
+    """Sending side of one file transfer.
 
-    The file is sent once, then the ranges that the other end requests, until it has the whole file. A sender
-    never gives up, because the other end may be out of sight. After a restart it sends only metadata and EOF,
-    and the other end requests the missing ranges. The checksum is computed in portions while data are sent.
+    The sender sends the whole file once, and then each range that the receiver requests, until the receiver
+    has the whole file. A sender never gives up, because the receiver may be out of radio contact. After a
+    restart the sender sends only metadata and EOF, and the receiver requests the missing ranges. The checksum
+    of the file is computed in steps while data are sent.
 
     Attributes:
         record: stored state of the transfer.
-        condition: condition code of its end, None while it is open.
-        said: text about its end.
+        condition: condition code with which the transfer ended, None while it is open.
+        said: text about the end of the transfer.
     """
 
     def __init__(
         self, source: int, record: Outgoing, save: Callable[[Outgoing], None], now_ns: int, *, fresh: bool
     ) -> None:
-        """Begin a transfer; without `fresh`, continue it by sending metadata and EOF only."""
+        """Begin a transfer if `fresh` is true; otherwise continue a stored transfer by metadata and EOF."""
         self.record = record
         self.transaction = Transaction(source, record.number, record.destination)
         self.condition: int | None = None
@@ -201,7 +213,7 @@ class Sender:
 
     @property
     def sent(self) -> int:
-        """Number of bytes that do not wait to be sent."""
+        """Number of bytes that were sent and are not requested again."""
         return self.record.size - self._wanted.total
 
     def again(self) -> None:
@@ -210,13 +222,13 @@ class Sender:
         self._acknowledged = False
 
     def cancel(self, condition: Condition = Condition.CANCELLED, why: str = "cancelled") -> None:
-        """Cancel the transfer and announce it to the other end."""
+        """Cancel the transfer and notify the receiver by an EOF."""
         self._stopped, self.said = condition, why
         self._wanted = Ranges()
         self._metadata_due, self._end_due, self._acknowledged = False, True, False
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Process content of the other end; return the immediate answers."""
+        """Process a unit from the receiver and return the immediate answers."""
         self._timer.heard(now_ns)
         match content:
             case Nak(gaps=gaps) if self._stopped is None:
@@ -238,7 +250,7 @@ class Sender:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the next content to send, None if none is due."""
+        """Return the content of the next unit to send, None if no unit is due."""
         self._go_on_summing()
         if self._metadata_due:
             self._metadata_due = False
@@ -285,7 +297,7 @@ class Sender:
 
 
 def answer_to(finished: Finished) -> Ack:
-    """Return the acknowledgement of a Finished, also for a transfer that is already closed."""
+    """Return the acknowledgement of a Finished unit. A closed transfer is acknowledged as well."""
     return Ack(Code.FINISHED, finished.condition, 2)
 
 
@@ -300,23 +312,23 @@ LACK_NS = 2_000_000_000
 SILENT_NS = 10_000_000_000
 FINISHED_NS = 5_000_000_000
 _FINISHED_TRIES = 20
-"""Maximum number of Finished units without acknowledgement; later requests are still answered."""
+"""Maximum number of unacknowledged Finished units before the receiver closes the transfer."""
 
 Accept = Callable[[Metadata], str]
-"""Function that returns why a file is rejected, or an empty text if it is accepted."""
+"""Function that returns why a file is rejected, or an empty text if the file is accepted."""
 
 
 class Receiver:
-    """Destination side of one transfer: stores data, requests missing ranges and checks the file.
+    """Receiving side of one file transfer, which stores data, requests missing ranges and checks the file.
 
     Attributes:
-        record: state of the transfer, stored by `keep`.
-        closed: whether the other end has acknowledged the end of the transfer or no longer answers.
-        said: text about its end.
+        record: state of the transfer, which `keep` writes to disk.
+        closed: whether the sender has acknowledged the end of the transfer or no longer answers.
+        said: text about the end of the transfer.
     """
 
     def __init__(self, store: Store, record: Incoming, accept: Accept, most: int, now_ns: int) -> None:
-        """Begin a transfer or continue a stored one; a file of more than `most` bytes is rejected."""
+        """Begin or continue the transfer `record`, rejecting a file of more than `most` bytes."""
         self.record = record
         self.closed = False
         self.said = ""
@@ -340,7 +352,7 @@ class Receiver:
         return self.record.size if whole else self._ranges.total
 
     def take(self, content: Content, now_ns: int) -> list[Content]:
-        """Process content of the sender; return the immediate answers."""
+        """Process a unit from the sender and return the immediate answers."""
         self.heard_ns = now_ns
         self._lack.heard(now_ns)
         self._silence.heard(now_ns)
@@ -358,7 +370,7 @@ class Receiver:
         return []
 
     def next(self, now_ns: int) -> Content | None:
-        """Return the next content to send, None if none is due."""
+        """Return the content of the next unit to send, None if no unit is due."""
         if self.record.finished is not None:
             return self._say_finished(now_ns)
         if self._whole():
@@ -371,7 +383,7 @@ class Receiver:
         return self._naks.popleft() if self._naks else None
 
     def keep(self) -> None:
-        """Make received data durable, then the record of it. Raises FileError."""
+        """Sync the received data to disk and then store the record of received ranges. Raises FileError."""
         if not self._dirty:
             return
         if self._file >= 0:
@@ -425,7 +437,7 @@ class Receiver:
         self._dirty = True
 
     def _end(self, eof: Eof, now_ns: int) -> list[Content]:
-        """Acknowledge an EOF; after the first EOF, begin to request missing ranges."""
+        """Acknowledge an EOF and begin to request missing ranges after the first EOF."""
         if self.record.finished is None:
             if eof.condition != Condition.NO_ERROR:
                 self.stop(eof.condition, "the sender has cancelled it")
@@ -452,7 +464,7 @@ class Receiver:
     def _go_on_checking(self) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
-        # Data that came before the metadata could not be compared with the size of the file.
+        # Data received before the metadata could not be checked against the size of the file.
         if size != self.record.size or self._ranges.end > size:
             self.stop(Condition.SIZE_ERROR, f"bytes up to {self._ranges.end}, {size} by its end")
             return
@@ -481,7 +493,7 @@ class Receiver:
 
     def _place(self) -> None:
         try:
-            self.keep()  # before the file is placed, so that a killed process places it at its next start
+            self.keep()  # store first, so that a restarted process can move the file
             self.close()
             self._store.place(self.record)
         except FileError as error:
@@ -497,7 +509,7 @@ class Receiver:
 
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
-"""Entity numbers of the satellite, of our ground station and of a foreign one (`ground.yamcs`)."""
+"""CFDP entity numbers of the satellite, our ground station and a foreign ground station (Yamcs)."""
 MOST_OPEN = 8
 """Maximum number of open transfers in each direction."""
 LONGEST_FILE = (1 << 32) - 1
@@ -506,7 +518,14 @@ _MOST_REPLIES = 64
 
 
 class Origin(NamedTuple):
-    """Command that caused a transfer: SPI and counter of its frame, packet and sequence; zeros for none."""
+    """Identification of the command that caused a transfer; all zeros for a transfer without command.
+
+    Attributes:
+        spi: SPI of the frame that contained the command.
+        counter: counter of the frame that contained the command.
+        packet: first 16 bits of the command packet.
+        sequence: sequence count of the command packet.
+    """
 
     spi: int = 0
     counter: int = 0
@@ -519,7 +538,11 @@ NOBODY = Origin()
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a transfer; `condition` is None while it is open, and `said` is the text about its end."""
+    """Progress of a file transfer.
+
+    The attribute `condition` is None while the transfer is open, and `said` is the text about the transfer's
+    end.
+    """
 
     outgoing: bool
     source: int
@@ -533,15 +556,15 @@ class Progress:
 
 
 class Entity:
-    """Transfers of one end of the link. Not thread-safe.
+    """CFDP entity: all file transfers of one end of the link. Not thread-safe.
 
     Attributes:
-        number: number of this entity.
-        ended: transfers that have ended; the owner removes them.
+        number: CFDP number of this entity.
+        ended: queue of ended transfers, which the caller empties.
     """
 
     def __init__(self, number: int, store: Store, accept: Accept, most: int, now_ns: int) -> None:
-        """Continue the open transfers of the store; a file of more than `most` bytes is rejected."""
+        """Continue the open transfers of the store, rejecting incoming files of more than `most` bytes."""
         self.number = number
         self.ended: deque[Progress] = deque(maxlen=_MOST_REPLIES)
         self._store, self._accept, self._most = store, accept, most
@@ -563,10 +586,10 @@ class Entity:
     def send(
         self, path: Path, name: str, destination: int, kind: int, utc_ns: int, now_ns: int, origin: Origin
     ) -> Progress:
-        """Begin or continue to send a file with a checksum of type `kind`. Raises FileError.
+        """Begin or continue to send a file with a checksum of type `kind`.
 
-        If the transfer of the file is already open, metadata and EOF are sent again, so that the other end
-        requests its missing ranges.
+        If a transfer of this file is already open, metadata and EOF are sent again, so that the receiver
+        requests the missing ranges. Raises FileError if the file cannot be sent.
         """
         try:
             facts = path.stat()
@@ -577,7 +600,7 @@ class Entity:
         if not path.is_file() or facts.st_size > LONGEST_FILE:
             raise FileError(f"{name}: no file, or one of more than {LONGEST_FILE} bytes")
         same = self._open(str(path), name, destination)
-        # A file that only grows is the same up to the size that is sent.
+        # A log file only grows, so its first bytes up to the announced size are unchanged.
         if same is not None and (
             facts.st_mtime_ns == same.record.modified_ns or facts.st_size > same.record.size
         ):
@@ -598,7 +621,7 @@ class Entity:
         return _of_sender(self._out[number])
 
     def cancel(self, source: int, number: int) -> None:
-        """Cancel a transfer of either direction. Raises FileError if there is no such transfer."""
+        """Cancel an incoming or outgoing transfer. Raises FileError if there is no such transfer."""
         if source == self.number and number in self._out:
             self._out[number].cancel()
         elif (source, number) in self._in:
@@ -607,7 +630,10 @@ class Entity:
             raise FileError(f"no transfer {number} of entity {source} is open")
 
     def take(self, unit: bytes, now_ns: int) -> None:
-        """Process a received unit; units for other entities are ignored. Raises PduError, FileError."""
+        """Process a received unit and ignore units for other entities.
+
+        Raises PduError for an invalid unit and FileError if the disk cannot be written.
+        """
         transaction, content = unpack(unit)
         if transaction.source == self.number:
             replies = self._take_as_sender(transaction, content, now_ns)
@@ -619,7 +645,7 @@ class Entity:
         self._clear()
 
     def unit(self, now_ns: int) -> bytes | None:
-        """Return the next unit to send, None if none is due."""
+        """Return the next unit to send, None if no unit is due."""
         if self._replies:
             return self._replies.popleft()
         for _ in range(len(self._out) + len(self._in)):
@@ -635,14 +661,14 @@ class Entity:
         return None
 
     def keep(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Make received data durable once a second. Raises FileError."""
+        """Store received data durably, once a second or `at_once`. Raises FileError if the disk fails."""
         if at_once or now_ns - self._kept_ns >= _KEEP_NS:
             self._kept_ns = now_ns
             for receiver in self._in.values():
                 receiver.keep()
 
     def close(self, now_ns: int) -> None:
-        """Make received data durable and close the files. Raises FileError."""
+        """Store received data durably and close the files. Raises FileError if the disk fails."""
         try:
             self.keep(now_ns, at_once=True)
         finally:
@@ -656,7 +682,7 @@ class Entity:
         match content:
             case Finished():
                 return [answer_to(content)]
-            case Nak():  # for an unknown transfer, so that its receiver stops waiting
+            case Nak():  # cancel an unknown transfer, so that the receiver stops waiting
                 return [Eof(Condition.CANCELLED, 0, 0)]
             case _:
                 return []
@@ -679,7 +705,10 @@ class Entity:
         return receiver.take(content, now_ns)
 
     def _begin(self, record: Incoming, now_ns: int) -> Receiver:
-        """Open an incoming transfer; beyond the maximum number, cancel the one that was silent longest."""
+        """Open an incoming transfer.
+
+        If too many are open, cancel the transfer without data for the longest time.
+        """
         if len(self._in) >= MOST_OPEN:
             stalest = min(self._in.values(), key=lambda receiver: receiver.heard_ns)
             stalest.stop(Condition.CANCELLED, "given up for a newer one")
@@ -705,7 +734,7 @@ class Entity:
         return Transaction(side.record.source, side.record.number, self.number)
 
     def _clear(self) -> None:
-        """Remove the transfers that have ended."""
+        """Move ended transfers from the open transfers to the queue of ended transfers."""
         for sender in [sender for sender in self._out.values() if sender.condition is not None]:
             del self._out[sender.record.number]
             self._store.remove(sender.record)

@@ -1,10 +1,10 @@
-"""Units of CFDP (CCSDS 727.0-B-5, section 5) of class 2 as values and bytes, and the packets that carry them.
+"""Encoding and decoding of CFDP class 2 units (CCSDS 727.0-B-5, section 5) and the packets that carry them.
 
-A unit has a header (version 1, entities of 2 bytes, transaction numbers of 4 bytes) and file data or a
-directive. The header announces neither a CRC nor large files, because the frame that carries the unit is
-authenticated. Identifiers of other lengths are accepted. Each unit travels in a space packet of variable
-length with the header and time of all packets and a CRC of 16 bits; the tables of packets do not contain
-it.
+A unit (protocol data unit) consists of a header and either file data or a directive. The header has version
+1, entity numbers of 2 bytes and transaction numbers of 4 bytes; the decoder also accepts other lengths. The
+units contain no CRC, because the frame that carries a unit is authenticated. The large-file option is not
+used. Each unit is sent in a space packet of variable length, with the same headers as the other packets and a
+16-bit CRC. These packets are not listed in the tables of packet definitions.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYT
 from knightcube.errors import FlightError
 
 SEGMENT_BYTES = 900
-"""File data (bytes) in one unit, so that the unit fits into a telecommand frame."""
+"""Maximum file data (bytes) in one unit, chosen so that the unit fits into a telecommand frame."""
 MOST_REQUESTS = 100
-"""Maximum number of gaps in one NAK, so that it fits into a telecommand frame."""
+"""Maximum number of gaps in one NAK unit, chosen so that the unit fits into a telecommand frame."""
 HIGHEST_NUMBER = 2**32 - 1
 _ENTITY_BYTES, _NUMBER_BYTES = 2, 4
 _FIXED_BYTES = 4
@@ -27,16 +27,16 @@ _PDU_VERSION = 0b001 << 5
 _FILE_DATA, _TO_SENDER, _UNACKNOWLEDGED, _CRC, _LARGE = 1 << 4, 1 << 3, 1 << 2, 1 << 1, 1
 _METADATA_OF_SEGMENT = 1 << 3
 _LENGTHS = (_ENTITY_BYTES - 1) << 4 | (_NUMBER_BYTES - 1)
-_FAULT_LOCATION = 6  # the type of that TLV
+_FAULT_LOCATION = 6  # TLV type of a fault location
 _MOST_NAME_BYTES = 255
 
 
 class PduError(FlightError):
-    """Raised for bytes that are not a unit of class 2; the text states the reason."""
+    """Raised for bytes that are not a CFDP unit of class 2. The error text states the reason."""
 
 
 class Condition(IntEnum):
-    """Condition codes, table 5-5."""
+    """CFDP condition codes (CCSDS 727.0-B-5, table 5-5)."""
 
     NO_ERROR = 0
     FILESTORE_REJECTION = 4
@@ -46,7 +46,7 @@ class Condition(IntEnum):
 
 
 class Code(IntEnum):
-    """Directive codes, table 5-4."""
+    """CFDP directive codes (CCSDS 727.0-B-5, table 5-4)."""
 
     EOF = 4
     FINISHED = 5
@@ -56,7 +56,7 @@ class Code(IntEnum):
 
 
 class TransactionStatus(IntEnum):
-    """The state of a transaction in an acknowledgement, table 5-8."""
+    """Status of a transaction in an acknowledgement (CCSDS 727.0-B-5, table 5-8)."""
 
     ACTIVE = 1
     TERMINATED = 2
@@ -64,7 +64,7 @@ class TransactionStatus(IntEnum):
 
 
 class FileStatus(IntEnum):
-    """File status, table 5-7."""
+    """Status of a received file (CCSDS 727.0-B-5, table 5-7)."""
 
     DISCARDED = 0
     REJECTED = 1
@@ -73,7 +73,7 @@ class FileStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Transaction:
-    """Identification of a transfer: source entity, its transaction number, and destination entity."""
+    """Identification of a transfer: source entity, transaction number and destination entity."""
 
     source: int
     number: int
@@ -82,7 +82,7 @@ class Transaction:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Size (bytes) of a file, its names at both ends, and the type of its checksum."""
+    """Metadata unit: file size (bytes), file names at the sender and receiver, and checksum type."""
 
     size: int
     source_name: str
@@ -92,7 +92,7 @@ class Metadata:
 
 @dataclass(frozen=True, slots=True)
 class FileData:
-    """Segment of the file."""
+    """File data unit: one segment of the file."""
 
     offset: int
     data: bytes
@@ -100,7 +100,7 @@ class FileData:
 
 @dataclass(frozen=True, slots=True)
 class Eof:
-    """End of file: all data were sent once, or the condition that ended the transfer."""
+    """EOF unit, sent after all data or if the sender cancels the transfer."""
 
     condition: int
     checksum: int
@@ -109,7 +109,7 @@ class Eof:
 
 @dataclass(frozen=True, slots=True)
 class Nak:
-    """Request for missing ranges (begin, end); (0, 0) requests the metadata."""
+    """NAK unit: request for missing byte ranges (begin, end). The range (0, 0) requests the metadata."""
 
     begin: int
     end: int
@@ -118,7 +118,7 @@ class Nak:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """Report of the receiver that the transfer has ended."""
+    """Finished unit: report from the receiver that the transfer has ended."""
 
     condition: int
     complete: bool
@@ -127,7 +127,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """Acknowledgement of an EOF or a Finished."""
+    """ACK unit: acknowledgement of an EOF or Finished unit."""
 
     code: int
     condition: int
@@ -141,7 +141,7 @@ _EOF = struct.Struct(">BII")
 
 
 def pack(transaction: Transaction, content: Content) -> bytes:
-    """Return the bytes of a unit."""
+    """Return a unit encoded as bytes."""
     body, kind = _body(transaction, content)
     if isinstance(content, Nak | Finished) or (isinstance(content, Ack) and content.code == Code.EOF):
         kind |= _TO_SENDER
@@ -151,7 +151,10 @@ def pack(transaction: Transaction, content: Content) -> bytes:
 
 
 def unpack(data: bytes) -> tuple[Transaction, Content]:
-    """Return the unit at the beginning of `data`. Raises PduError."""
+    """Return the transaction and content of the unit at the beginning of `data`.
+
+    Raises PduError if the bytes are not a valid unit.
+    """
     if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _PDU_VERSION:
         raise PduError("no unit of version 1 of CFDP")
     if data[0] & (_UNACKNOWLEDGED | _CRC | _LARGE):
@@ -180,7 +183,7 @@ def unpack(data: bytes) -> tuple[Transaction, Content]:
 
 
 def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
-    """Return the bytes after the header, and the bit of the header for file data."""
+    """Return the bytes after the header of a unit, and the file data flag for the header."""
     match content:
         case FileData(offset, data):
             return _LONG.pack(offset) + data, _FILE_DATA
@@ -233,16 +236,16 @@ def _name(text: str) -> bytes:
 
 
 def _fault(condition: int, entity: int) -> bytes:
-    """Return the TLV of the entity that found a fault, empty without a fault."""
+    """Return the TLV that identifies the entity which detected a fault, empty if there is no fault."""
     if condition == Condition.NO_ERROR:
         return b""
     return bytes((_FAULT_LOCATION, _ENTITY_BYTES)) + entity.to_bytes(_ENTITY_BYTES, "big")
 
 
 DOWN = 0x0973
-"""First 16 bits of a packet that carries a unit to the ground: telemetry, APID 0x173."""
+"""First 16 bits of a packet with a unit to the ground (type telemetry, APID 0x173)."""
 UP = 0x1A28
-"""First 16 bits of a packet that carries a unit to the satellite: telecommand, APID 0x228."""
+"""First 16 bits of a packet with a unit to the satellite (type telecommand, APID 0x228)."""
 PACKET_VERSION = 1
 
 _PACKET_HEADERS = struct.Struct(">HHHBq")
@@ -250,15 +253,15 @@ _MODULUS = 1 << 14
 
 
 class UnitPacker:
-    """Makes the packets of one direction with their sequence counts."""
+    """Encoder that puts units into packets of one direction and counts the packets."""
 
     def __init__(self, identifier: int) -> None:
-        """Make packets that begin with `identifier`, `DOWN` or `UP`."""
+        """Make packets whose first 16 bits are `identifier`, which is `DOWN` or `UP`."""
         self._identifier = identifier
         self._count = 0
 
     def pack(self, unit: bytes, time_ns: int) -> bytes:
-        """Return the packet of a unit."""
+        """Return the packet that carries a unit."""
         length = SECONDARY_BYTES + len(unit) + CRC_BYTES - 1
         body = (
             _PACKET_HEADERS.pack(self._identifier, UNSEGMENTED | self._count, length, PACKET_VERSION, time_ns)
@@ -269,12 +272,12 @@ class UnitPacker:
 
 
 def is_unit(packet: bytes, identifier: int) -> bool:
-    """Return whether a packet begins with `identifier`, `DOWN` or `UP`."""
+    """Return whether the first 16 bits of a packet are `identifier`, which is `DOWN` or `UP`."""
     return int.from_bytes(packet[:2], "big") == identifier
 
 
 def unit_of(packet: bytes) -> bytes:
-    """Return the unit in a packet, empty if the packet is damaged."""
+    """Return the unit in a packet, or empty bytes if the packet is damaged."""
     stated = int.from_bytes(packet[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
     known = len(packet) == stated and packet[HEADER_BYTES : HEADER_BYTES + 1] == bytes((PACKET_VERSION,))
     return packet[HEADER_BYTES + SECONDARY_BYTES : -CRC_BYTES] if known and crc16(packet) == 0 else b""

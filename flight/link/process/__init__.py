@@ -1,4 +1,5 @@
 """The link process: radio lines, live telemetry, playback, and commands with their verification.
 
-Follows the flight log and writes to the command socket; the control loop waits for nothing of it.
+The link process reads the growing flight log and writes to the command socket. The control loop never waits
+for the link process.
 """

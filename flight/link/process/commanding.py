@@ -1,16 +1,18 @@
-"""Hand-over of commands to the control process, their verification (PUS service 1) and their schedule.
+"""Delivery of commands to the control process, command verification (PUS service 1) and time-tagged commands.
 
-A command is accepted or refused, started, and completed or failed. Each command is sent from a socket of
-its own, so that no answer can be assigned to another command. The control process answers a command when it
-has obeyed it. A command that ends in a mode is completed when the mode packet of the live telemetry shows
-that mode. It has failed if the mode becomes SAFE or if another command replaces it. A slew is completed
-when it has arrived, and has failed in any other mode.
+The stages of a command are: accepted or refused, started, and completed or failed. Each command is sent from
+a separate socket, so that an answer cannot be assigned to the wrong command. The control process answers a
+command after executing it. A command that changes the mode is completed when a mode packet in the live
+telemetry shows the new mode. A command that changes the mode fails if the mode becomes SAFE or if a newer
+command replaces it. A slew command is completed when the slew has arrived, and fails if the slew mode ends
+otherwise.
 
-The schedule of time-tagged commands is stored in two copies, so that a process killed at any moment leaves
-one valid copy. An entry leaves the disk before its command is executed, so no command is executed twice. A
-command that is more than ten seconds late, for example because the board was off, is reported as failed and
-not executed. A command that falls due in SAFE also fails, because the ground decides how to leave SAFE. A
-command waits until telemetry has shown the mode.
+The schedule of time-tagged commands is stored in two copies, so that one valid copy exists even if the
+process is killed while writing. A schedule entry is deleted from disk before its command is executed, so that
+no command is executed twice. A command that is more than ten seconds late, for example because the board was
+off, is reported as failed and not executed. A scheduled command also fails in mode SAFE, because only the
+ground may decide how to leave SAFE. After a start, no scheduled command is executed until telemetry has shown
+the current mode.
 """
 
 from __future__ import annotations
@@ -38,11 +40,11 @@ from flight.link.telemetry.packets import LAYOUTS, LONGEST_PACKET, to_text, walk
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import FlightError
 
-_ARRIVED = "arrived"  # the trigger of the mode packet (flight.loop.modes)
+_ARRIVED = "arrived"  # trigger in the mode packet at the end of a slew (flight.loop.modes)
 
 
 class Stage(IntEnum):
-    """Stage of a command; the numbers are those of the verification packet."""
+    """Stage of a command. The enumeration values are the values in the verification packet."""
 
     ACCEPTED = 1
     REFUSED = 2
@@ -57,14 +59,14 @@ class Stage(IntEnum):
 
 
 class Request(NamedTuple):
-    """Identification of a command packet for its sender: the first 16 bits and the sequence count."""
+    """Identification of a command packet by its first 16 bits and its sequence count."""
 
     packet: int
     sequence: int
 
 
 UNREAD = Request(0, 0)
-"""Request of a frame whose packet was not read."""
+"""Placeholder request for a frame whose packet was not read."""
 
 
 def request_of(packet: bytes) -> Request:
@@ -74,7 +76,7 @@ def request_of(packet: bytes) -> Request:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A command that was handed over, with SPI and counter of its frame."""
+    """Command sent to the control process, with the SPI and counter of its frame."""
 
     spi: int
     counter: int
@@ -84,7 +86,7 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The fields of a verification packet."""
+    """Verification report: the values of a verification packet."""
 
     spi: int
     counter: int
@@ -95,12 +97,12 @@ class Report:
 
 
 def report(sent: Sent, stage: Stage, text: str) -> Report:
-    """Return the report that a command has reached a stage."""
+    """Return the verification report of a command that has reached a stage."""
     return Report(sent.spi, sent.counter, stage, sent.command.packet.name, text, sent.request)
 
 
 def final_mode(command: Command) -> Mode | None:
-    """Return the mode in which a command is completed, None if it is completed at once."""
+    """Return the mode that completes a command, None for a command that is completed at once."""
     match command:
         case ChangeMode(mode):
             return mode
@@ -113,13 +115,13 @@ def final_mode(command: Command) -> Mode | None:
 
 
 class Verification:
-    """Follows the stages of commands that were handed over."""
+    """Tracker of the stages of commands that were sent to the control process."""
 
     def __init__(self) -> None:
-        self._open: tuple[Sent, Mode, int] | None = None  # with the mode it ends in, and since when
+        self._open: tuple[Sent, Mode, int] | None = None  # command, final mode, mission time of answer
 
     def answered(self, sent: Sent, answer: bytes) -> list[Report]:
-        """Return the reports for an answer of the control process; b"" stands for a missing answer."""
+        """Return the reports for an answer of the control process. Empty bytes stand for a missing answer."""
         found = [answer[begin:end] for layout, begin, end in walk(answer) if layout.packet is COMMAND]
         if not found:
             return [report(sent, Stage.FAILED, "the flight did not answer")]
@@ -139,7 +141,7 @@ class Verification:
         return reports
 
     def followed(self, packet: bytes) -> list[Report]:
-        """Return the reports that a packet of live telemetry causes."""
+        """Return the reports of commands whose completion or failure a live telemetry packet shows."""
         layout = LAYOUTS[MODE.name]
         if self._open is None or packet[:2] != layout.identifier.to_bytes(2, "big"):
             return []
@@ -161,10 +163,10 @@ class Verification:
 
 
 AT_MOST = 8
-"""Maximum number of commands that wait for an answer."""
+"""Maximum number of commands without an answer."""
 
 PATIENCE_NS = 5_000_000_000
-"""Timeout (ns) for an answer of the control process, whose command cycle is 0.1 s."""
+"""Timeout (ns) for an answer from the control process, which reads commands every 0.1 s."""
 
 T = TypeVar("T")
 
@@ -178,17 +180,17 @@ class _Waiting(Generic[T]):
 
 
 class ControlLine(Generic[T]):
-    """Client of the command socket of the control process. T identifies a command to the caller."""
+    """Client of the control process's command socket. The type T identifies a command to the caller."""
 
     def __init__(self, target: Path, folder: Path) -> None:
-        """Create the sockets for answers in `folder`, which the control process must be able to enter."""
+        """Create the sockets for answers in `folder`, to which the control process must have access."""
         self._target = str(target)
         self._folder = folder
         self._waiting: list[_Waiting[T]] = []
         self._count = 0
 
     def send(self, command: T, data: bytes, now_ns: int) -> str:
-        """Hand over a command without waiting; return the problem, or an empty text on success."""
+        """Send a command without waiting. Return the problem, or an empty text on success."""
         if len(self._waiting) >= AT_MOST:
             return f"{AT_MOST} commands wait for their answers already"
         self._count += 1
@@ -209,7 +211,7 @@ class ControlLine(Generic[T]):
         return ""
 
     def answers(self, now_ns: int) -> list[tuple[T, bytes]]:
-        """Return the received answers; b"" stands for an answer that timed out."""
+        """Return the received answers with their commands. Empty bytes stand for an answer that timed out."""
         found, still = [], []
         for waiting in self._waiting:
             try:
@@ -225,7 +227,7 @@ class ControlLine(Generic[T]):
         return found
 
     def close(self) -> None:
-        """Stop waiting for all answers."""
+        """Stop waiting for answers and close all sockets."""
         for waiting in self._waiting:
             self._end(waiting)
         self._waiting = []
@@ -236,25 +238,33 @@ class ControlLine(Generic[T]):
 
 
 def _remove(path: Path) -> None:
-    """Remove the file of a socket; `send` later removes a file that cannot be removed now."""
+    """Remove a socket file if possible. The method `send` removes a remaining file later."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
 
 MOST_ENTRIES = 32
 HIGHEST = 2**63 - 1
-"""Largest number in a stored copy; as a UTC in ns it is in the year 2262."""
+"""Largest number in a stored schedule. As a UTC in ns, this number is in the year 2262."""
 _LONGEST_FILE = 1 << 16
 
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
 
 
 class TimetableError(FlightError):
-    """Raised if an entry cannot be added, found or removed; the text states the reason."""
+    """Raised if a schedule entry cannot be added, found or removed. The error text states the reason."""
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Command in words that is due at a UTC (ns since 1970), with SPI and counter of its frame."""
+    """Schedule entry: a command in words and its due time.
+
+    Attributes:
+        number: number of the entry.
+        at_ns: due time of the command, UTC in ns since 1970.
+        spi: SPI of the frame that contained the scheduling command.
+        counter: counter of the frame that contained the scheduling command.
+        command: command in words.
+    """
 
     number: _Count
     at_ns: _Count
@@ -264,7 +274,11 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Content of one file. The copy with the higher version is valid; `last` is the last assigned number."""
+    """Stored copy of the schedule.
+
+    If two copies differ, the copy with the higher version is used. The attribute `last` is the last assigned
+    entry number.
+    """
 
     version: _Count = 0
     last: _Count = 0
@@ -278,10 +292,10 @@ class _Read:
 
 
 class Timetable:
-    """Stored entries of a folder, which only one process may use."""
+    """Schedule of time-tagged commands, stored in a folder that only one process may use."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the newest valid copy; `lost` is set if copies exist but none is valid."""
+        """Read the newest valid copy of the schedule. Set `lost` if copies exist but none is valid."""
         self._folder = folder
         read = [self._read(copy) for copy in COPIES]
         good = [one.copy for one in read if one.copy is not None]
@@ -290,11 +304,14 @@ class Timetable:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """All entries in the order in which they are due."""
+        """All schedule entries in order of their due times."""
         return tuple(sorted(self._now.entries, key=lambda entry: (entry.at_ns, entry.number)))
 
     def add(self, at_ns: int, spi: int, counter: int, command: str) -> Entry:
-        """Add an entry and store it durably. Raises TimetableError."""
+        """Add an entry and store the schedule.
+
+        Raises TimetableError if the schedule is full or not writable.
+        """
         if len(self._now.entries) >= MOST_ENTRIES:
             raise TimetableError(f"{MOST_ENTRIES} commands are scheduled already: delete one")
         entry = Entry(self._now.last + 1, at_ns, spi, counter, command)
@@ -302,14 +319,17 @@ class Timetable:
         return entry
 
     def remove(self, number: int) -> None:
-        """Remove an entry durably; 0 removes all entries. Raises TimetableError."""
+        """Remove an entry from the stored schedule; the number 0 removes all entries.
+
+        Raises TimetableError if there is no such entry or if the schedule cannot be stored.
+        """
         left = tuple(entry for entry in self._now.entries if number and entry.number != number)
         if number and len(left) == len(self._now.entries):
             raise TimetableError(f"no command is scheduled under {number}")
         self._store(left, self._now.last)
 
     def forget(self, number: int) -> None:
-        """Remove an entry from memory only, if the disk cannot be written."""
+        """Remove an entry from memory only. This is used if the disk cannot be written."""
         left = tuple(entry for entry in self._now.entries if entry.number != number)
         self._now = msgspec.structs.replace(self._now, entries=left)
 
@@ -337,7 +357,7 @@ def _encode(copy: _Copy) -> bytes:
 
 
 def _decode(data: bytes) -> _Copy | None:
-    """Return a decoded copy, or None for bytes that `_encode` does not produce."""
+    """Return the schedule in the bytes of a stored copy, None if the copy is damaged."""
     line, end, crc = data.partition(b"\n")
     if crc != b"%08x\n" % zlib.crc32(line + end):
         return None
@@ -348,7 +368,7 @@ def _decode(data: bytes) -> _Copy | None:
 
 
 LATEST_NS = 10 * SECOND_NS
-"""Maximum delay (ns) after which a command is still executed."""
+"""Maximum delay (ns) with which a scheduled command is still executed."""
 
 _WITH_MODE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big"): LAYOUTS[packet.name] for packet in (MODE, HEALTH)
@@ -356,25 +376,31 @@ _WITH_MODE = {
 
 
 class Scheduling:
-    """Executes the timetable of a link process. Times are UTC, ns since 1970."""
+    """Scheduler that executes time-tagged commands. Times are UTC in ns since 1970."""
 
     def __init__(self, timetable: Timetable) -> None:
         self._timetable = timetable
         self._mode: int | None = None
 
     def beginning(self) -> list[Report]:
-        """Return the reports due at the start of the process."""
+        """Return the reports to be sent at the start of the link process."""
         text = "both copies of the schedule are lost: it is empty"
         return [Report(0, 0, Stage.FAILED, SCHEDULE.name, text)] if self._timetable.lost else []
 
     def followed(self, packet: bytes) -> None:
-        """Take the mode from a packet of live telemetry."""
+        """Update the current mode if a packet of live telemetry contains the mode."""
         layout = _WITH_MODE.get(packet[:2])
         if layout is not None:
             self._mode = int(layout.array(packet)[0]["mode"])
 
     def obey(self, directive: Scheduled | Deletion | Listing, done: Report, utc_ns: int) -> list[Report]:
-        """Execute a directive and return all its reports; `done` is the report of its completion."""
+        """Execute a scheduling directive and return all reports about it.
+
+        Args:
+            directive: directive that adds, deletes or lists scheduled commands.
+            done: report of the directive's completion.
+            utc_ns: current UTC, ns since 1970.
+        """
         try:
             match directive:
                 case Scheduled():
@@ -390,7 +416,10 @@ class Scheduling:
             return [replace(done, stage=Stage.FAILED, text=str(error))]
 
     def due(self, utc_ns: int) -> Iterator[Report | Sent]:
-        """Yield each due command, or the report why it is not executed. It is removed durably before."""
+        """Yield each due command, or a report that states why the command is not executed.
+
+        Each entry is removed from the stored schedule before its command is yielded.
+        """
         for entry in self._timetable.entries:
             unknown = self._mode is None and utc_ns - entry.at_ns <= LATEST_NS
             if entry.at_ns > utc_ns or unknown:
@@ -398,9 +427,7 @@ class Scheduling:
             problem = self._problem(entry, utc_ns)
             try:
                 self._timetable.remove(entry.number)
-            except (
-                TimetableError
-            ) as error:  # the entry is still on disk and could be executed again after a restart
+            except TimetableError as error:  # entry still on disk, could be executed again after a restart
                 problem = str(error)
                 self._timetable.forget(entry.number)
             if problem:
@@ -410,14 +437,14 @@ class Scheduling:
                 yield Sent(entry.spi, entry.counter, command_of_words(entry.command))
 
     def _problem(self, entry: Entry, utc_ns: int) -> str:
-        """Return why a due command must not be executed, or an empty text if it may be."""
+        """Return why a due command must not be executed, or an empty text if it may be executed."""
         if utc_ns - entry.at_ns > LATEST_NS:
             return f"it is {_utc(utc_ns)}"
         if self._mode == Mode.SAFE:
             return "in SAFE the ground decides"
         try:
             command_of_words(entry.command)
-        except CommandError as error:  # of another release's table
+        except CommandError as error:  # the entry was scheduled by another software release
             return str(error)
         return ""
 
@@ -430,7 +457,10 @@ class Scheduling:
 
 
 def utc_of(text: str) -> int:
-    """Return the ns since 1970 of a UTC in ISO 8601, up to 2262-04-11. Raises CommandError."""
+    """Return the ns since 1970 of a UTC text in ISO 8601 format.
+
+    Raises CommandError for an invalid text and for a time after 2262-04-11.
+    """
     try:
         time = datetime.fromisoformat(text)
     except ValueError as error:
@@ -443,7 +473,7 @@ def utc_of(text: str) -> int:
 
 
 def text_of(entry: Entry) -> str:
-    """Return the text of an entry: its number, UTC and command."""
+    """Return the number, UTC and command of a schedule entry as text."""
     return f"{entry.number}: {_utc(entry.at_ns)} {entry.command}"
 
 

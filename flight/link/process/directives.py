@@ -1,4 +1,4 @@
-"""Directives: commands that the link process executes itself (playback, keys, schedule, file transfers)."""
+"""Directives: commands executed by the link process, for playback, keys, schedule and file transfers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flight.link.telemetry.packets import (
 
 SUM_BYTES = 32
 LONGEST_COMMAND = 96
-"""Length (bytes) of a command in words, including the zero at its end."""
+"""Maximum length (bytes) of a command in words, including the terminating zero byte."""
 _LONGEST_UTC = 32
 
 _ENTITY = Field(
@@ -87,7 +87,7 @@ LIST = telecommand("list-schedule", 0x222, "Report each scheduled command")
 
 @dataclass(frozen=True, slots=True)
 class ListFiles:
-    """Send the list of files to an entity."""
+    """Directive to send the list of files to a CFDP entity."""
 
     under: str = ""
     entity: int = GROUND
@@ -98,7 +98,7 @@ class ListFiles:
 
 @dataclass(frozen=True, slots=True)
 class SendFile:
-    """Send a file to an entity."""
+    """Directive to send a file to a CFDP entity."""
 
     name: str
     entity: int = GROUND
@@ -109,7 +109,7 @@ class SendFile:
 
 @dataclass(frozen=True, slots=True)
 class CancelFile:
-    """End transfer `number` of entity `source`."""
+    """Directive to cancel a file transfer, identified by sending entity and transaction number."""
 
     source: int
     number: int
@@ -120,7 +120,7 @@ class CancelFile:
 
 @dataclass(frozen=True, slots=True)
 class UseFile:
-    """Select a received file with this SHA-256."""
+    """Directive to select a received file for use if its SHA-256 is `sum`."""
 
     name: str
     sum: bytes
@@ -131,7 +131,7 @@ class UseFile:
 
 @dataclass(frozen=True, slots=True)
 class DeleteFile:
-    """Delete a received file."""
+    """Directive to delete a received file."""
 
     name: str
 
@@ -141,7 +141,13 @@ class DeleteFile:
 
 @dataclass(frozen=True, slots=True)
 class Play:
-    """Play back run `run` (0: the newest run) from `begin` to `end` (mission time, s)."""
+    """Directive to play back recorded telemetry.
+
+    Attributes:
+        run: number of the run, 0 for the newest run.
+        begin: mission time of the first packet, s.
+        end: mission time of the last packet, s.
+    """
 
     run: int
     begin: float
@@ -154,7 +160,7 @@ class Play:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End the playback."""
+    """Directive to stop the playback."""
 
     def __str__(self) -> str:
         return "stop playback"
@@ -162,7 +168,7 @@ class Stop:
 
 @dataclass(frozen=True, slots=True)
 class NewKey:
-    """Change a key."""
+    """Directive to change the key of an SPI."""
 
     spi: int
     generation: int
@@ -174,7 +180,7 @@ class NewKey:
 
 @dataclass(frozen=True, slots=True)
 class Scheduled:
-    """Execute a command in words at a UTC in ISO 8601."""
+    """Directive to execute a command, given in words, at a UTC in ISO 8601 format."""
 
     at: str
     words: str
@@ -185,7 +191,7 @@ class Scheduled:
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """Delete a scheduled command; 0 deletes all."""
+    """Directive to delete a scheduled command. The number 0 deletes all scheduled commands."""
 
     number: int
 
@@ -195,7 +201,7 @@ class Deletion:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """Report each scheduled command."""
+    """Directive to report all scheduled commands."""
 
     def __str__(self) -> str:
         return "list scheduled commands"
@@ -217,7 +223,7 @@ _PACKETS: dict[type[Any], Packet] = {
     UseFile: USE_FILE,
     DeleteFile: DELETE_FILE,
 }
-"""Packet of each directive; the fields have the names of the directive's attributes."""
+"""Packet definition of each directive class. Packet fields and class attributes have the same names."""
 _KINDS = {packet.name: kind for kind, packet in _PACKETS.items()}
 
 DIRECTIVES: tuple[Packet, ...] = tuple(_PACKETS.values())
@@ -231,7 +237,10 @@ def name_of(directive: Directive) -> str:
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
-    """Return the packet of a directive. Raises CommandError for values that do not fit."""
+    """Return a directive encoded as a packet.
+
+    Raises CommandError for values that do not fit into the packet.
+    """
     packet, values = _PACKETS[type(directive)], dict[str, Any]()
     for one in packet.fields:
         value = getattr(directive, one.name)
@@ -245,7 +254,10 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
 
 
 def unpack(data: bytes) -> Directive | None:
-    """Return the directive in a packet, None for a packet of another type. Raises CommandError."""
+    """Return the directive in a packet, None for a packet that is not a directive.
+
+    Raises CommandError for a damaged packet and for invalid values.
+    """
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
     if layout is None:
         return None

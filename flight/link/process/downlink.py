@@ -1,8 +1,9 @@
-"""Downlink of the link process: reports first, then live telemetry, then files and playback in turn.
+"""Telemetry downlink of the link process, limited to the data rate of the line.
 
-The flight log is followed as it grows, and stretches of any recorded run are played back on command. All
-traffic stays within the rate of the line. Live telemetry beyond that rate is thinned: only the newest
-packet of each periodic type waits. The archive on board keeps all packets.
+Reports have the highest priority, followed by live telemetry, and then by files and playback, which
+alternate. Live telemetry is read from the growing flight log. Time intervals of recorded runs are played back
+on command. If live telemetry exceeds the data rate, only the newest packet of each periodic type is kept for
+sending. The archive on board keeps all packets.
 """
 
 from __future__ import annotations
@@ -27,19 +28,19 @@ _STEM = "flight"
 _CHUNK = 1 << 16
 _LOOK_BACK = 1 << 14
 _LOOKS = 25
-"""Number of reads without new data after which the reader looks for a new segment or run."""
+"""Number of reads without new data after which the reader checks for a new segment or run."""
 _UNORDERED_NS = 5_000_000_000
-"""Largest time (ns) by which packets of different rate groups are out of order in the log."""
+"""Maximum time (ns) by which packets of different rate groups can be out of order in the log."""
 _TIME = struct.Struct(">q")
 
 
 def time_of(packet: bytes) -> int:
-    """Return the mission time of a packet, ns."""
+    """Return the mission time (ns) in the secondary header of a packet."""
     return int(_TIME.unpack_from(packet, HEADER_BYTES + 1)[0])
 
 
 class _PacketStream:
-    """Splits a stream of bytes into whole packets."""
+    """Decoder that splits a byte stream into complete packets."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -54,14 +55,14 @@ class _PacketStream:
 
 
 class LogFollower:
-    """Follows the newest run of an archive, or one run.
+    """Reader of new packets in the flight log of the newest run of an archive, or of a single run.
 
     Attributes:
-        place: folder of the archive, or of the run.
+        place: folder of the archive or of the single run.
     """
 
     def __init__(self, place: Path) -> None:
-        """Begin near the end of the newest run under `place`; the run may be created later."""
+        """Begin near the end of the newest run in the folder `place`. The run may also be created later."""
         self.place = place
         self._run: Path | None = None
         self._path: Path | None = None
@@ -69,17 +70,17 @@ class LogFollower:
         self._stream = _PacketStream()
         self._idle = 0
         self.label = b""
-        """Packet `run` of the followed run, empty while no run was found."""
+        """Packet `run` of the current run, empty until a run is found."""
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:
-        """Return the folder of a run, of the newest run for 0; None if there is no such run."""
+        """Return the folder of a run by its number, 0 for the newest run; None if there is no such run."""
         if number == 0:
             return self._run
         return next((run for run in _runs(self.place) if int(run.name.partition("-")[2]) == number), None)
 
     def new(self) -> list[bytes]:
-        """Return the packets written since the last call, at most 64 kB."""
+        """Return the packets written to the log since the last call, at most 64 kB per call."""
         data = b"" if self._path is None else _read(self._path, self._offset)
         self._offset += len(data)
         self._idle = 0 if data else self._idle + 1
@@ -89,7 +90,7 @@ class LogFollower:
         return self._stream.add(data) if data else []
 
     def _go_on(self) -> None:
-        """Continue with the next segment or a newer run, if there is one."""
+        """Continue with the next segment, or with a newer run if the current run has no further segment."""
         if self._path is not None:
             number = _number(self._path)
             later = [path for path in _segments(self._path.parent) if _number(path) > number]
@@ -116,7 +117,10 @@ class LogFollower:
 
 
 def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
-    """Yield the packets of a run from `begin` to `end` (mission time, s); b"" marks a pause."""
+    """Yield the packets of a run from mission time `begin` to `end` (s), and empty bytes after each read.
+
+    Empty bytes let the caller interrupt a long search for the first packet.
+    """
     begin_ns, end_ns = begin * 1e9, end * 1e9
     for path in _segments_from(folder, begin_ns):
         stream, offset = _PacketStream(), 0
@@ -130,7 +134,7 @@ def stretch(folder: Path, begin: float, end: float) -> Iterator[bytes]:
 
 
 def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
-    """Return the segments from the first one that can contain packets of a time (ns) or later."""
+    """Return the segments of a run that can contain packets of mission time `begin_ns` or later."""
     segments = _segments(folder)
     while len(segments) > 1:
         first = _PacketStream().add(_read(segments[1], 0)[: 2 * LONGEST_PACKET])
@@ -141,7 +145,7 @@ def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
 
 
 def _runs(archive: Path) -> list[Path]:
-    """Return the folders of an archive's runs, or an empty list if the archive cannot be read."""
+    """Return the folders of all runs in an archive, or an empty list if the archive cannot be read."""
     try:
         return find_runs(archive)
     except OSError:
@@ -157,12 +161,12 @@ def _segments(folder: Path) -> list[Path]:
 
 
 def _number(path: Path) -> int:
-    """Return the number at the end of the name of a segment or a run."""
+    """Return the number at the end of a segment's file name."""
     return int(path.stem.rpartition("-")[2])
 
 
 def _read(path: Path, offset: int) -> bytes:
-    """Return at most 64 kB of a file, or nothing if it is missing, unreadable or a FIFO."""
+    """Return at most 64 kB of a file, or empty bytes if the file cannot be read."""
     try:
         with open(path, "rb", opener=_at_once) as file:
             file.seek(offset)
@@ -177,30 +181,30 @@ def _at_once(path: str, flags: int) -> int:
 
 
 LIVE, PLAYBACK, FILES = 0, 1, 2
-"""Virtual channels of live telemetry, playback and files."""
+"""Numbers of the virtual channels for live telemetry, playback and files."""
 
 _SINGLE = {
     LAYOUTS[packet.name].identifier.to_bytes(2, "big")
     for packet in (RUN, TARGET, MODE, PLAN, STREAK, STARS, EVENT, COMMAND)
 }
-"""Packet types that must never be thinned."""
+"""Identifiers of packet types of which every packet must be sent."""
 
 _BURST_S = 0.1
 _WAITING_S = 0.5
 _URGENT = 256
-"""Maximum number of waiting reports; a newer report displaces the oldest."""
+"""Maximum number of queued reports. If the queue is full, a new report replaces the oldest report."""
 _FLUSH_NS = 200_000_000
 
 
 class LiveQueue:
-    """Queue of live packets that wait for the rate of the line.
+    """Queue of live telemetry packets that wait to be sent.
 
     Attributes:
-        thinned: number of packets that were replaced by a newer packet of their type.
+        thinned: number of packets dropped because a newer packet of the same type replaced them.
     """
 
     def __init__(self, room: float) -> None:
-        """Create a queue that keeps only the newest packet of each periodic type beyond `room` bytes."""
+        """Create a queue that keeps only the newest packet of each type once it contains `room` bytes."""
         self._room = room
         self._waiting: deque[bytes] = deque()
         self._bytes = 0
@@ -227,20 +231,20 @@ class LiveQueue:
 
 
 class Downlink:
-    """Makes telemetry frames at the rate of the line.
+    """Generator of telemetry frames at the data rate of the line.
 
     Attributes:
-        sent: frames made.
-        displaced: waiting reports that were dropped for newer reports.
-        played_ns: mission time that the playback has reached.
+        sent: number of telemetry frames made.
+        displaced: number of queued reports that were replaced by newer reports.
+        played_ns: mission time (ns) that the playback has reached.
     """
 
     def __init__(
         self, spacecraft: int, frame_bytes: int, rate: float, seal: Seal, files: Callable[[], bytes | None]
     ) -> None:
-        """Make frames of `frame_bytes` bytes at `rate` bytes/s.
+        """Make frames of `frame_bytes` bytes at a data rate of `rate` bytes/s.
 
-        `files` returns the next packet of the file transfers, or None if there is none.
+        The function `files` returns the next packet of the file transfers, or None if no packet is due.
         """
         room = frame_bytes - TELEMETRY_HEADER.size - OVERHEAD_BYTES - CRC_BYTES
         master = MasterCount()
@@ -262,7 +266,7 @@ class Downlink:
 
     @property
     def thinned(self) -> int:
-        """Number of live packets that were thinned."""
+        """Number of live packets dropped because of the limited data rate."""
         return self._queue.thinned
 
     @property
@@ -271,7 +275,7 @@ class Downlink:
         return self._source is not None
 
     def report(self, packet: bytes) -> None:
-        """Queue a packet to be sent before all other packets."""
+        """Queue a report packet, which is sent before all other packets."""
         self.displaced += len(self._urgent) == _URGENT
         self._urgent.append(packet)
 
@@ -280,11 +284,14 @@ class Downlink:
         self._queue.add(packet)
 
     def play(self, source: Iterator[bytes] | None) -> None:
-        """Send the packets of `source` at the remaining rate; an item b"" marks a pause."""
+        """Play back the packets of `source` at the data rate that other traffic leaves free.
+
+        If `source` yields empty bytes, the playback continues at the next call of `frames`.
+        """
         self._source = source
 
     def frames(self, now_ns: int) -> list[bytes]:
-        """Return the frames that are due. Raises FlightError if no frame can be protected."""
+        """Return the frames that are due at `now_ns`. Raises FlightError if no frame can be protected."""
         before = now_ns if self._credit_ns is None else self._credit_ns
         most = max(2.0 * self._frame_bytes, self._rate * _BURST_S)
         self._credit = min(most, self._credit + self._rate * (now_ns - before) * 1e-9)
@@ -310,7 +317,7 @@ class Downlink:
         return self._live.flush() if late else []
 
     def _next_in_turn(self) -> list[bytes]:
-        """Return frames of a file or of the playback, which share the rate left by live telemetry."""
+        """Return frames of the file transfers or of the playback, alternating between the two."""
         self._files_first = not self._files_first
         if self._files_first:
             return self._next_filed() or self._next_played()
@@ -336,7 +343,7 @@ class Downlink:
 
 
 class Playback:
-    """Playback of recorded packets, one time interval at a time."""
+    """Playback of one time interval of recorded packets at a time."""
 
     def __init__(self, downlink: Downlink, log: LogFollower) -> None:
         self._downlink = downlink
@@ -344,7 +351,12 @@ class Playback:
         self._done: Report | None = None
 
     def begin(self, play: Play, done: Report) -> list[Report]:
-        """Begin a playback and return the reports due now; `done` is reported at its end."""
+        """Begin a playback and return the reports due now.
+
+        Args:
+            play: directive with the run and time interval.
+            done: report to be sent when the playback is complete.
+        """
         folder = self._log.folder(play.run)
         if folder is None:
             return [replace(done, stage=Stage.FAILED, text=f"there is no run {play.run}")]
@@ -354,14 +366,14 @@ class Playback:
         return [*reports, replace(done, stage=Stage.STARTED)]
 
     def end(self, reason: str) -> list[Report]:
-        """End the playback; return the report of the interrupted playback, if any."""
+        """End the playback and return the failure report of an interrupted playback."""
         reports = [] if self._done is None else [replace(self._done, stage=Stage.FAILED, text=reason)]
         self._done = None
         self._downlink.play(None)
         return reports
 
     def turn(self) -> list[Report]:
-        """Return the report of a playback that was sent completely."""
+        """Return the completion report of a playback once all its packets were sent, otherwise nothing."""
         if self._done is None or self._downlink.playing:
             return []
         done, self._done = self._done, None

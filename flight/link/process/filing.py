@@ -1,8 +1,9 @@
-"""Files on board: which files may be sent or received, and the selection of a received file.
+"""Management of files on board: rules for sent and received files, and selection of received files.
 
-Files under `log/` (the runs of the flight) and `received/` can be sent down. A file that comes up belongs
-to one of `KINDS`. A received file has no effect until a command with its SHA-256 selects it. The board then
-uses it as `chosen/KIND/NAME`, the only file of its kind (docs/fly/files.md).
+The satellite can send files in the folders `log/` (recorded runs) and `received/` to the ground. Each file
+sent to the satellite belongs to one of the kinds `KINDS`. A received file has no effect until a command with
+the file's SHA-256 selects the file. The selected file becomes `chosen/KIND/NAME`, replacing the selected file
+of the same kind (docs/fly/files.md).
 """
 
 from __future__ import annotations
@@ -42,20 +43,28 @@ from flight.link.process.directives import (
 from knightcube.errors import UsageError
 
 KINDS = ("configuration", "elements", "catalogue", "release")
-"""Kinds of files that the satellite receives, and their folders."""
+"""Kinds of files that the satellite receives. Each kind is also the name of a folder."""
 LARGEST_UP = 64 << 20
 """Maximum size (bytes) of a received file."""
 MOST_RECEIVED = 256 << 20
-"""Maximum size (bytes) of all received files."""
+"""Maximum total size (bytes) of all received files."""
 LISTING = "listing.json"
 _PORTION = 1 << 20
 
 
 class Filing:
-    """Executes the commands for files and owns the file transfers. Not thread-safe."""
+    """Executor of the file commands and owner of the file transfers on board. Not thread-safe."""
 
     def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
-        """`folder` holds transfers and received files, `log` the flight's runs. Raises UsageError."""
+        """Continue the stored transfers.
+
+        Args:
+            folder: folder of the transfers and the received files.
+            log: folder of the recorded runs.
+            now_ns: current time of the monotonic clock, ns.
+
+        Raises UsageError if the folder cannot be used.
+        """
         self._folder = folder
         self._store = Store(folder)
         self._roots = {"log": log, "received": self._store.received}
@@ -68,14 +77,14 @@ class Filing:
             raise UsageError(str(error)) from error
 
     def take(self, packet: bytes, now_ns: int) -> None:
-        """Process a received unit. Raises CommandError for an invalid unit or if the disk fails."""
+        """Process a packet with a CFDP unit. Raises CommandError for an invalid unit or if the disk fails."""
         try:
             self._entity.take(unit_of(packet), now_ns)
         except (PduError, FileError, OSError) as error:
             raise CommandError(str(error)) from error
 
     def packet(self, now_ns: int, time_ns: int) -> bytes | None:
-        """Return the next packet to send down at mission time `time_ns`, None if none is due."""
+        """Return the next packet for the ground at mission time `time_ns` (ns), None if no packet is due."""
         try:
             unit = self._entity.unit(now_ns)
         except (FileError, OSError) as error:
@@ -84,7 +93,7 @@ class Filing:
         return None if unit is None else self._units.pack(unit, time_ns)
 
     def turn(self, now_ns: int) -> list[Report]:
-        """Continue long operations for one step, and return their reports."""
+        """Execute one step of each long operation and return the reports of finished operations."""
         try:
             self._entity.keep(now_ns)
             self._problem = ""
@@ -101,7 +110,7 @@ class Filing:
         return self._entity.transfers()
 
     def ended(self) -> Iterator[tuple[Progress, Report | None]]:
-        """Yield each transfer that has ended, with the report of the command that began it."""
+        """Yield each ended transfer with the final report of the command that started the transfer."""
         while self._entity.ended:
             one = self._entity.ended.popleft()
             report = None
@@ -113,7 +122,14 @@ class Filing:
             yield one, report
 
     def obey(self, directive: FileDirective, done: Report, utc_ns: int, now_ns: int) -> list[Report]:
-        """Execute a directive and return the reports due now; `done` is the report of its completion."""
+        """Execute a file directive and return the reports due now.
+
+        Args:
+            directive: directive about files.
+            done: report of the directive's completion.
+            utc_ns: current UTC, ns since 1970.
+            now_ns: current time of the monotonic clock, ns.
+        """
         try:
             match directive:
                 case ListFiles(entity=entity, under=under):
@@ -133,7 +149,7 @@ class Filing:
         return [done]
 
     def close(self, now_ns: int) -> None:
-        """Store the received data. Raises FileError."""
+        """Store the received data and close all files. Raises FileError if the disk fails."""
         self._entity.close(now_ns)
 
     def _send(
@@ -142,13 +158,16 @@ class Filing:
         origin = Origin(done.spi, done.counter, *done.request)
         kind = (
             MODULAR if entity == FOREIGN else CRC32
-        )  # every implementation knows the first; the second detects more errors
+        )  # other stations may lack CRC-32, which detects more errors
         one = self._entity.send(path, name, entity, kind, utc_ns, now_ns, origin)
         text = f"{name}: {one.size} bytes, transfer {one.number}"
         return [replace(done, stage=Stage.STARTED, text=text)]
 
     def _path(self, name: str) -> Path:
-        """Return the file of a name. Raises FileError, also if a link leads out of the two folders."""
+        """Return the path of a file name.
+
+        Raises FileError for a missing file or a path outside the two folders.
+        """
         root, _, rest = name.partition("/")
         if (problem := problem_of_name(name)) or root not in self._roots:
             raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
@@ -174,7 +193,7 @@ class Filing:
         return ""
 
     def _write_listing(self, under: str) -> Path:
-        """Write the list of files, sorted by name. Raises FileError."""
+        """Write the list of files, sorted by name, and return the path of the list. Raises FileError."""
         files = []
         for name, root in self._roots.items():
             for path in root.rglob("*"):
@@ -189,7 +208,10 @@ class Filing:
         return path
 
     def _choosing(self, path: Path, name: str, wanted: bytes) -> Iterator[str | None]:
-        """Check and select a file in steps: yield None after each step, then the problem or an empty text."""
+        """Check the SHA-256 of a received file in steps and select the file.
+
+        Yields None after each step, and at the end the problem or an empty text.
+        """
         digest = hashlib.sha256()
         kind, _, own = name.removeprefix("received/").partition("/")
         with path.open("rb") as file:
@@ -227,7 +249,7 @@ def _name_of(file: dict[str, Any]) -> str:
 
 
 def values_of(progress: Progress) -> dict[str, Any]:
-    """Return the fields of the packet `transfer`."""
+    """Return the values of the packet `transfer` for the progress of a file transfer."""
     return {
         "down": int(progress.outgoing),
         "source": progress.source,

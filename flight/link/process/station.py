@@ -1,8 +1,9 @@
-"""Link process: the lines to the ground, and the loop that receives frames and sends telemetry at 50 Hz.
+"""Link process: communication lines to the ground, and the loop that receives frames and sends telemetry.
 
-The lines are UDP, TCP and serial. No call waits, and a flood of frames is read in portions. The loop runs in
-one thread and waits only for its next turn. The counter of an accepted frame is stored before its content is
-executed. The link stores nothing but these counters: killed at any moment, it executes no command twice.
+The lines are UDP, TCP and serial. The loop runs at 50 Hz in one thread, and no call on a line blocks. A flood
+of received frames is processed in portions, so that telemetry is not delayed. The counter of an accepted
+frame is stored before the command in the frame is executed. A link process that is killed at any moment
+therefore executes no command twice.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ from hal.interfaces.wires import SECOND_NS, Clock, SerialPort
 from knightcube.errors import FlightError, UsageError
 
 AT_MOST = 512
-"""Maximum number of frames read from a line per call, so that a flood does not delay the telemetry."""
+"""Maximum number of datagrams read per call, so that a flood of frames does not delay the telemetry."""
 
 _BUFFER = 1 << 20
 _HEARD_NS = 60_000_000_000
@@ -71,33 +72,41 @@ _PIECE = 1 << 14
 
 
 class Line(Protocol):
-    """Interface of a line to the ground."""
+    """Interface of a communication line to the ground."""
 
     name: str
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the received frames, each with its sender, oldest first. Never raises."""
+        """Return the received frames with their senders, oldest first. Never raises."""
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Record that an authentic frame came from a sender."""
+        """Record that a sender has sent an authentic frame."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
         """Send frames to all listeners. Never raises."""
 
     def close(self) -> None:
-        """Close. Safe to call twice."""
+        """Close the line. A second call has no effect."""
 
 
 class UdpLine:
     """UDP line with one frame per datagram.
 
-    Telemetry is sent to the fixed address and, for a minute, to each sender of an authentic frame.
+    Telemetry is sent to the fixed address, and to each sender for one minute after its last authentic frame.
     """
 
     def __init__(
         self, address: str, to: str | None = None, peers: Sequence[IPv4Network] | None = None
     ) -> None:
-        """Bind HOST:PORT; if `peers` is given, frames of other senders are ignored. Raises UsageError."""
+        """Bind a UDP socket.
+
+        Args:
+            address: own address, HOST:PORT.
+            to: fixed address HOST:PORT that receives telemetry, None for no fixed address.
+            peers: networks of the accepted senders, None to accept all senders.
+
+        Raises UsageError if the address cannot be bound.
+        """
         self.name = f"UDP {address}"
         self._peers = peers
         self._fixed = None if to is None else host_port(to)
@@ -113,29 +122,29 @@ class UdpLine:
 
     @property
     def port(self) -> int:
-        """The port that is bound."""
+        """Number of the bound UDP port."""
         return int(self._socket.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
-        """Return the received datagrams, cut to one byte more than the longest frame."""
+        """Return the received datagrams, each cut to one byte more than the longest frame."""
         found = []
         for _ in range(AT_MOST):
             try:
                 data, sender = self._socket.recvfrom(LONGEST_FRAME + 1)
             except BlockingIOError:
                 break
-            except OSError:  # a listener that is gone answered by ICMP
+            except OSError:  # ICMP error from a listener that no longer exists
                 continue
             if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
                 found.append((data, sender))
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Send telemetry to this sender for a minute."""
+        """Send telemetry to this sender for one minute."""
         self._heard[sender] = now_ns
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send a datagram for each frame to each listener."""
+        """Send each frame as one datagram to each listener."""
         self._heard = {who: at for who, at in self._heard.items() if now_ns - at < _HEARD_NS}
         fixed = () if self._fixed is None or self._fixed in self._heard else (self._fixed,)
         for listener in (*fixed, *self._heard):
@@ -149,10 +158,20 @@ class UdpLine:
 
 
 class TcpLine:
-    """TCP server with a stream of marked frames per connection; a fifth connection replaces the oldest."""
+    """TCP server for up to four connections, on which each frame follows a sync marker.
+
+    A fifth connection replaces the oldest connection.
+    """
 
     def __init__(self, address: str, peers: Sequence[IPv4Network] | None = None) -> None:
-        """Listen at HOST:PORT; if `peers` is given, only they may connect. Raises UsageError."""
+        """Listen for connections.
+
+        Args:
+            address: own address, HOST:PORT.
+            peers: networks from which connections are accepted, None to accept all connections.
+
+        Raises UsageError if the address cannot be bound.
+        """
         self.name = f"TCP {address}"
         self._peers = peers
         self._connections: dict[socket.socket, tuple[FrameStream, bytearray]] = {}
@@ -164,7 +183,7 @@ class TcpLine:
 
     @property
     def port(self) -> int:
-        """The port that is bound."""
+        """Number of the TCP port on which the server listens."""
         return int(self._listener.getsockname()[1])
 
     def receive(self) -> list[tuple[bytes, Any]]:
@@ -185,10 +204,10 @@ class TcpLine:
         return found
 
     def trust(self, sender: Any, now_ns: int) -> None:
-        """Do nothing, because each connection receives the telemetry."""
+        """Do nothing, because all connections receive the telemetry anyway."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send frames to all connections, and close a connection that does not read them."""
+        """Send frames to all connections, and close connections that do not read the frames."""
         marked = b"".join(SYNC + frame for frame in frames)
         for connection, (_, unsent) in list(self._connections.items()):
             unsent.extend(marked)
@@ -228,10 +247,10 @@ class TcpLine:
 
 
 class SerialLine:
-    """Stream of marked frames on a serial port, to a radio or a modem."""
+    """Serial line to a radio or modem, on which each frame follows a sync marker."""
 
     def __init__(self, name: str, port: SerialPort) -> None:
-        """Use an open port, which reopens automatically after a loss."""
+        """Use an open serial port, which reopens automatically if the device is lost."""
         self.name = name
         self._port = port
         self._stream = telecommand_stream()
@@ -248,7 +267,7 @@ class SerialLine:
         """Do nothing, because a serial line has only one other end."""
 
     def send(self, frames: Sequence[bytes], now_ns: int) -> None:
-        """Send marked frames; frames are lost while the port is lost."""
+        """Send frames with sync markers. Frames are discarded while the port is lost."""
         with contextlib.suppress(DeviceError):
             if frames:
                 self._port.send(b"".join(SYNC + frame for frame in frames))
@@ -259,13 +278,13 @@ class SerialLine:
 
 
 def host_port(address: str) -> tuple[str, int]:
-    """Return host and port of HOST:PORT. The caller has checked the form."""
+    """Return the host and port of a valid address HOST:PORT."""
     host, _, port = address.rpartition(":")
     return host, int(port)
 
 
 def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, Sealer]) -> str:
-    """Change a key; return the problem, or an empty text on success."""
+    """Change the key of an SPI. Return the problem, or an empty text on success."""
     if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
         return f"there is no SPI {change.spi}"
     before = vault.read(change.spi)
@@ -280,17 +299,26 @@ def _change_key(change: NewKey, vault: Vault, gate: Gate, sealers: Mapping[int, 
 
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250
-"""Period (ns) while frames arrive. A Linux socket buffers 50 ms of 10,000 frames/s."""
+"""Period (ns) of the loop while frames arrive.
+
+A Linux socket buffers about 50 ms of traffic at 10,000 frames/s.
+"""
 _LABEL_NS = 10 * SECOND_NS
 _RESERVED_BLOCK = 4096
 _REFUSALS_A_SECOND = 4
 _HIGHEST_REPORTED = 2**63 - 1
-"""Largest counter and mission time in a packet. The counter of a frame has up to 96 bits."""
+"""Largest frame counter and mission time (ns) that fit into a report. Received counters have 96 bits."""
 
 
 @dataclass(frozen=True, slots=True)
 class StationSettings:
-    """Settings of the link: spacecraft identifier, length of a frame (bytes), and rate (bytes/s)."""
+    """Settings of the link.
+
+    Attributes:
+        spacecraft: spacecraft identifier in all frames.
+        frame_bytes: length of a telemetry frame, bytes.
+        rate: data rate of the telemetry, bytes/s.
+    """
 
     spacecraft: int
     frame_bytes: int
@@ -298,7 +326,7 @@ class StationSettings:
 
 
 class Station:
-    """Satellite end of the link."""
+    """Satellite end of the link: processes received frames and sends telemetry."""
 
     def __init__(
         self,
@@ -309,7 +337,7 @@ class Station:
         log: LogFollower,
         clock: Clock,
     ) -> None:
-        """Use open lines, which the caller closes."""
+        """Use open communication lines, which the caller closes."""
         self._vault = vault
         self._lines = lines
         self._control = control
@@ -343,7 +371,7 @@ class Station:
 
     @property
     def unreported(self) -> int:
-        """Reports that could not be packed, or that newer reports displaced before they were sent."""
+        """Number of reports that were never sent because packing failed or the queue was full."""
         return self._unpacked + self._downlink.displaced
 
     def run(
@@ -354,8 +382,9 @@ class Station:
     ) -> None:
         """Run until `ended` returns true.
 
-        `complain` is called once for each problem with sending, and once a second at most while reports are
-        lost. `alive` is called once a second while the loop turns, also within a turn that takes many frames.
+        The function `complain` is called once for each problem with sending, and at most once a second while
+        reports are lost. The function `alive` is called once a second while the loop makes progress, also
+        during an iteration that processes many frames.
         """
         self._alive = alive
         due_ns, complained, lost, lost_ns = self._clock.now_ns(), "", 0, 0
@@ -373,7 +402,7 @@ class Station:
         self._filing.close(self._clock.now_ns())
 
     def turn(self) -> bool:
-        """Process received frames and send due frames; return whether any frame was received."""
+        """Process received frames and send due frames. Return whether any frame was received."""
         now_ns, before = self._clock.now_ns(), self._received
         for line in self._lines:
             for frame, sender in line.receive():
@@ -396,7 +425,7 @@ class Station:
         try:
             frames = self._downlink.frames(now_ns)
             self._problem = ""
-        except FlightError as error:  # no counter is free; a command can still set a new key
+        except FlightError as error:  # no free counter: a command can still set a new key
             self._problem, frames = str(error), []
         for line in self._lines:
             line.send(frames, now_ns)
@@ -404,7 +433,7 @@ class Station:
         return self._received > before
 
     def _beat(self) -> None:
-        """Report once a second that the loop makes progress."""
+        """Call the function `alive` once a second to report that the loop makes progress."""
         now_ns = self._clock.now_ns()
         if self._alive is not None and now_ns >= self._alive_ns:
             self._alive_ns = now_ns + SECOND_NS
@@ -415,7 +444,7 @@ class Station:
         try:
             admitted = self._gate.admit(frame)
         except RefusedError as error:
-            # A flood of repeated frames must cause few reports.
+            # Reports are rate-limited, because an attacker could repeat recorded frames at a high rate.
             if error.counter is not None and now_ns - self._refusals_ns[0] > SECOND_NS:
                 self._refusals_ns.append(now_ns)
                 counter = min(error.counter, _HIGHEST_REPORTED)
@@ -445,7 +474,7 @@ class Station:
             self._report(report(sent, Stage.FAILED, problem))
 
     def _execute_due(self, now_ns: int) -> None:
-        """Hand over the due scheduled commands, or report why they are not executed."""
+        """Send due scheduled commands to the control process, and report commands that are not executed."""
         utc_ns = self._clock.utc_ns()
         for due in self._scheduling.due(utc_ns):
             if isinstance(due, Sent):
@@ -454,7 +483,7 @@ class Station:
                 self._report(due)
 
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
-        """Execute a directive and report its stages."""
+        """Execute a directive and report the stages of its execution."""
         name, text = directives.name_of(directive), str(directive)
         request = request_of(admitted.data)
         done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
@@ -465,7 +494,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Directive, done: Report) -> list[Report]:
-        """Execute a directive and return the reports due now; `done` is the report of its completion."""
+        """Execute a directive and return the reports due now. The report `done` states its completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)
@@ -490,7 +519,10 @@ class Station:
             self._downlink.live(self._log.label)
 
     def _seal(self, header: bytes, data: bytes) -> bytes:
-        """Protect a frame by the first SPI of telemetry that has a counter. Raises FlightError."""
+        """Protect a frame with the primary telemetry SPI, or with the reserve SPI if the primary fails.
+
+        Raises FlightError if both SPIs fail.
+        """
         problem: FlightError | None = None
         for sealer in self._sealers.values():
             try:
@@ -520,7 +552,7 @@ class Station:
             self._send(TRANSFER, values_of(progress))
 
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
-        """Send a packet of the link; a packet whose values do not fit is counted and dropped."""
+        """Queue a report packet for sending. A packet whose values do not fit is counted and dropped."""
         try:
             self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
         except TelemetryError as error:
@@ -531,12 +563,12 @@ class Station:
         return self._filing.packet(self._clock.now_ns(), self._time_ns())
 
     def _time_ns(self) -> int:
-        """Return the mission time (ns), limited to the range of the packets' field."""
+        """Return the mission time (ns), limited to the range of the time field in a packet."""
         return min(self._mission_ns + self._clock.now_ns() - self._mission_at_ns, _HIGHEST_REPORTED)
 
 
 def _security(gate: Gate, vault: Vault) -> dict[str, Any]:
-    """Return the fields of the link packet about frames and security associations."""
+    """Return the values of the link packet about received frames and security associations."""
     known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
     gates = [gate.association(spi) for spi in COMMAND_SPIS]
     return {
@@ -549,7 +581,7 @@ def _security(gate: Gate, vault: Vault) -> dict[str, Any]:
 
 
 def parser_of(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:
-    """Return the function that splits a telecommand frame of this spacecraft."""
+    """Return a function that splits a telecommand frame of this spacecraft into header and protected data."""
     size = TELECOMMAND_HEADER.size
 
     def parse(frame: bytes) -> tuple[bytes, bytes]:

@@ -1,1 +1,1 @@
-"""Telemetry: CCSDS packets from one definition table, the flight log, its reader, its documentation."""
+"""Telemetry: packet definitions, encoding and decoding of CCSDS packets, and the flight log."""

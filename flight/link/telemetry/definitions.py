@@ -1,9 +1,10 @@
-"""Types of a packet definition, the table of all telemetry packets, and the table of parameters.
+"""Definitions of all telemetry packets, and of the parameters that an operator can change in flight.
 
-The packer, the parser, the ground database, the CSV export and the documentation are made from this table.
-A packet that has flown is never changed in place: a field is appended, and the version of the packet is
-raised. The parameters are values that an operator can change in flight, all of them at once. Until a table is
-loaded, the configuration gives their values; the bounds of the configuration's schema apply as well.
+The encoder, the decoder, the ground database, the CSV export and the documentation are generated from these
+definitions. The existing fields of a packet that has flown are never changed. New fields are appended, and
+the version of the packet is increased. All parameters are loaded at once, as one table. Until a table is
+loaded, the parameters have the values of the configuration. Loaded values must also satisfy the bounds of the
+configuration schema.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ Alarms = tuple[tuple[int, Level], ...]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Nominal ranges (low, high) of a value; a value outside is a warning or a fault."""
+    """Nominal ranges (low, high) of a value. A value outside its range causes a warning or a fault."""
 
     warning: Range | None = None
     fault: Range | None = None
@@ -36,17 +37,17 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field: `kind` is a numpy type code (f8, f4, u1, u2, u4, u8, i8) or S<n> for n bytes of UTF-8.
-
-    `count` > 1 makes an array. All numbers are big-endian on the wire.
+    """Definition of one field of a packet. Numbers are big-endian in the packet.
 
     Attributes:
-        states: the values of an enumerated field, each with its name.
-        bits: the bits of a bit field, each with its name; several bits can be set.
-        alarms: the states or set bits that are a warning or a fault.
-        limits: the nominal ranges of a value without states.
-        valid: the allowed range (low, high) of a command's argument.
-        wraps: whether the field continues at 0 after its largest number.
+        kind: numpy type code (f8, f4, u1, u2, u4, u8, i8), or S<n> for n bytes of UTF-8 text.
+        count: number of values; a field with more than one value is an array.
+        states: numbers and names of the states of an enumerated field.
+        bits: numbers and names of the bits of a bit field, of which several can be set.
+        alarms: states or set bits that are reported as a warning or a fault.
+        limits: nominal ranges of a numeric field without states.
+        valid: allowed range (low, high) of a command argument.
+        wraps: whether the field is a counter that continues at 0 after its largest number.
     """
 
     name: str
@@ -63,20 +64,20 @@ class Field:
 
 
 def counter(name: str, meaning: str) -> Field:
-    """Return the field of a counter, which wraps at the end of its range."""
+    """Return the definition of a counter field, which wraps at the end of its range."""
     return Field(name, "u4", "-", meaning, wraps=True)
 
 
 def flag(name: str, meaning: str) -> Field:
-    """Return the field of a condition, no or yes."""
+    """Return the definition of a Boolean field with the states no and yes."""
     return Field(name, "u1", "-", meaning, states=NO_YES)
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One packet: its application process identifier (APID), rate and fields.
+    """Definition of a packet: name, application process identifier (APID), rate and fields.
 
-    `hazard` states the harm that a telecommand can cause, empty if there is none.
+    The text `hazard` states the harm that a telecommand can cause. It is empty for a harmless packet.
     """
 
     name: str
@@ -123,19 +124,22 @@ PARAMETER_FIELDS: tuple[Field, ...] = (
         "health.hottest", "degree C", -40.0, 150.0, "board temperature at which the mode changes to safe"
     ),
 )
-"""Fields of the parameters, in their order in the packets."""
+"""Definitions of the parameter fields, in the order of the parameter packets."""
 
 PARAMETER_KEYS: tuple[str, ...] = tuple(parameter.name.replace("_", ".", 1) for parameter in PARAMETER_FIELDS)
-"""Keys of the parameters in a configuration, in the same order."""
+"""Configuration keys of the parameters, in the order of `PARAMETER_FIELDS`."""
 
 
 def crc_of(values: Sequence[float]) -> int:
-    """Return the CRC-32 of a table's values, as big-endian doubles in the order of `PARAMETER_KEYS`."""
+    """Return the CRC-32 of parameter values, encoded as big-endian doubles in table order."""
     return zlib.crc32(struct.pack(f">{len(PARAMETER_FIELDS)}d", *values))
 
 
 def problem_of(values: Mapping[str, float]) -> str:
-    """Return the problem of a table (missing or unknown key, value out of range), else an empty text."""
+    """Return the problem of a parameter table, or an empty text if the table is valid.
+
+    A problem is a missing key, an unknown key or a value out of range.
+    """
     if lacking := [key for key in PARAMETER_KEYS if key not in values]:
         return f"{lacking[0]} is missing: a table is loaded as a whole"
     if unknown := sorted(set(values) - set(PARAMETER_KEYS)):
@@ -148,19 +152,19 @@ def problem_of(values: Mapping[str, float]) -> str:
 
 
 TABLES: States = ((0, "configuration"), (1, "loaded"))
-"""Source of the table of parameters in use."""
+"""Sources of the parameter table in use."""
 MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
 STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
-"""The use of the coils (`flight.loop.body.SteeringState`)."""
+"""States of the use of the coils (`flight.loop.body.SteeringState`)."""
 STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
-"""The quality of a stream of readings (`flight.loop.facts.StreamState`)."""
+"""States of the quality of a stream of readings (`flight.loop.facts.StreamState`)."""
 KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
-"""Quality of the attitude estimate (`flight.bodies.orbit.body`)."""
+"""States of the quality of the attitude estimate (`flight.bodies.orbit.body`)."""
 COILS: States = ((0, "x"), (1, "y"), (2, "z"))
-"""The coils, by body axis."""
+"""Torque coils, numbered by body axis."""
 STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
-"""The stages of a command (`flight.link.process.commanding.Stage`)."""
+"""Stages of a command (`flight.link.process.commanding.Stage`)."""
 
 SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
 SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAULT), "fault"))
@@ -213,7 +217,7 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("wide-lost", "warning"),
     ("wide-false", "warning"),
 )
-"""Conditions that monitors detect, in the order of `flight.loop.facts`, with the severity of their events."""
+"""Conditions that the monitors detect, in the order of `flight.loop.facts`, each with its severity."""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))
 FACT_ALARMS: Alarms = tuple((bit, level) for bit, (_, level) in enumerate(_FACTS))
 
@@ -323,7 +327,7 @@ COMMAND = Packet(
 
 
 MAX_NODES = 40
-"""Maximum number of nodes of a path in its packet."""
+"""Maximum number of path nodes in a plan packet."""
 
 _Q2 = Limits(fault=(-Q2_LIMIT, Q2_LIMIT))
 
@@ -576,7 +580,7 @@ STARS = Packet(
 )
 
 MOST_SIGHTINGS = 8
-"""Maximum number of sightings in a packet."""
+"""Maximum number of sightings in a `sightings` packet."""
 
 SIGHTINGS = Packet(
     "sightings",
@@ -711,7 +715,7 @@ TRANSFER = Packet(
 
 
 _LATENESS = Limits(fault=(0.0, 0.0125))
-"""Nominal delay of a control cycle, s: half a period of 40 Hz, after which the cycle is skipped."""
+"""Nominal delay (s) of a control cycle. A cycle delayed by more than half its period is skipped."""
 _EXECUTION = Limits(warning=(0.0, 0.0125), fault=(0.0, 0.025))
 
 CYCLE_TIMING = Packet(

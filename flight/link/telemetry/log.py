@@ -1,15 +1,15 @@
-"""Flight log: the recorder that packs values, the queue before the disk, the segments and the runs.
+"""Flight log: recorder that packs values, bounded queue, segment files, and the archive of runs.
 
-`FlightLog.write` appends to a bounded queue and never waits. A ticker of the clock writes the queue into
-numbered segments without buffering, so that a process killed at any moment leaves at most one incomplete
-packet. While the disk fails, packets wait in the queue; packets that exceed the queue are counted and
-reported. Measured execution times depend on the machine, so they are written to a separate performance log,
-and the flight log of a lock-step run is reproducible bit for bit.
+`FlightLog.write` appends a packet to a bounded queue and never blocks. A periodic task (ticker) writes the
+queue to numbered segment files without buffering, so that a killed process leaves at most one incomplete
+packet. While the disk fails, packets remain in the queue. Packets that do not fit into the queue are lost,
+and their number is reported. Measured execution times depend on the machine and are therefore written to a
+separate performance log. The flight log of a lock-step simulation is reproducible bit for bit.
 
-Each boot creates the folder of a new run, such as `run-000042`; a run's folder is never written by a second
-boot. Runs are ordered by number, because the wall clock of a board may be wrong. The oldest runs are
-deleted to keep a budget and to free a full disk, but never the last run. If nothing can be written, the
-flight continues without a log.
+Each boot creates a new run folder such as `run-000042`, into which no later boot writes. Runs are ordered by
+number, because the wall clock of the board may be wrong. The oldest runs are deleted if the archive exceeds
+its budget or the disk is full, but the last run is never deleted. If the disk cannot be written, the flight
+continues without a log.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SUFFIX = ".ccsds"
 
 
 class SegmentFile(Protocol):
-    """Interface of an unbuffered binary file, as the log uses it."""
+    """Interface of the unbuffered binary file to which the log writes."""
 
     def write(self, data: bytes, /) -> int | None:
         """Append bytes and return the number of bytes written. Raises OSError."""
@@ -54,15 +54,15 @@ class SegmentFile(Protocol):
 
 
 def open_segment(path: Path) -> SegmentFile:
-    """Create a segment and make its name durable. Raises OSError, also if the file exists.
+    """Create a segment file and sync its folder. Raises OSError if the file exists or cannot be created.
 
-    The segment is opened for appending, so that a write after a truncation follows the last whole packet.
+    The file is opened in append mode, so that a write after a truncation follows the last complete packet.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
         make_lasting(path.parent)
-    except OSError:  # the file is removed, so that the next attempt can create it
+    except OSError:  # remove the file, so that the next attempt can create it
         file.close()
         path.unlink(missing_ok=True)
         raise
@@ -70,20 +70,20 @@ def open_segment(path: Path) -> SegmentFile:
 
 
 def find_segments(folder: Path, stem: str) -> list[Path]:
-    """Return the segments of a log, oldest first, or an empty list if there is none."""
+    """Return the segment files of a log, oldest first, or an empty list if there are none."""
     pattern = re.compile(re.escape(stem) + r"-(\d+)" + re.escape(SUFFIX))
     matches = ((pattern.fullmatch(path.name), path) for path in folder.glob(f"{stem}-*{SUFFIX}"))
     return [path for _, path in sorted((int(match[1]), path) for match, path in matches if match)]
 
 
 class SegmentStore:
-    """Appends packets to `<stem>-0001.ccsds`, `<stem>-0002.ccsds`, ... in an existing folder.
+    """Writer of packets to segment files `<stem>-0001.ccsds`, `<stem>-0002.ccsds`, ... in an existing folder.
 
-    The content of the files depends on the packets only, not on their division among calls.
+    The content of the files depends only on the packets, not on how many packets each call appends.
 
     Attributes:
-        packets: number of packets written completely.
-        dropped: number of segments deleted to keep the budget.
+        packets: number of completely written packets.
+        dropped: number of segment files deleted to stay within the budget.
     """
 
     def __init__(
@@ -94,23 +94,23 @@ class SegmentStore:
         budget_bytes: int,
         opener: Callable[[Path], SegmentFile] = open_segment,
     ) -> None:
-        """Create the first segment. Raises OSError."""
+        """Create the first segment file. Raises OSError if the file cannot be created."""
         self._folder = folder
         self._stem = stem
         self._segment_bytes = segment_bytes
         self._budget_bytes = budget_bytes
         self._opener = opener
-        self._finished: deque[tuple[Path, int]] = deque()  # with their sizes, oldest first
+        self._finished: deque[tuple[Path, int]] = deque()  # paths and sizes (bytes), oldest first
         self._number = 0
         self.packets = 0
         self.dropped = 0
         self._open_next()
 
     def append(self, packets: Sequence[bytes]) -> None:
-        """Write packets, and begin a new segment whenever one is full. Raises OSError.
+        """Write packets and begin a new segment file whenever the current file is full.
 
-        After a failure `packets` counts the packets written completely. The segment ends with the last of
-        them, and `append` may be called again.
+        Raises OSError if a write fails. The attribute `packets` then counts the completely written packets,
+        the file is truncated after the last complete packet, and `append` may be called again.
         """
         chunk: list[bytes] = []
         size = self._size
@@ -124,7 +124,7 @@ class SegmentStore:
         self._write(chunk)
 
     def removed(self) -> bool:
-        """Return whether another process has removed the segment. Raises OSError."""
+        """Return whether another process has removed the current segment file. Raises OSError."""
         try:
             os.stat(self._path)
         except FileNotFoundError:
@@ -132,18 +132,18 @@ class SegmentStore:
         return False
 
     def sync(self) -> None:
-        """Make the written packets durable. Raises OSError."""
+        """Sync the written packets to disk. Raises OSError."""
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Sync and close the segment. Raises OSError."""
+        """Sync and close the current segment file. Raises OSError."""
         try:
             self.sync()
         finally:
             self._file.close()
 
     def _open_next(self) -> None:
-        """Begin the next segment; after a failure the current segment remains in use."""
+        """Begin the next segment file. If this fails, the current file remains in use."""
         path = self._folder / f"{self._stem}-{self._number + 1:04d}{SUFFIX}"
         self._file = self._opener(path)
         self._path = path
@@ -151,7 +151,7 @@ class SegmentStore:
         self._size = 0
 
     def _turn(self) -> None:
-        """Finish the segment and begin the next."""
+        """Finish the current segment file and begin the next file."""
         self.sync()
         old, finished = self._file, (self._path, self._size)
         self._open_next()
@@ -172,7 +172,7 @@ class SegmentStore:
         self.packets += len(chunk)
 
     def _make_room(self, coming: int) -> None:
-        """Delete the oldest segments, except the newest, until `coming` bytes fit into the budget."""
+        """Delete finished segment files, oldest first, until `coming` further bytes fit into the budget."""
         total = self._size + coming + sum(size for _, size in self._finished)
         while self._finished and total > self._budget_bytes:
             path, size = self._finished.popleft()
@@ -181,7 +181,7 @@ class SegmentStore:
             total -= size
 
     def _keep_whole(self, chunk: list[bytes], written: int) -> None:
-        """Count the packets of `chunk` within `written` bytes, and truncate the file after them."""
+        """Count the complete packets of `chunk` within `written` bytes, and truncate the file after them."""
         whole = 0
         for packet in chunk:
             if whole + len(packet) > written:
@@ -196,35 +196,47 @@ class SegmentStore:
 
 
 MOST_RUNS = 1000
-"""Maximum number of runs. A board that crashes at every start would create many small runs."""
+"""Maximum number of runs. The limit matters for a board that crashes at every start, creating many runs."""
 
 LEAST_FREE_BYTES = 64 << 20
-"""Free disk space (bytes) at the start of a run, enough for hours of packets."""
+"""Minimum free disk space (bytes) at the start of a run, enough for several hours of packets."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""Errors of a full or failing disk. Other errors indicate a wrong path."""
+"""Error numbers (errno) of a full or failing disk. Other error numbers indicate a wrong path."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
 
 @dataclass(frozen=True, slots=True)
 class NewRun:
-    """Folder of a new run, which is missing if the disk cannot be written, and the number of dropped runs."""
+    """Result of starting a run.
+
+    Attributes:
+        folder: path of the run's folder, which does not exist if the disk cannot be written.
+        dropped: number of old runs that were deleted.
+    """
 
     folder: Path
     dropped: int
 
 
 def find_runs(archive: Path) -> list[Path]:
-    """Return the folders of an archive's runs, oldest first, or an empty list if there is none."""
+    """Return the run folders in an archive, oldest first, or an empty list if there are none."""
     return [path for _, path in _numbered(archive) if path.is_dir() and not path.is_symlink()]
 
 
 def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
-    """Create the folder of the next run, and free `coming_bytes`, the maximum size of the run.
+    """Create the folder of the next run, and delete old runs to make room for the new run.
 
-    Only folders of runs are removed. Raises UsageError if the budget is smaller than the new run or if the
-    path is wrong. A failing disk is reported by the log that writes to it.
+    Only run folders are deleted. A full or failing disk raises no error here, because the log reports the
+    failure.
+
+    Args:
+        archive: folder of the runs.
+        budget_bytes: maximum size of all runs.
+        coming_bytes: maximum size of the new run.
+
+    Raises UsageError if the budget is smaller than the new run or if the path is wrong.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(
@@ -246,7 +258,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
 
 
 def _free(archive: Path) -> float:
-    """Return the free space (bytes) of the archive's disk, infinity if it is unknown."""
+    """Return the free space (bytes) on the disk of the archive, infinity if the free space is unknown."""
     try:
         disk = os.statvfs(archive)
     except OSError:
@@ -255,18 +267,21 @@ def _free(archive: Path) -> float:
 
 
 def _drop(run: Path) -> None:
-    """Remove a run; files that cannot be removed now are removed at the next boot."""
+    """Delete the folder of a run. Files that cannot be deleted now are deleted at a later boot."""
     shutil.rmtree(run, ignore_errors=True)
 
 
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
-    """Return all paths that have the name of a run, with their numbers, in order."""
+    """Return the run numbers and paths of all files and folders with the name of a run, in order."""
     matches = ((_NAME.fullmatch(path.name), path) for path in archive.glob("run-*"))
     return sorted((int(match[1]), path) for match, path in matches if match)
 
 
 def _make_room(runs: list[Path], room_bytes: int) -> int:
-    """Drop the oldest runs until the others fit into the room; return the number of dropped runs."""
+    """Delete the oldest runs until the remaining runs fit into `room_bytes`.
+
+    Return the number of deleted runs.
+    """
     sizes = [_size(run) for run in runs]
     total, dropped = sum(sizes), 0
     while dropped < len(runs) and (total > room_bytes or len(runs) - dropped >= MOST_RUNS):
@@ -277,7 +292,7 @@ def _make_room(runs: list[Path], room_bytes: int) -> int:
 
 
 def _size(folder: Path) -> int:
-    """Return the size (bytes) of all files below a folder; files that vanish meanwhile are not counted."""
+    """Return the total size (bytes) of all files below a folder, ignoring files that disappear meanwhile."""
     total = 0
     for path in folder.rglob("*"):
         try:
@@ -294,9 +309,10 @@ _RECENT_NS = 2_000_000_000
 
 
 class FlightLog:
-    """Log in a folder. One thread calls `write`; a ticker of the clock writes the queue to disk.
+    """Log in a folder, with a bounded queue that a periodic task (ticker) writes to disk.
 
-    The bytes on disk depend on the packets only, not on the times at which the queue is written.
+    Only one thread may call `write`. The content of the files depends only on the packets, not on the times
+    at which the queue is written.
     """
 
     def __init__(
@@ -316,10 +332,10 @@ class FlightLog:
     ) -> None:
         """Begin a new log.
 
-        With `sync_period_ns` None, fsync is called only at the end of each segment, as suits a lock-step
-        simulation, which is faster than real time. Raises UsageError if the folder already holds such a log
-        and `overwrite` is not set, if the sizes are invalid, or if the folder cannot be written. A `patient`
-        log does not raise for a failing disk but retries.
+        If `sync_period_ns` is None, fsync is called only at the end of each segment file. This suits a
+        lock-step simulation, which runs faster than real time. If `patient` is true, a failing disk raises no
+        error, and writing is retried. Raises UsageError if the folder contains a log of the same name and
+        `overwrite` is false, if the sizes are invalid, or if the folder cannot be written.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(
@@ -330,21 +346,21 @@ class FlightLog:
         self._queue_packets = queue_packets
         self._sync_period_ns = sync_period_ns
         self._queue: deque[bytes] = deque()
-        self._refused = 0  # packets lost by the writer
-        self._unwritten = 0  # packets lost by the drainer
-        self._refused_ns = 0  # when last
-        self._failure = ""  # why nothing can be written now
+        self._refused = 0  # packets lost because the queue was full or the log closed
+        self._unwritten = 0  # packets lost after they were queued
+        self._refused_ns = 0  # time of the last such loss
+        self._failure = ""  # reason why packets cannot be written now
         self._past_failure = ""
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = threading.Lock()  # held while draining, never taken by write()
+        self._draining = threading.Lock()  # held while the queue is written, never taken by write()
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:
             nonlocal overwrite
             _clear(folder, stem, overwrite)
-            overwrite = True  # files of a failed attempt are our own
+            overwrite = True  # a retry may overwrite the files of a failed attempt
             return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
 
         self._begin = begin
@@ -359,7 +375,7 @@ class FlightLog:
         self._ticker = clock.ticker(f"log-{stem}", drain_period_ns, self._drain)
 
     def write(self, packet: bytes) -> None:
-        """Queue one packet without waiting; a packet that exceeds the queue is counted and lost."""
+        """Queue a packet without blocking. If the queue is full, the packet is lost and counted."""
         if self._closed or len(self._queue) >= self._queue_packets:
             self._refused += 1
             self._refused_ns = self._clock.now_ns()
@@ -368,18 +384,18 @@ class FlightLog:
 
     @property
     def lost(self) -> int:
-        """Number of packets given to `write` that are lost."""
+        """Number of packets passed to `write` that were lost."""
         return self._refused + self._unwritten
 
     @property
     def dropped_segments(self) -> int:
-        """Number of segments deleted to keep the budget."""
+        """Number of segment files deleted to stay within the budget."""
         return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:
-        """Return the current problem and the number of lost packets, or an empty text without a problem.
+        """Return the current problem and the number of lost packets, or an empty text if there is no problem.
 
-        A closed log reports any loss since it was opened.
+        A closed log reports a problem if any packet was lost.
         """
         problem = self._problem()
         waiting = len(self._queue)
@@ -397,7 +413,10 @@ class FlightLog:
         return ""
 
     def close(self) -> None:
-        """Write the queue, sync and close. Safe to call twice; waits at most five seconds for a hung disk."""
+        """Write the queue, sync and close the log.
+
+        The call waits at most five seconds for a hung disk. A second call has no effect.
+        """
         if self._closed:
             return
         self._ticker.stop()
@@ -418,7 +437,7 @@ class FlightLog:
             self._draining.release()
 
     def _drain(self) -> None:
-        """Write the queue to disk and sync it if a sync is due. The ticker calls this method."""
+        """Write the queue to disk, and sync the file if a sync is due. The ticker calls this method."""
         with self._draining:
             now_ns = self._clock.now_ns()
             if self._closed or (self._failure and now_ns < self._retry_ns):
@@ -437,7 +456,7 @@ class FlightLog:
             self._busy_since_ns = None
 
     def _look(self) -> None:
-        """Report files that another process removed; the next attempt continues in a new folder."""
+        """Report a failure if another process has removed the log files. The next write creates new files."""
         store = self._store
         with suppress(OSError):
             if store is not None and store.removed():
@@ -447,7 +466,7 @@ class FlightLog:
                 store.close()
 
     def _write_queue(self) -> None:
-        """Write the queued packets; packets that the disk does not accept stay in the queue."""
+        """Write the queued packets. Packets that cannot be written remain in the queue."""
         if self._store is None:
             if self._failure and self._clock.now_ns() < self._retry_ns and not self._closed:
                 return
@@ -470,13 +489,16 @@ class FlightLog:
         self._retry_ns = self._clock.now_ns() + _RETRY_NS
 
     def _give_up(self) -> None:
-        """Count the packets in the queue as lost."""
+        """Empty the queue and count its packets as lost."""
         self._unwritten += len(self._queue)
         self._queue.clear()
 
 
 def _clear(folder: Path, stem: str, overwrite: bool) -> None:
-    """Create the folder, and remove an existing log if `overwrite` is set. Raises UsageError, OSError."""
+    """Create the folder of a log and remove an existing log of the same name.
+
+    Raises UsageError if the log exists and `overwrite` is false, and OSError if the folder cannot be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     old = find_segments(folder, stem)
     if old and not overwrite:
@@ -487,25 +509,29 @@ def _clear(folder: Path, stem: str, overwrite: bool) -> None:
 
 _STATUS = (RUN, CONTROL, ATTITUDE, HOUSEKEEPING, HEALTH)
 _STATUS_EVENTS = 2
-"""Number of events in a status, so that status and answer to a command fit into one Ethernet frame."""
+"""Number of events in a status report.
+
+The number is small enough for a status report and a command answer to fit into one Ethernet frame.
+"""
 
 
 class Log(Protocol):
     """Destination of packets."""
 
     def write(self, packet: bytes) -> None:
-        """Store a packet without waiting."""
+        """Store a packet without blocking."""
 
 
 class Recorder:
-    """Packs values and writes the packets to the logs, with mission time instead of clock time.
+    """Recorder that packs values into packets, converts clock time to mission time and writes to the logs.
 
-    A record that cannot be packed is counted and lost, without an error in the task that wrote it.
+    A record that cannot be packed is lost and counted. It raises no error in the task that called the
+    recorder.
 
     Attributes:
         epoch_ns: clock time (ns) of mission time zero.
-        lost: number of records whose values did not fit their packet.
-        lost_text: reason for the newest lost record.
+        lost: number of records lost because their values did not fit into the packet.
+        lost_text: reason for the loss of the newest lost record.
     """
 
     def __init__(self, flight: Log, performance: Log) -> None:
@@ -520,7 +546,10 @@ class Recorder:
         self.lost_text = ""
 
     def record(self, packet: Packet, time_ns: int, **values: Any) -> bytes | None:
-        """Write a packet to the flight log and return its bytes, None if its values do not fit."""
+        """Pack values and write the packet to the flight log.
+
+        Returns the packet, or None if the values do not fit into the packet.
+        """
         packed = self._pack(self._flight_packer, packet, time_ns, values)
         if packed is not None:
             self._newest[packet.name] = packed
@@ -528,25 +557,25 @@ class Recorder:
         return packed
 
     def status(self) -> bytes:
-        """Return the newest packets about the state of the flight, then the newest events, oldest first.
+        """Return a status report: the newest status packets, followed by the newest events, oldest first.
 
-        Events of obeyed commands are omitted, because each request of a status would appear in its answer.
+        Events about executed commands are omitted, because each status request would add such an event.
         """
         newest = [self._newest[packet.name] for packet in _STATUS if packet.name in self._newest]
         return b"".join([*newest, *self._events])
 
     def newest(self, packet: Packet) -> bytes:
-        """Return the newest packet of a type, empty if none was written."""
+        """Return the newest packet of a type, or empty bytes if no such packet was written."""
         return self._newest.get(packet.name, b"")
 
     def time(self, packet: Packet, time_ns: int, **values: Any) -> None:
-        """Write a packet to the performance log."""
+        """Pack values and write the packet to the performance log."""
         packed = self._pack(self._performance_packer, packet, time_ns, values)
         if packed is not None:
             self._performance.write(packed)
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event, as the sink of `flight.loop.facts.EventLog`."""
+        """Write an event to the flight log. This method is the sink of `flight.loop.facts.EventLog`."""
         packed = self.record(
             EVENT,
             time_ns,

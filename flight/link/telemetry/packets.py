@@ -1,13 +1,15 @@
-"""CCSDS space packets: packing, parsing, and the search for valid packets in a stretch of bytes.
+"""CCSDS space packets: encoding, decoding, and the search for valid packets in a byte string.
 
-A packet is the primary header of CCSDS 133.0-B-2 (6 bytes: version 0, telemetry, secondary header present,
-APID; unsegmented, 14-bit sequence count of that APID; data length minus one), a secondary header (version
-of the definition, u1; mission time in ns, i8), the fields of the table `flight.link.telemetry.definitions`,
-and a packet error control of 16 bits: the CRC of CCSDS 232.0-B (x^16 + x^12 + x^5 + 1, preset to ones) over
-all preceding bytes. All numbers are big-endian.
+A packet consists of a primary header, a secondary header, the fields of the packet definition
+(`flight.link.telemetry.definitions`) and a CRC. The primary header (CCSDS 133.0-B-2, 6 bytes) contains the
+APID, a 14-bit sequence count per APID and the data length; all packets are unsegmented. The secondary header
+contains the version of the packet definition (u1) and the mission time in ns (i8). The CRC has 16 bits and
+covers all preceding bytes (CCSDS 232.0-B: polynomial x^16 + x^12 + x^5 + 1, initial value all ones). All
+numbers are big-endian.
 
-The search accepts a packet if its version bits, APID, sequence flags, length and CRC are right. After other
-bytes it continues at the next byte that could begin a packet, so that only damaged packets are lost.
+The search accepts a packet if its version bits, APID, sequence flags, length and CRC are correct. After
+invalid bytes the search continues at the next byte that could begin a packet, so that only damaged packets
+are lost.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ PacketArray = npt.NDArray[np.void]
 HEADER_BYTES = 6
 SECONDARY_BYTES = 9
 CRC_BYTES = 2
-LONGEST_PACKET = 4096  # bounds the search for packets of another version in a damaged log
+LONGEST_PACKET = 4096  # maximum length (bytes), limits the search in a damaged log
 SEQUENCE_MODULUS = 1 << 14
 UNSEGMENTED = int(PacketSeqCtrl(SequenceFlags.UNSEGMENTED, 0).raw())
 
@@ -45,23 +47,27 @@ _STRUCT_CODES = {"f8": "d", "f4": "f", "u1": "B", "u2": "H", "u4": "I", "u8": "Q
 
 
 class TelemetryError(FlightError):
-    """Raised for values that do not fit the definition of their packet and for bytes that are not packets."""
+    """Raised for values that do not fit the packet definition and for bytes that are not a packet."""
 
 
 def crc16(data: bytes) -> int:
-    """Return the CRC-16 of CCSDS 232.0-B ("CCITT-FALSE"); 0 over a packet that ends in its own CRC."""
+    """Return the CRC-16 of CCSDS 232.0-B (also called CCITT-FALSE).
+
+    The result is 0 for data that end with their own correct CRC.
+    """
     return binascii.crc_hqx(data, 0xFFFF)
 
 
 def to_text(value: bytes) -> str:
-    """Return the text of a string field, padding removed."""
+    """Return the text of a string field without its zero padding."""
     return bytes(value).rstrip(b"\0").decode("utf-8", "replace")
 
 
 def _to_bytes(value: object, size: int) -> bytes:
-    """Return a text as less than `size` bytes of UTF-8, cut between characters; others become '?'.
+    """Return a text as UTF-8, truncated between characters to less than `size` bytes.
 
-    At least one zero follows, by which clients of the XTCE definition find the end of the text.
+    Characters that cannot be encoded become '?'. At least one zero byte remains after the text, because
+    clients of the XTCE definition need a terminating zero.
     """
     if not isinstance(value, str):
         raise TypeError("a text is needed")
@@ -70,12 +76,12 @@ def _to_bytes(value: object, size: int) -> bytes:
 
 
 def _text_size(field: Field) -> int:
-    """Return the bytes of a string field, 0 for a number."""
+    """Return the length (bytes) of a string field, 0 for a numeric field."""
     return int(field.kind[1:]) if field.kind.startswith("S") else 0
 
 
 def wraps_at(field: Field) -> int:
-    """Return the modulus of a counter, 0 for a field that does not wrap."""
+    """Return the modulus of a counter field, 0 for a field that does not wrap."""
     return 1 << 8 * np.dtype(field.kind).itemsize if field.wraps else 0
 
 
@@ -85,36 +91,39 @@ def _struct_code(field: Field) -> str:
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of the bytes of a packet, compiled from its definition."""
+    """Byte layout of a packet, computed from the packet definition."""
 
     packet: Packet
 
     @cached_property
     def identifier(self) -> int:
-        """The first 16 bits of the primary header."""
+        """First 16 bits of the primary header, which identify the packet type."""
         kind = PacketType.TC if self.packet.telecommand else PacketType.TM
         return int(PacketId(kind, sec_header_flag=True, apid=self.packet.apid).raw())
 
     @cached_property
     def body(self) -> struct.Struct:
-        """Both headers and the fields, without the CRC."""
+        """Struct format of both headers and all fields, without the CRC."""
         return struct.Struct(">HHHBq" + "".join(_struct_code(field) for field in self.packet.fields))
 
     @cached_property
     def length(self) -> int:
-        """Bytes of the whole packet."""
+        """Length (bytes) of the whole packet, including the CRC."""
         return self.body.size + CRC_BYTES
 
     @cached_property
     def fields(self) -> tuple[tuple[str, int, int, int], ...]:
-        """Name, length (bytes) of a text or 0, count, and modulus of a counter or 0, for each field."""
+        """Tuple of name, text length (bytes), number of items and counter modulus for each field.
+
+        The text length is 0 for a numeric field, and the modulus is 0 for a field that does not wrap.
+        """
         return tuple(
             (field.name, _text_size(field), field.count, wraps_at(field)) for field in self.packet.fields
         )
 
     @cached_property
     def offsets(self) -> dict[str, int]:
-        """The first byte of `time_ns` and of every field, by name."""
+        """Offset (bytes) of the mission time `time_ns` and of each field in the packet, by name."""
         offsets = {"time_ns": HEADER_BYTES + 1}
         offset = HEADER_BYTES + SECONDARY_BYTES
         for field in self.packet.fields:
@@ -124,7 +133,7 @@ class Layout:
 
     @cached_property
     def dtype(self) -> np.dtype[np.void]:
-        """The numpy type of one whole packet: `time_ns`, then the fields of the table."""
+        """Structured numpy type of a whole packet, with the mission time `time_ns` and all fields."""
         formats = [">i8"]
         for field in self.packet.fields:
             number = np.dtype(field.kind).newbyteorder(">")
@@ -133,17 +142,20 @@ class Layout:
         return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length})
 
     def array(self, packets: bytes) -> PacketArray:
-        """Return a structured array, read-only and without a copy, of whole packets back to back."""
+        """Return consecutive packets of this type as a read-only structured array without copying."""
         return np.frombuffer(packets, dtype=self.dtype)
 
     def sequence_counts(self, packets: bytes) -> npt.NDArray[np.int64]:
-        """Return the 14-bit sequence counts of whole packets back to back."""
+        """Return the 14-bit sequence counts of consecutive packets of this type."""
         view = np.dtype({"names": ["word"], "formats": [">u2"], "offsets": [2], "itemsize": self.length})
         return np.asarray(np.frombuffer(packets, dtype=view)["word"].astype(np.int64) % SEQUENCE_MODULUS)
 
 
 def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
-    """Return the layouts of a table by packet name. Raises TelemetryError for an inconsistent table."""
+    """Return the layouts of packet definitions by packet name.
+
+    Raises TelemetryError for inconsistent definitions, for example for an APID that is used twice.
+    """
     layouts = {packet.name: Layout(packet) for packet in packets}
     apids = [layout.packet.apid for layout in layouts.values()]
     if len(set(apids)) != len(apids):
@@ -161,21 +173,22 @@ LAYOUTS: dict[str, Layout] = compile_layouts(PACKETS)
 
 
 class Packer:
-    """Makes packets with a sequence count per APID. Not thread-safe."""
+    """Encoder of packets with a sequence count per APID. Not thread-safe."""
 
     def __init__(self, layouts: Mapping[str, Layout] | None = None) -> None:
-        """Pack the packets of a compiled table, by default of the telemetry table."""
+        """Use the given packet layouts, by default the layouts of all telemetry packets."""
         self._layouts = LAYOUTS if layouts is None else layouts
         self._counts = dict.fromkeys(self._layouts, 0)
 
     def pack(
         self, packet: Packet, time_ns: int, values: Mapping[str, object] | None = None, /, **fields: object
     ) -> bytes:
-        """Return the bytes of one packet at mission time `time_ns`, all fields given by name.
+        """Return an encoded packet with mission time `time_ns` and the given field values.
 
-        Texts too long for their field are cut between two characters, counters past their end wrap. NaN
-        passes: the table says where it means "none". Raises TelemetryError for a missing or unknown field, a
-        wrong length, or a value out of range; such a packet is not counted.
+        A text that is too long for its field is truncated between two characters, and a counter that exceeds
+        its range wraps. NaN is accepted in all floating-point fields. Raises TelemetryError for a missing or
+        unknown field, a wrong array length or a value out of range. The sequence count does not change in
+        this case.
         """
         given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]
@@ -203,7 +216,7 @@ class Packer:
 
 
 def _to_items(value: Any, count: int) -> list[Any]:
-    """Return the numbers of an array field. Raises ValueError if their number is not `count`."""
+    """Return the values of an array field as a list. Raises ValueError unless there are `count` values."""
     items: list[Any] = value.tolist() if isinstance(value, np.ndarray) else value
     if type(items) is not list:
         items = list(items)
@@ -213,7 +226,7 @@ def _to_items(value: Any, count: int) -> list[Any]:
 
 
 def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> TelemetryError:
-    """Return the error that names the wrong value of a packet that cannot be packed."""
+    """Return an error that names the invalid value of a packet that cannot be packed."""
     name, names = layout.packet.name, [field.name for field in layout.packet.fields]
     if missing := [each for each in names if each not in given]:
         return TelemetryError(f"packet {name}: missing: {', '.join(missing)}")
@@ -238,15 +251,15 @@ def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> Telem
 
 
 BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAYOUTS.values()}
-# A known identifier, or its first byte as the last byte of all.
+# This pattern matches a known identifier, or the first byte of an identifier at the end of the data.
 _START = re.compile(
     b"|".join(re.escape(i) + b"|" + re.escape(i[:1]) + rb"\Z" for i in BY_IDENTIFIER), re.DOTALL
 )
-_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # as the first byte of the sequence control carries them
+_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # sequence flags within their byte
 
 
 def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:
-    """Yield layout, first byte and end of each valid packet of any version."""
+    """Yield the layout, start offset and end offset of each valid packet in `data`, of any version."""
     position, end = 0, len(data)
     while position < end:
         layout = BY_IDENTIFIER.get(data[position : position + 2])
@@ -260,9 +273,9 @@ def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:
 
 
 def truncated_bytes(data: bytes, begin: int) -> int:
-    """Return the length of an incomplete packet at the end of `data`, 0 if there is none.
+    """Return the length (bytes) of an incomplete packet at the end of `data`, 0 if there is none.
 
-    `begin` is the end of the last valid packet.
+    The argument `begin` is the end offset of the last valid packet.
     """
     position, end = begin, len(data)
     while position < end:
@@ -274,7 +287,7 @@ def truncated_bytes(data: bytes, begin: int) -> int:
 
 
 def _valid_length(data: bytes, position: int, layout: Layout) -> int:
-    """Return the length of the valid packet at `position`, 0 if there is none."""
+    """Return the length (bytes) of the valid packet at offset `position`, 0 if there is no valid packet."""
     length = _stated_length(data, position)
     stop = position + length
     if length < HEADER_BYTES + 1 or stop > len(data):
@@ -287,13 +300,13 @@ def _valid_length(data: bytes, position: int, layout: Layout) -> int:
 
 
 def _stated_length(data: bytes, position: int) -> int:
-    """Return the packet length in the header at `position`, 0 if the header is incomplete."""
+    """Return the packet length (bytes) stated in the header at offset `position`, 0 for a partial header."""
     header = data[position : position + HEADER_BYTES]
     return int.from_bytes(header[4:], "big") + HEADER_BYTES + 1 if len(header) == HEADER_BYTES else 0
 
 
 def _cut_short(data: bytes, position: int) -> bool:
-    """Return whether an incomplete packet may begin at `position`."""
+    """Return whether an incomplete packet could begin at offset `position`."""
     left = len(data) - position
     if left == 1:
         return any(identifier[:1] == data[position:] for identifier in BY_IDENTIFIER)
