@@ -1,1 +1,1 @@
-"""Cameras as geometry, and image files as arrays."""
+"""Camera models, and the reading and writing of image files."""

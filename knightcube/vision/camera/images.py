@@ -4,16 +4,17 @@
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # pixels without a header
     write_picture(Path("found.png"), grey_stretch(pixels))
 
-Row 0 is the first row of the file. FITS viewers show it at the bottom, other viewers at the top; confusing
-them mirrors the sky. The orientation in the EXIF data of a photograph is ignored.
+Row 0 of an image array is the first row of the file. FITS viewers show the first row at the bottom, and other
+viewers show it at the top. An image read in the wrong row order is a mirror image of the sky. The orientation
+in the EXIF data of a photograph is ignored.
 
-The FITS reader follows FITS Standard 4.0, sections 3, 4.4.1 and 5. It reads the primary image with BITPIX 8,
-16, 32, -32 or -64, two axes, BZERO, BSCALE and BLANK. It rejects extensions, tables, compressed images and
-cubes.
+The FITS reader follows FITS Standard 4.0, sections 3, 4.4.1 and 5. The reader accepts primary images with two
+axes and BITPIX 8, 16, 32, -32 or -64, and applies BZERO and BSCALE. The reader rejects blank pixels (BLANK),
+extensions, tables, compressed images and cubes.
 
-The vision worker keeps its newest frames on disk (`keep_frame`). A file is a PGM (Netpbm), which any image
-program opens: a comment with facts about the frame, in JSON, and grey counts of 8 or 16 bits as the camera
-gave them.
+The vision worker keeps its newest frames on disk (`keep_frame`). A kept frame is a PGM file (Netpbm), which
+most image programs can open. The file contains the unchanged grey counts of the frame, of 8 or 16 bits, and
+metadata in JSON as a comment.
 """
 
 from __future__ import annotations
@@ -41,25 +42,28 @@ SIGNATURE = b"SIMPLE  ="
 BLOCK = 2880
 CARD = 80
 KINDS = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
-"""Pixel types by BITPIX."""
+"""NumPy types of FITS pixels by the value of BITPIX."""
 UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
-"""BZERO with which unsigned numbers are stored as signed numbers (section 4.4.2.5)."""
+"""BZERO of unsigned integers that are stored as signed ones (FITS Standard 4.0, section 4.4.2.5)."""
 
 
 def primary_image(content: bytes, name: str) -> Image:
-    """Return the image (rows, columns) of the `content` of a FITS file; row 0 is the first of the file.
+    """Return the image (rows, columns) in the bytes of a FITS file; row 0 is the first row of the file.
 
-    Integers without a scale keep their type, shifted unsigned numbers of 16 and 32 bits become unsigned, and
-    any other scale gives float64. Raises UsageError, with `name`, for other content.
+    Integer pixels without BZERO and BSCALE keep their type. Signed pixels with the BZERO of unsigned integers
+    become unsigned. Pixels with any other BZERO or BSCALE become float64. Raises UsageError, with the file's
+    `name`, if the image is not supported.
     """
     header, start = _header(content, name)
     bits = _whole(header, "BITPIX", name)
     if bits not in KINDS:
-        raise UsageError(f"{name}: BITPIX = {bits}: one of {', '.join(map(str, KINDS))} is read")
+        raise UsageError(f"{name}: BITPIX = {bits} is not supported: use {', '.join(map(str, KINDS))}")
     axes = [_whole(header, f"NAXIS{axis + 1}", name) for axis in range(_whole(header, "NAXIS", name))]
     if len(axes) < 2 or min(axes) < 1 or math.prod(axes[2:]) != 1:
         shape = " x ".join(map(str, axes)) or "nothing"
-        raise UsageError(f"{name}: the primary image is {shape}: one plane of columns x rows is read")
+        raise UsageError(
+            f"{name}: the primary image is {shape}: only one plane of columns x rows is supported"
+        )
     columns, rows = axes[:2]
     kind = np.dtype(KINDS[bits])
     if len(content) < start + rows * columns * kind.itemsize:
@@ -79,13 +83,13 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
         return native
     offset, unsigned = UNSIGNED.get(native.dtype.str[1:], (0.0, None))
     if unsigned is not None and (zero, scale) == (offset, 1.0):
-        # Adding the offset flips the highest bit only.
+        # Adding the BZERO of unsigned integers flips only the highest bit.
         return np.asarray(native.view(unsigned) ^ unsigned(offset))
     return np.asarray(zero + scale * native.astype(np.float64))
 
 
 def _header(content: bytes, name: str) -> tuple[dict[str, str], int]:
-    """Return the values of the cards as text, without comments, and the position of the first pixel."""
+    """Return the FITS header values by keyword, as text, and the byte offset of the first pixel."""
     header: dict[str, str] = {}
     for place in range(0, len(content) - CARD + 1, CARD):
         card = content[place : place + CARD].decode("ascii", errors="replace")
@@ -108,7 +112,7 @@ def _whole(header: dict[str, str], keyword: str, name: str) -> int:
 
 def _real(header: dict[str, str], keyword: str, otherwise: float, name: str) -> float:
     try:
-        # The exponent of a double may be written with a D (section 4.2.4).
+        # FITS allows a D before the exponent of a double (FITS Standard 4.0, section 4.2.4).
         value = float(header[keyword].replace("D", "E")) if keyword in header else otherwise
     except ValueError:
         value = math.nan
@@ -121,15 +125,15 @@ FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 EXTRA = "pip install 'knightcube-flight[images]'"
 
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
-"""Tag and value of TIFF 6.0, section 8."""
+"""The TIFF tag PhotometricInterpretation and its value WhiteIsZero (TIFF 6.0, section 8)."""
 GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
-"""Pillow's names of grey pixels of 8 or 16 bits."""
+"""NumPy types of grey images by Pillow's mode."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 
 _LUMINANCE = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue (ITU-R BT.601)."""
+"""Weights of red, green and blue in the luminance (ITU-R BT.601)."""
 _NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
-# Pillow keeps the high byte of 16-bit colour. Given the other order of bytes, it keeps the low one.
+# Pillow keeps the high byte of 16-bit colour. If the byte order is swapped, Pillow keeps the low byte.
 _OTHER_BYTES = {
     f"{colour};16{order}": f"{colour};16{other}"
     for colour in ("RGB", "RGBA", "RGBX")
@@ -138,10 +142,12 @@ _OTHER_BYTES = {
 
 
 def read_image(path: Path) -> Image:
-    """Return the image (rows, columns): uint8 or uint16, from FITS also signed, 32-bit or floating.
+    """Return the image (rows, columns) of a FITS, PNG, TIFF, JPEG or BMP file.
 
-    The content decides the format, not the name. Colour becomes luminance (ITU-R BT.601). Raises UsageError
-    when the file is missing, damaged or none of these, or has pixels that are not finite.
+    The format is recognised by the file's content, not by its name. Pixels are uint8 or uint16, and those of
+    FITS files may also be signed, 32-bit or floating-point. Colour images are converted to luminance (ITU-R
+    BT.601). Raises UsageError if the file is missing, damaged or of another format, or if pixels are not
+    finite.
     """
     try:
         with path.open("rb") as file:
@@ -154,10 +160,10 @@ def read_image(path: Path) -> Image:
 
 
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
-    """Return the image (rows, columns) of a file of raw pixels, row by row, of 8 bits or 16 little-endian.
+    """Return the image (rows, columns) of a file of raw pixels, of 8 bits or of 16 bits little-endian.
 
-    Any header before the pixels is skipped: the last bytes of the file are used.
-    Raises UsageError when the file is missing or too short.
+    The pixels are stored row by row at the end of the file. Any header before the pixels is skipped.
+    Raises UsageError if the file is missing or too short.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
     try:
@@ -174,10 +180,10 @@ def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
 
 
 def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDArray[np.uint8]:
-    """Return a grey image (rows, columns, 3) of red, green and blue, to draw on.
+    """Return a contrast-stretched image as RGB (rows, columns, 3), so that coloured marks can be drawn on it.
 
-    The `low`th percentile of the pixels becomes black and the `high`th white. Raises UsageError unless
-    0 <= low < high <= 100.
+    The `low`th percentile of the pixels becomes black and the `high`th percentile becomes white. Raises
+    UsageError unless 0 <= low < high <= 100.
     """
     if not 0.0 <= low < high <= 100.0:
         raise UsageError(f"percentiles {low} and {high}: give 0 <= low < high <= 100")
@@ -188,9 +194,9 @@ def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDAr
 
 
 def write_picture(path: Path, picture: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
-    """Write a PNG: colours (rows, columns, 3), or grey counts (rows, columns) of 8 or 16 bits as they are.
+    """Write a PNG file from an RGB image (rows, columns, 3) or a grey image (rows, columns) of 8 or 16 bits.
 
-    Raises UsageError when it cannot be written.
+    Raises UsageError if the file cannot be written.
     """
     try:
         from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
@@ -209,7 +215,7 @@ def _through_pillow(path: Path) -> Image:
     except ImportError as error:
         raise UsageError(f"{path}: {', '.join(FORMATS)} need Pillow: {EXTRA}") from error
     try:
-        # The warnings concern metadata, which is not used; damaged pixels raise.
+        # Pillow's warnings concern metadata, which is not used; damaged pixels raise an exception.
         with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
             _check_kept(path, picture)
             if _is_deep(picture):
@@ -223,34 +229,34 @@ def _through_pillow(path: Path) -> Image:
         raise UsageError(f"{path}: is not a {', '.join(FORMATS)} or FITS image: convert it") from error
     except pillow.DecompressionBombError as error:
         raise UsageError(f"{path}: has too many pixels: {error}") from error
-    # The exceptions that Pillow raises for damaged files.
+    # Pillow raises any of these exceptions for damaged files.
     except (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
         raise UsageError(f"{path}: is damaged: {error}") from error
 
 
 def _check_kept(path: Path, picture: Picture) -> None:
-    """Raise UsageError for images that Pillow misreads: truncated 16-bit colour, inverted grey."""
+    """Raise UsageError for images that Pillow misreads, namely truncated 16-bit colour and inverted grey."""
     deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
     if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
-        raise UsageError(f"{path}: its 16-bit colour is not read: convert it to 16-bit grey")
+        raise UsageError(f"{path}: 16-bit colour of this kind is not supported: convert it to 16-bit grey")
     interpretation = getattr(picture, "tag_v2", {}).get(PHOTOMETRIC_INTERPRETATION)
     if picture.mode.startswith("I") and interpretation == WHITE_IS_ZERO:
-        raise UsageError(f"{path}: its zero is white: convert it to a TIFF whose zero is black")
+        raise UsageError(f"{path}: in this TIFF zero is white: convert it to a TIFF in which zero is black")
 
 
 def _raw_mode(args: object) -> str:
-    """Return the raw mode of a tile: the first argument of its decoder."""
+    """Return the raw mode of a Pillow tile, which is the first argument of the tile's decoder."""
     return str(args[0]) if isinstance(args, tuple) and args else str(args)
 
 
 def _is_deep(picture: Picture) -> bool:
-    """Return whether an image has 16-bit colours, of which Pillow keeps the high bytes."""
+    """Return whether an image has 16-bit colours, which Pillow reduces to their high bytes."""
     modes = {_raw_mode(tile[3]) for tile in getattr(picture, "tile", ())}
     return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
 
 
 def _low_bytes(args: Any) -> Any:
-    """Return the arguments of the decoder that select the other byte of each pair."""
+    """Return the decoder's arguments with the byte order swapped, so that Pillow keeps the low bytes."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
 
@@ -267,13 +273,13 @@ def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
 def _grey(path: Path, picture: Picture) -> Image:
     mode = picture.mode
     if mode in COLOUR_MODES:
-        # Pillow cannot convert all of these modes directly. Transparency is dropped.
+        # Pillow converts some colour modes to grey only through RGB. Transparency is dropped.
         return np.asarray(picture.convert("RGB").convert("L"))
     if mode in GREY_MODES:
         grey = picture.convert("L") if mode == "1" else picture
         return np.asarray(grey).astype(GREY_MODES[mode])
     if mode == "I":
-        # The numbers of 32 bits often fit into 16.
+        # Mode I has 32-bit integers, but their values often fit into 16 bits.
         pixels = np.asarray(picture)
         if pixels.min() >= 0 and pixels.max() <= np.iinfo(np.uint16).max:
             return pixels.astype(np.uint16)
@@ -281,12 +287,18 @@ def _grey(path: Path, picture: Picture) -> Image:
 
 
 KEPT_FRAMES_FOLDER = "frames"
-"""Name of the folder of kept frames inside the folder of a run."""
+"""Name of the folder of kept frames inside the run's folder."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeptFrames:
-    """The folder of kept frames, their maximum number, and the file name of one frame, without its suffix."""
+    """Where the vision worker keeps frames on disk.
+
+    Attributes:
+        folder: folder of the kept frames.
+        most: maximum number of kept frames.
+        name: file name of the next frame, without suffix.
+    """
 
     folder: Path
     most: int
@@ -294,9 +306,9 @@ class KeptFrames:
 
 
 def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
-    """Write a frame (rows, columns) with facts about it, and delete the oldest frames beyond the maximum.
+    """Write a frame (rows, columns) with its metadata (`facts`), and delete the oldest surplus frames.
 
-    An error of the disk loses the frame without an exception.
+    If the disk fails, the frame is lost and no exception is raised.
     """
     with suppress(OSError):
         kept.folder.mkdir(exist_ok=True)
@@ -308,7 +320,7 @@ def keep_frame(kept: KeptFrames, pixels: Image, facts: dict[str, Any]) -> None:
 
 
 def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
-    """Return the bytes of a PGM of integer counts, of 8 or 16 bits, with facts as a comment."""
+    """Return the bytes of a PGM file of 8-bit or 16-bit counts, with the metadata `facts` as a comment."""
     deep = pixels.dtype.itemsize > 1
     rows, columns = pixels.shape
     text = json.dumps(facts)
@@ -317,7 +329,7 @@ def portable_grey_map(pixels: Image, facts: dict[str, Any]) -> bytes:
 
 
 def facts_of(data: bytes) -> dict[str, Any]:
-    """Return the facts in the file of a kept frame. Raises ValueError if the file is not one."""
+    """Return the metadata in the bytes of a kept frame. Raises ValueError if `data` is not a kept frame."""
     head, _, rest = data.partition(b"\n# ")
     if head != b"P5":
         raise ValueError("no kept frame")

@@ -1,12 +1,13 @@
 """Camera models: the pinhole, the lens with radial distortion, the mounted camera, and their uncertainty.
 
 Camera frame: boresight +z, x along columns to the right, y along rows down; pixel (0, 0) is the centre of
-the top-left pixel. The pinhole follows Sease 2.1-2.4, corrected: stars behind the camera are dropped, and
-pixel offsets count from 0.
+the top-left pixel. The pinhole camera follows Sease, eq. (2.1) to (2.4), except that stars
+behind the camera are dropped and pixel coordinates start at 0.
 
 The lens maps a direction with tangents u = (x/z, y/z) to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre
-(Brown 1966, radial terms). Beyond the tangent where the distorted radius stops growing the polynomial folds
-back on itself. The lens images nothing there, and a lens that folds within its own detector is rejected.
+(Brown 1966, radial terms). Beyond the tangent at which the distorted radius stops growing, the distortion
+polynomial folds back on itself. A `Lens` images no direction beyond this fold, and raises LensError if the
+fold lies within the detector.
 
 `Exposures` gives the exposure at which streaks are long enough for an accurate rate.
 """
@@ -29,7 +30,7 @@ class Pinhole:
 
     Attributes:
         columns, rows: number of pixels.
-        focal_length: px. `from_field_of_view` computes it from the field of view.
+        focal_length: focal length, px.
     """
 
     columns: int
@@ -38,12 +39,12 @@ class Pinhole:
 
     @classmethod
     def from_field_of_view(cls, columns: int, rows: int, field_of_view: float) -> Pinhole:
-        """Return the camera whose columns span `field_of_view`, rad, edge to edge (Sease 2.4)."""
+        """Return the camera whose image width spans `field_of_view`, rad, edge to edge (Sease, eq. (2.4))."""
         return cls(columns, rows, 0.5 * columns / np.tan(0.5 * field_of_view))
 
     @property
     def ideal(self) -> Pinhole:
-        """The camera itself, which has no distortion."""
+        """The pinhole camera itself, because it has no distortion."""
         return self
 
     def rescaled(self, factor: float) -> Pinhole:
@@ -56,19 +57,19 @@ class Pinhole:
         return 0.5 * (self.columns - 1), 0.5 * (self.rows - 1)
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) of directions (n, 3) in the camera frame; those with z <= 0 become NaN."""
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions with z <= 0 give NaN."""
         v = np.asarray(vectors, dtype=float)
         z = np.where(v[..., 2:] > 0.0, v[..., 2:], np.nan)
         return np.asarray(self.focal_length * v[..., :2] / z + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2) (Sease 3.20, 3.21)."""
+        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2) (Sease, eq. (3.20), (3.21))."""
         offset = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
         v = np.concatenate([offset, np.ones((*offset.shape[:-1], 1))], axis=-1)
         return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; NaN does not."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
         x, y = points[..., 0], points[..., 1]
         inside_x = (x >= -0.5 - margin) & (x <= self.columns - 0.5 + margin)
         inside_y = (y >= -0.5 - margin) & (y <= self.rows - 0.5 + margin)
@@ -81,13 +82,13 @@ class Pinhole:
 
 
 _MOST_STEPS, _LAST_STEP = 60, 1e-8
-"""Largest number of Newton steps, and the last step in tangent: the error is about its square."""
+"""Maximum number of Newton steps, and the step (in tangent) below which the iteration ends."""
 _NO_FOLD = 1e-12
-"""Least denominator of a fold: a fold at a tangent of a million is ignored."""
+"""Minimum denominator in the formula of the fold, so that folds beyond a tangent of a million are ignored."""
 
 
 class LensError(FlightError):
-    """A lens without size, or with a distortion that cannot be inverted."""
+    """Raised for a lens whose size is not positive or whose distortion cannot be inverted."""
 
 
 class CameraModel(Protocol):
@@ -121,7 +122,7 @@ class CameraModel(Protocol):
         """Return the camera with its focal length multiplied by `factor`."""
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN if they are not imaged."""
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
         """Return unit vectors (n, 3) in the camera frame of pixels (n, 2)."""
@@ -137,8 +138,8 @@ class Lens:
     Attributes:
         focal_length: focal length on the axis, px.
         centre: pixel (x, y) of the optical axis.
-        k1, k2: coefficients of the second and the fourth power of the undistorted tangent.
-        reach: largest tangent that is imaged; infinite if the distortion never folds.
+        k1, k2: radial distortion coefficients of the second and the fourth power of the undistorted tangent.
+        reach: largest undistorted tangent that is imaged; infinite if the distortion never folds back.
 
     Raises:
         LensError: if the distortion cannot be inverted over the whole detector.
@@ -164,19 +165,19 @@ class Lens:
         if corner >= self._limit():
             raise LensError(
                 f"k1 {self.k1}, k2 {self.k2}: distortion folds the image back at"
-                f" {self._limit() * self.focal_length:.0f} px from the axis, within the detector's"
-                f" {corner * self.focal_length:.0f} px, and cannot be undone"
+                f" {self._limit() * self.focal_length:.0f} px from the axis, but the detector extends to"
+                f" {corner * self.focal_length:.0f} px"
             )
 
     @classmethod
     def of(cls, camera: CameraModel) -> Lens:
-        """Return `camera` as a lens; a pinhole becomes one without distortion."""
+        """Return a camera as a `Lens`; a pinhole camera becomes a lens without distortion."""
         if isinstance(camera, Lens):
             return camera
         return cls(camera.columns, camera.rows, camera.focal_length, camera.centre)
 
     def to_mapping(self) -> dict[str, int | float | list[float]]:
-        """Return the lens as plain numbers for a YAML file: lengths in pixels, k1 and k2 of tangents."""
+        """Return the parameters of the lens as plain numbers for a YAML file, with lengths in pixels."""
         return {
             "columns": int(self.columns),
             "rows": int(self.rows),
@@ -196,7 +197,7 @@ class Lens:
         return replace(self, focal_length=self.focal_length * factor)
 
     def project(self, vectors: FloatArray) -> FloatArray:
-        """Return pixels (n, 2) of directions (n, 3) in the camera frame; NaN if they are not imaged."""
+        """Return pixels (n, 2) of directions (n, 3) in the camera frame; directions not imaged give NaN."""
         v = np.asarray(vectors, dtype=float)
         z = v[..., 2:]
         tangent = v[..., :2] / np.where(z > 0.0, z, np.nan)
@@ -206,7 +207,10 @@ class Lens:
         return np.asarray(self.focal_length * stretched + np.array(self.centre))
 
     def unit_vectors(self, points: FloatArray) -> FloatArray:
-        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2); NaN if they are not imaged."""
+        """Return unit vectors (n, 3) in the camera frame of pixels (n, 2).
+
+        A pixel beyond the fold of the distortion gives NaN.
+        """
         stretched = (np.asarray(points, dtype=float) - np.array(self.centre)) / self.focal_length
         radius = np.hypot(stretched[..., :1], stretched[..., 1:])
         square = self._undistorted(radius) ** 2
@@ -216,7 +220,7 @@ class Lens:
         return np.asarray(v / np.sqrt(1.0 + square))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; NaN does not."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` px; False for NaN."""
         return Pinhole(self.columns, self.rows, self.focal_length).contains(points, margin)
 
     @property
@@ -229,21 +233,22 @@ class Lens:
         return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def _limit(self) -> float:
-        """Return the distorted tangent of the edge of the image, where the true tangent is `reach`."""
+        """Return the distorted tangent at which the undistorted tangent is `reach`."""
         square = self.reach**2
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the undistorted tangents (...) of distorted ones; NaN beyond the edge of the image.
+        """Return the undistorted tangents of distorted tangents (...); NaN beyond the fold of the distortion.
 
-        Newton's method starts at the distorted tangent, or at the inflection of the curve if that is nearer
-        to the axis: from there it passes the root at most once and then approaches it from one side.
+        Newton's method starts at the distorted tangent, or at the inflection point of the distortion curve if
+        that is nearer to the axis. From this start Newton's method passes the root at most once and then
+        converges from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:
             return stretched
         seen = stretched < self._limit()
-        # A NaN must not affect the end of the iteration.
+        # NaN is replaced by 0, because a NaN would keep the iteration from converging.
         target = np.where(seen, stretched, 0.0)
         inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
         radius = np.minimum(target, inflection)
@@ -252,7 +257,7 @@ class Lens:
             square = radius * radius
             value = radius * (1.0 + square * (k1 + square * k2)) - target
             step = value / (1.0 + square * (slope1 + square * slope2))
-            # A step from the inflection may lead below zero, but the root is not negative.
+            # A Newton step from the inflection point may lead below zero, but the root is not negative.
             radius = np.maximum(radius - step, 0.0)
             if np.vdot(step, step) < _LAST_STEP**2:
                 break
@@ -260,11 +265,14 @@ class Lens:
 
 
 def _reach(k1: float, k2: float) -> float:
-    """Return the least tangent at which the distorted one stops growing: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+    """Return the smallest tangent r at which the distorted radius stops growing.
+
+    It is the smallest positive root of 1 + 3 k1 r^2 + 5 k2 r^4 = 0, or infinite if there is none.
+    """
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf
-    # The smaller positive root, without cancellation: for k2 = 0 it is -1/(3 k1).
+    # This form of the quadratic's smaller positive root r^2 avoids cancellation; for k2 = 0 it is -1/(3 k1).
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
 
@@ -283,12 +291,12 @@ def check_image(image: Image, camera: CameraModel) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedCamera:
-    """A lens and its mounting.
+    """A camera model and the attitude of the camera in the body.
 
     Attributes:
         lens: the camera model.
-        mounting: attitude of the camera (4,), body into camera axes.
-        to_camera: its rotation matrix (3, 3).
+        mounting: quaternion (4,) from body axes to camera axes.
+        to_camera: rotation matrix (3, 3) from body axes to camera axes.
     """
 
     lens: CameraModel
@@ -300,31 +308,31 @@ class MountedCamera:
         object.__setattr__(self, "to_camera", attitude_matrix(self.mounting))
 
     def in_camera(self, directions: FloatArray) -> FloatArray:
-        """Return directions (..., 3), given in body axes, in camera axes."""
+        """Transform directions (..., 3) from body axes to camera axes."""
         return np.asarray(directions @ self.to_camera.T)
 
     def in_body(self, rays: FloatArray) -> FloatArray:
-        """Return rays (..., 3), given in camera axes, in body axes."""
+        """Transform rays (..., 3) from camera axes to body axes."""
         return np.asarray(rays @ self.to_camera)
 
 
 UNSTATED = 30e-6
-"""Standard deviation (s) of the line time of a shutter without a description: 1,000 rows in 30 ms are
-common."""
+"""Standard deviation (s) of an unknown line time of a rolling shutter (30 ms for 1,000 rows is common)."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraKnowledge:
-    """Standard deviations of the true camera from its description; 0 if the description is exact.
+    """Standard deviations of the stated parameters of a camera; 0 for parameters that are exact.
 
-    The defaults hold for a camera without calibration whose field of view is correct.
+    The defaults hold for an uncalibrated camera whose stated field of view is correct.
 
     Attributes:
         focal_length: relative standard deviation of the focal length.
         centre: standard deviation of the optical axis along x and along y, px.
-        distortion: standard deviation of the displacement of a corner, relative to its radius.
-        line_time: standard deviation of the delay between the exposures of successive rows, s. None: 0 if
-            the delay is stated, otherwise `UNSTATED`.
+        distortion: standard deviation of the distortion at an image corner, relative to the corner's distance
+            from the image centre.
+        line_time: standard deviation of the delay between the exposures of successive rows, s. None means 0
+            if the camera's delay is stated, otherwise `UNSTATED`.
     """
 
     focal_length: float = 0.0
@@ -334,13 +342,13 @@ class CameraKnowledge:
 
 
 EXACT = CameraKnowledge(centre=0.0, distortion=0.0, line_time=0.0)
-"""Knowledge of a camera that equals its description, such as an emulated camera."""
+"""Standard deviations of a camera whose parameters are exact, such as an emulated camera."""
 
 
 _STREAK = 20.0
-"""Desired streak length (px): rates are poor below 5 px, and faint stars are lost above 100 px."""
+"""Desired streak length (px): rates are inaccurate below 5 px, and faint stars are lost above 100 px."""
 _POINT = 1.0
-"""Motion in the usual exposure (px) below which a star is a point."""
+"""Motion (px) during the usual exposure below which a star counts as a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,9 +356,9 @@ class Exposures:
     """The exposure times of a camera.
 
     Attributes:
-        usual: exposure for points, s.
-        least, most: range of the exposures for streaks, s.
-        scale: scale of the image, px per rad.
+        usual: exposure used while stars appear as points, s.
+        least, most: shortest and longest exposure used while stars appear as streaks, s.
+        scale: image scale, px/rad.
     """
 
     usual: float
@@ -359,7 +367,7 @@ class Exposures:
     scale: float
 
     def at(self, rate: float) -> float:
-        """Return the exposure, s, at an angular rate, rad/s, across the boresight."""
+        """Return the exposure, s, for an angular rate across the boresight, rad/s."""
         speed = rate * self.scale
         if speed * self.usual < _POINT:
             return self.usual
