@@ -1,10 +1,10 @@
-"""Edges along scan lines to a fraction of a pixel, in pixels and as directions.
+"""Sub-pixel edges along scan lines of an image, as pixel positions and as directions.
 
-Columns and rows are read, normalised, made binary and filtered as in Meller 3.1. The position of every change
-of the binary line is then refined: the slope of the signal, smoothed by a Gaussian, has its peak at the
-steepest point of the limb's profile. The width of the Gaussian is doubled as long as the edge is wider
-(Lindeberg 1998, Int. J. Comput. Vision 30, 117), so that limbs of one pixel and of a hundred pixels are
-located at their steepest points.
+Columns and rows of the image are normalised, thresholded and filtered as in Meller et al., section 3.1. Each
+change from dark to bright is then located at the maximum slope of the brightness smoothed by a Gaussian. The
+width of the Gaussian is doubled as long as the edge is wider than the Gaussian (Lindeberg 1998, Int. J.
+Comput. Vision 30, 117), so that limbs of one pixel and of a hundred pixels are both located at their steepest
+points.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from knightcube.vision.camera.lens import CameraModel, Lens
 from knightcube.vision.horizon.settings import EdgeSettings, light_of
 
 RUN = 5
-"""Window of the majority filter (px), which removes shorter fluctuations."""
+"""Window (px) of the majority filter that removes short fluctuations of a binary line."""
 
 
 def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
-    """Return binary lines (n, m) after a majority filter over an odd number of `run` px (Meller 3.1, step 2).
+    """Return binary lines (n, m) after a majority filter of `run` px, an odd number.
 
-    Beyond its ends a line is continued with its last pixel.
+    Each line is extended at both ends by repeating its end pixel. Source: Meller et al., section 3.1, step 2.
     """
     half = run // 2
     size = binary.shape[1]
@@ -37,33 +37,32 @@ def run_filtered(binary: BoolArray, run: int = RUN) -> BoolArray:
 
 
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Standard deviations of the Gaussian (px)."""
+"""Standard deviations (px) of the Gaussians that smooth the brightness."""
 _REACH = 3.0
-"""Largest distance, in scales, of the steepest point from the change of the binary line."""
+"""Largest distance of the steepest point from the binary change, in standard deviations of the Gaussian."""
 _TAIL = 3.5
-"""Distance, in scales, at which the Gaussian is truncated."""
+"""Distance at which the Gaussian is truncated, in standard deviations."""
 _OUTGROWN = 1.4
-"""Ratio of the step heights at the doubled and the present scale above which the edge is wider than the
-present scale."""
+"""Ratio of step heights at successive scales above which the edge is wider than the smaller scale."""
 _MARGIN = 4.0
-"""Distance from the border (px) within which edges are ignored; some detectors have a black frame."""
+"""Distance from the image border (px) within which edges are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
-"""Prior error of an edge position, as the sum of a constant (px) and a fraction of the scale."""
+"""Prior error of an edge position: a constant (px), plus a fraction of the Gaussian's standard deviation."""
 _SAMPLES = 2048
-"""Number of pixels that determine the brightness levels."""
+"""Number of pixels from which the dark and bright levels are determined."""
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
-"""Ratio of a pixel's standard deviation to the median absolute difference of two pixels, for normal noise."""
+"""Ratio of the standard deviation of Gaussian noise to the median absolute difference of two pixels."""
 _STANDS_OUT = 6.0
-"""Threshold above which a pixel counts as lit, in standard deviations of the dark pixels."""
+"""Threshold above which a pixel counts as bright, in standard deviations of the dark pixels."""
 _LEAST_LIT = 16
-"""Minimum number of lit samples, because fewer lit samples may be a hot pixel or a star."""
+"""Minimum number of bright samples, because fewer bright samples may be a hot pixel or a star."""
 _PROFILE: IntArray = np.arange(-9, 6)
 """Positions of the stored profile samples, in px from the edge towards the bright side."""
 
 
 @dataclass(frozen=True, slots=True)
 class Levels:
-    """Average brightness of dark and of bright pixels, and the noise of dark pixels."""
+    """Mean brightness of dark pixels, median of bright pixels, and standard deviation of dark pixels."""
 
     dark: float
     bright: float
@@ -72,13 +71,13 @@ class Levels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanLines:
-    """The columns and rows that were read.
+    """The columns and rows of an image that the edge search reads.
 
     Attributes:
-        columns, rows: the indices of the lines.
-        column_bright, row_bright: the lines made binary and filtered (n, m).
-        space: distance between the lines, px.
-        levels: brightness of dark and bright pixels.
+        columns, rows: indices of the columns and of the rows.
+        column_bright, row_bright: whether each pixel of a line is bright after the filter (n, m).
+        space: distance between neighbouring lines, px.
+        levels: brightness levels of dark and bright pixels.
     """
 
     columns: IntArray
@@ -90,13 +89,18 @@ class ScanLines:
 
     @property
     def pixels(self) -> int:
-        """The number of pixels read."""
+        """The number of pixels that the edge search reads."""
         return self.column_bright.size + self.row_bright.size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePart:
-    """A part of an image for a closer search: lowest and highest x, y (2, 2), px, and the image's levels."""
+    """A rectangle of an image in which edges are searched on more lines.
+
+    Attributes:
+        box: lowest and highest (x, y) of the rectangle (2, 2), px.
+        levels: brightness levels of the whole image.
+    """
 
     box: FloatArray
     levels: Levels
@@ -104,16 +108,17 @@ class ImagePart:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanEdges:
-    """Places where a scan line changes from dark to bright.
+    """Edges at which a scan line changes from dark to bright.
 
     Attributes:
-        points: positions (n, 2), px.
-        towards: unit steps along the line to the bright side (n, 2).
-        scale: scale of the Gaussian that found the edge (n,), px.
-        sigma: standard deviation of the position along the line before a fit (n,), px.
-        background: brightness of the dark side (n,); it is low next to the limb and the terminator, and
-            higher next to a coast or a cloud.
-        profile: brightness along the line from dark to bright around the edge (n, m); NaN outside the image.
+        points: positions of the edges (n, 2), px.
+        towards: unit vectors along the scan line towards the bright side (n, 2).
+        scale: standard deviation of the Gaussian that found the edge (n,), px.
+        sigma: standard deviation of the edge position along the scan line before a fit (n,), px.
+        background: brightness of the dark side (n,), which is low at the limb and the terminator, and higher
+            at a coast or a cloud.
+        profile: brightness along the scan line around the edge, from dark to bright (n, m); NaN outside the
+            image.
     """
 
     points: FloatArray
@@ -125,8 +130,8 @@ class ScanEdges:
 
     @property
     def profile_steps(self) -> FloatArray:
-        """The positions of the profile's samples (n, m), px from the edge towards the bright side."""
-        # The profile is centred on the pixel nearest to the edge.
+        """The positions of the profile samples (n, m), in px from the edge towards the bright side."""
+        # The profile is centred on the pixel nearest to the edge, not on the edge.
         place = np.sum(self.points * self.towards, axis=1)
         return np.asarray((np.rint(place) - place)[:, None] + _PROFILE)
 
@@ -137,9 +142,9 @@ class ScanEdges:
 def find_edges(
     image: Image, settings: EdgeSettings, part: ImagePart | None = None
 ) -> tuple[ScanEdges, ScanLines]:
-    """Return the edges on evenly spaced columns and rows of an image (rows, columns), and these lines.
+    """Return the edges on evenly spaced columns and rows of an image (rows, columns), and the lines searched.
 
-    With `part`, only the lines that cross that part of the image are read.
+    If `part` is given, only lines that cross this part of the image are searched.
     """
     places = []
     for axis, size in enumerate((image.shape[1], image.shape[0])):
@@ -168,7 +173,7 @@ def find_edges(
 
 
 def _levels(light: list[FloatArray]) -> Levels:
-    """Return the brightness levels of lines; both levels are equal if no pixel is lit.
+    """Return the brightness levels of scan lines; the dark and bright level are equal if no pixel is bright.
 
     The bright level is the median of all pixels that exceed the noise of the dark pixels, so that the Sun's
     disc and hot pixels have no effect.
@@ -184,7 +189,7 @@ def _levels(light: list[FloatArray]) -> Levels:
     dark = np.abs(np.concatenate(steps)[values <= least + 0.1 * (most - least)])
     middle = len(dark) // 2
     noise = float(np.partition(dark, middle)[middle]) * _STEP_TO_SIGMA
-    # The second percentile lies two standard deviations below the mean.
+    # The second percentile lies two standard deviations below the mean of the dark pixels.
     low = least + 2.0 * noise
     lit = order[np.searchsorted(order, low + max(_STANDS_OUT * noise, 0.05 * (most - low)), "right") :]
     if len(lit) < _LEAST_LIT or most <= low:
@@ -194,14 +199,14 @@ def _levels(light: list[FloatArray]) -> Levels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BinaryChanges:
-    """Changes of the binary lines, whose pixels are concatenated in a flat array.
+    """Changes between dark and bright on scan lines, whose pixels are concatenated in a flat array.
 
     Attributes:
-        light: brightness of all lines (s,).
-        first: index of the first pixel of the line of each change (k,).
-        length: length of that line (k,), px.
-        start: position of the bright pixel of the change along the line (k,), px.
-        step: 1 or -1, the direction to the bright side (k,).
+        light: brightness of the pixels of all scan lines (s,).
+        first: index in `light` of the first pixel of each change's scan line (k,).
+        length: length of each change's scan line (k,), px.
+        start: position of each change's bright pixel along the scan line (k,), px.
+        step: direction towards the bright side along the scan line, 1 or -1 (k,).
     """
 
     light: FloatArray
@@ -211,7 +216,7 @@ class _BinaryChanges:
     step: IntArray
 
     def along(self, which: IntArray, index: IntArray) -> FloatArray:
-        """Return the brightness (k, m) at positions `index` (k, m) on the lines of the changes `which`."""
+        """Return the brightness (k, m) at positions `index` (k, m) along the scan lines of k changes."""
         last = self.length[which, None] - 1
         return np.asarray(self.light[self.first[which, None] + np.minimum(np.maximum(index, 0), last)])
 
@@ -219,7 +224,14 @@ class _BinaryChanges:
 def _line_edges(
     light: list[FloatArray], bright: list[BoolArray], places: tuple[IntArray, IntArray], contrast: float
 ) -> ScanEdges:
-    """Return the edges of columns and of rows (n, m) at `places` (n,), of a height above `contrast`."""
+    """Return the edges on columns and rows that are higher than `contrast`.
+
+    Args:
+        light: brightness of the columns and of the rows, each (n, m).
+        bright: binary columns and rows, each (n, m).
+        places: indices of the columns and of the rows, each (n,).
+        contrast: minimum height of an edge.
+    """
     parts, read = [], 0
     for direction, binary in enumerate(bright):
         line, before = np.nonzero(binary[:, 1:] != binary[:, :-1])
@@ -239,7 +251,7 @@ def _line_edges(
     step, other, axis, last = step[kept], other[kept], axis[kept], length[kept] - 1
     count = np.arange(len(kept))
     points, towards = np.empty((len(kept), 2)), np.zeros((len(kept), 2))
-    # On a column (axis 0) the place is y.
+    # On a column (axis 0) the position along the line is y.
     points[count, axis], points[count, 1 - axis], towards[count, 1 - axis] = other, place, step
     index = np.rint(place).astype(int)[:, None] + step[:, None] * _PROFILE
     profile = changes.along(kept, index)
@@ -250,9 +262,10 @@ def _line_edges(
 
 
 def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steepest points of lines: offset from the start, px, scale, px, and step height, (k,) each.
+    """Return the steepest point near each of k changes: offset, px, Gaussian scale, px, and step height.
 
-    The height is that of a sharp step with the same slope. A step lower than `weak` is not an edge.
+    The offset is the distance from the start of the change. The step height is the height of a sharp step
+    with the same slope. An edge has at least the step height `weak`.
     """
     count = len(changes.start)
     offset, height, scale = np.zeros(count), np.zeros(count), np.ones(count)
@@ -271,7 +284,7 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
         left, peak, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
         bend = np.minimum(left - 2.0 * peak + right, -1e-300)
         place = best - reach + np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
-        # At a small scale, noise can be steeper than a wide edge, which must not end the search.
+        # A step lower than `weak` is noise and does not end the search for a wide edge.
         before = height[open_]
         gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
         open_ = open_[gains]
@@ -281,15 +294,15 @@ def _steepest_points(changes: _BinaryChanges, weak: float) -> tuple[FloatArray, 
 
 @lru_cache(maxsize=16)
 def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
-    """Return offsets (w,), px, and the matrix (w, p) from the brightness there to slopes at p places near 0.
+    """Return the matrix (w, p) that converts brightness at w offsets into slopes at p offsets around 0.
 
-    The third value is the distance of the outermost place from zero, px. A sharp unit step has the slope 1 at
-    every scale `size`, px.
+    The result is the w offsets, px, the matrix, and the largest of the p offsets, px. The Gaussian has the
+    standard deviation `size`, px. The slope of a sharp unit step is 1 for every `size`.
     """
     half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
     x: FloatArray = np.arange(-half, half + 1, dtype=float)
     kernel = x * np.exp(-0.5 * (x / size) ** 2)
-    # The response to a step between two pixels is the sum over one side.
+    # The response of the kernel to a step between two pixels is the sum over one side of the kernel.
     kernel = kernel / np.sum(kernel[x > 0])
     window = np.arange(-reach - half, reach + half + 1)
     matrix = np.zeros((len(window), 2 * reach + 1))
@@ -299,7 +312,7 @@ def _slope_matrix(size: float) -> tuple[IntArray, FloatArray, int]:
 
 
 _SAMPLE = 32
-"""Distance between samples along a line (px)."""
+"""Distance between samples along a scan line (px)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -307,9 +320,9 @@ class EdgeRays:
     """Edges as directions.
 
     Attributes:
-        rays: unit vectors (n, 3), camera axes.
-        brighter: change of the ray per pixel towards the bright side along the scan line (n, 3).
-        pixel: size of a pixel there (n,), rad.
+        rays: unit vectors to the edges (n, 3), camera axes.
+        brighter: change of the unit vector per pixel along the scan line towards the bright side (n, 3).
+        pixel: angular size of a pixel at the edge (n,), rad.
     """
 
     rays: FloatArray
@@ -322,7 +335,7 @@ class EdgeRays:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Pixels on the scan lines: directions (m, 3), and whether they are bright (m,)."""
+    """Sampled pixels of the scan lines: unit vectors (m, 3), camera axes, and which are bright (m,)."""
 
     rays: FloatArray
     bright: BoolArray
@@ -330,14 +343,14 @@ class Samples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """Edges and samples as directions from the camera.
+    """Edges and samples of an image as directions.
 
     Attributes:
         space: distance between the scan lines, px.
-        edges: the edges in pixels.
-        rays: the edges as directions.
-        across, down: change of the ray per pixel to the right and downwards (n, 3).
-        samples: samples along the scan lines.
+        edges: edges as pixel positions.
+        rays: edges as directions.
+        across, down: change of an edge's unit vector per pixel to the right and per pixel downwards (n, 3).
+        samples: sampled pixels on the scan lines.
     """
 
     space: float
@@ -351,9 +364,9 @@ class Observation:
 def observe(
     edges: ScanEdges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
 ) -> Observation:
-    """Return edges and samples as directions, without edges that the lens does not image.
+    """Return edges and sampled pixels as directions, without edges beyond the field of the lens.
 
-    If `samples` are given, they replace the samples of the scan lines.
+    If `samples` is given, it is used instead of samples of the scan lines.
     """
     count = len(edges)
     right, below = edges.points + np.array([1.0, 0.0]), edges.points + np.array([0.0, 1.0])
@@ -376,7 +389,7 @@ def observe(
 
 
 def _sample_places(size: int) -> IntArray:
-    """Return the positions of the samples along a line of `size` px."""
+    """Return the positions of the samples along a scan line of `size` px."""
     return np.arange(_SAMPLE // 2, size, _SAMPLE * max(1, size // 512))
 
 
@@ -384,7 +397,7 @@ def _sample_places(size: int) -> IntArray:
 def _sample_rays(
     camera: Lens, columns: tuple[int, ...], rows: tuple[int, ...]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the directions (m, 3) of the samples on the given lines, and which samples the lens images.
+    """Return the directions (m, 3) of the samples on scan lines, and which samples the lens images.
 
     The result is cached, because it is the same in successive frames.
     """

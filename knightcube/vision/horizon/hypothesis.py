@@ -1,10 +1,10 @@
-"""One possible horizon: its edges on the limb, the fit, and the evidence for and against it.
+"""A horizon hypothesis: a limb fitted to edges of the image, and the evidence for and against it.
 
-The significance of a horizon is an upper bound of the expected number of cones, among all that differ in the
-image, near which chance edges lie as often and as closely. The density of chance edges is that of the edges
-beside the limb. These edges lie on curves: a coast or the rim of a cloud with radius R that touches the limb
-stays within the gate g of it over 2 sqrt(2 g R). Scan lines across one piece of such a curve are not
-independent, so that pieces are counted instead of scan lines.
+The significance of a horizon is an upper bound of the expected number of cones in the image that chance edges
+fit as well as the horizon. The density of chance edges is estimated from the edges beside the limb. Chance
+edges lie on curves. A coast or the rim of a cloud with radius R that touches the limb stays within a distance
+g of the limb over a length of 2 sqrt(2 g R). Scan lines that cross the same segment of such a curve are not
+independent, so the test counts segments of this length instead of scan lines.
 """
 
 from __future__ import annotations
@@ -42,22 +42,19 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _GRAZING = 0.3
-"""Minimum cosine of the angle between a scan line and the normal of the limb. More oblique lines are
-inaccurate."""
+"""Minimum cosine of the angle between a scan line and the limb's normal; oblique lines are inaccurate."""
 _LOWEST_SUN = np.radians(1.0)
-"""Minimum elevation of the Sun at a limb point (rad), because the limb appears higher if the Sun is lower."""
+"""Minimum elevation of the Sun at a limb point (rad); below it the limb appears too high."""
 _FINE = SCALE_HEIGHT / 6.0
-"""Pixel size (m) below which the steepest point of an edge is used, because the profile extends beyond the
-stored samples."""
+"""Pixel size at the limb (m) below which profiles are not fitted, because they exceed the stored samples."""
 _CORRELATED = 10.0
 """Correlation length (px) of the brightness behind the limb."""
 _PIXEL_SIGMA = 12.0**-0.5
-"""Standard deviation of the blur by a square pixel (px)."""
+"""Standard deviation (px) of the blur that a square pixel causes."""
 _LEAST_SPREAD = 0.03
-"""Minimum error of a limb position that is fitted to a brightness profile (px)."""
+"""Minimum standard deviation (px) of a limb position that is fitted to a brightness profile."""
 _OTHER_AIR = 500.0
-"""Difference (m) of the limb's apparent height between bright and dark ground that an unknown density of the
-air causes."""
+"""Error of the limb height (m) between bright and dark ground, due to the unknown density of the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +63,11 @@ class LimbPoints:
 
     Attributes:
         index: indices of the limb's edges among the edges of the image (n,).
-        rays: directions (n, 3).
-        sigma: standard deviations normal to the limb (n,), rad.
-        pixel: size of a pixel normal to the limb (n,), rad.
-        inward: cosine of the angle between the scan line and the normal of the limb (n,).
-        residuals, gradients: residuals (n,) and their gradients (n, 5), see `limb_gradients`.
+        rays: unit vectors to the limb points (n, 3), camera axes.
+        sigma: standard deviations of the limb points normal to the limb (n,), rad.
+        pixel: angular size of a pixel normal to the limb (n,), rad.
+        inward: cosine of the angle between the scan line and the limb's normal (n,).
+        residuals, gradients: residuals (n,), rad, and their gradients (n, 5) from `limb_gradients`.
     """
 
     index: IntArray
@@ -83,7 +80,7 @@ class LimbPoints:
 
 
 def near_limb(view: LimbView, observation: Observation, tolerance: float) -> BoolArray:
-    """Return which edges (n,) lie within `tolerance` px of the limb, with their bright side towards nadir."""
+    """Return which edges (n,) lie within `tolerance` px of the limb with the bright side towards nadir."""
     near = np.abs(limb_residuals(view, observation.rays.rays)) < tolerance * observation.rays.pixel
     return np.asarray(near & (observation.rays.brighter @ view.nadir > 0.0))
 
@@ -91,15 +88,15 @@ def near_limb(view: LimbView, observation: Observation, tolerance: float) -> Boo
 def _limb_points(
     view: LimbView, observation: Observation, members: BoolArray, sun: FloatArray | None
 ) -> LimbPoints:
-    """Return the members in daylight whose scan line is not too oblique to the limb."""
+    """Return the limb points of the `members` (n,) in daylight whose scan lines are not too oblique."""
     chosen = np.flatnonzero(members)
     rays = observation.rays.rays[chosen]
     if sun is not None:
         day = sun_elevation(view, rays, sun) > _LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
-    # A step s of the ray u changes the residual as the rotation d = u x s does. The slopes (n, 2) are per
-    # pixel to the right and downwards.
+    # A small change s of the ray u changes the residual as much as the rotation u x s does.
+    # The slopes (n, 2) are the changes of the residual per pixel to the right and downwards.
     turns = np.cross(gradients[:, :3], rays)
     steps = observation.across[chosen], observation.down[chosen]
     slopes = -np.stack([np.einsum("ij,ij->i", turns, step) for step in steps], axis=1)
@@ -113,7 +110,7 @@ def _limb_points(
 def _placed_by_profile(
     view: LimbView, observation: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
-    """Return the points at the positions that a fit of their profiles gives, if pixels are coarse enough."""
+    """Return the limb points at positions fitted to their profiles, if the pixels are coarse enough."""
     metres = limb.pixel * view.limb_distance
     if not len(metres) or float(np.median(metres)) < _FINE:
         return limb
@@ -122,7 +119,7 @@ def _placed_by_profile(
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
     rays = limb.rays + shift[:, None] * observation.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
-    # Scan lines that are closer than the size of ground features are not independent.
+    # Scan lines closer to each other than the size of ground features are not independent.
     correlated = np.sqrt(max(1.0, _CORRELATED / observation.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
     sigma = correlated * np.hypot(spread, least) * limb.inward * limb.pixel
@@ -130,21 +127,21 @@ def _placed_by_profile(
 
 
 _GATES = (0.25, 0.5, 1.0, 2.0)
-"""Trial half widths (px) of the gate. The gate with the smallest expected number of chance cones is used."""
+"""Half-widths (px) of the gates around the limb that are tried; the most significant result is used."""
 _ROUND = 0.1
-"""Radius of the curves on which chance edges lie, as a fraction of the image size."""
+"""Assumed radius of the curves on which chance edges lie, as a fraction of the image size."""
 _BESIDE = 0.05
-"""Distance from the limb within which other edges give the density, as a fraction of the image size."""
+"""Distance from the limb within which chance edges are counted, as a fraction of the image size."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimbInView:
-    """The limb in an image.
+    """Length of the limb in an image, and how often scan lines cross the limb.
 
     Attributes:
-        length: length of the part that should show edges, px.
-        crossings: number of crossings of that part with the scan lines.
-        all_crossings: number of crossings of the whole limb in the image with the scan lines.
+        length: length of the part of the limb that should show edges, px.
+        crossings: number of times that scan lines cross the part of the limb that should show edges.
+        all_crossings: number of times that scan lines cross the whole limb in the image.
     """
 
     length: float
@@ -155,19 +152,19 @@ class LimbInView:
 def limb_in_view(
     points: FloatArray, inside: BoolArray, due: BoolArray, space: tuple[float, float]
 ) -> LimbInView:
-    """Return the limb in an image.
+    """Return the length of a limb in the image and the number of its crossings with scan lines.
 
     Args:
-        points: a closed limb (n, 2), px.
+        points: successive points around the closed limb (n, 2), px.
         inside: which points of the limb are inside the image (n,).
         due: which points of the limb should show an edge (n,).
-        space: distance between the columns that are read, and between the rows, px.
+        space: distances between neighbouring scanned columns and between neighbouring scanned rows, px.
     """
     with np.errstate(invalid="ignore"):
         step = np.abs(np.roll(points, -1, axis=0) - points)
     both = [kept & np.roll(kept, -1) for kept in (inside & due, inside)]
     size = np.hypot(step[:, 0], step[:, 1])
-    # A step along x crosses columns, and a step along y crosses rows.
+    # A step along x crosses scanned columns, and a step along y crosses scanned rows.
     crossings = np.sum(step * (step > _GRAZING * size[:, None]) / np.array(space), axis=1)
     return LimbInView(
         *(float(np.sum(each)) for each in (size[both[0]], crossings[both[0]], crossings[both[1]]))
@@ -177,19 +174,19 @@ def limb_in_view(
 def log10_chance(
     limb: LimbInView, residuals: FloatArray, others: FloatArray, camera: CameraModel, unknowns: int
 ) -> float:
-    """Return log10 of the bound of the number of chance cones that fit equally well as a limb.
+    """Return log10 of an upper bound of the expected number of cones that chance edges fit as well as a limb.
 
     Args:
-        limb: the limb in the image.
+        limb: length of the limb in the image, and its crossings with scan lines.
         residuals: residuals of the limb's edges (k,), px.
         others: distances of all other edges from the limb (m,), px.
-        camera: the camera.
-        unknowns: number of fitted parameters: 2 for nadir, 3 with the altitude.
+        camera: camera that took the image.
+        unknowns: number of fitted parameters, 2 for nadir alone and 3 for nadir and altitude.
     """
     size = float(max(camera.columns, camera.rows))
     lines = max(limb.crossings, float(len(residuals)), 1.0)
     beside = _BESIDE * size
-    # One edge is added, so that the density of chance edges is positive if no edge lies beside the limb.
+    # One edge is added, so that the density of chance edges is positive even if no edge lies beside the limb.
     near = np.count_nonzero(np.abs(others) < beside) + 1.0
     density = near / (2.0 * beside * max(limb.all_crossings, lines))
     best = math.inf
@@ -198,7 +195,7 @@ def log10_chance(
         pieces = min(lines, limb.length / (2.0 * math.sqrt(2.0 * gate * _ROUND * size)))
         chance = min(2.0 * gate * density, 0.5)
         cones = math.log10(len(_GATES)) + unknowns * math.log10(size / gate)
-        # The probability that this share of the pieces or more is hit by chance (Chernoff's bound).
+        # `tail` is Chernoff's bound, as log10, of the probability that chance edges hit this many segments.
         tail = 0.0
         if share > chance:
             rest = 0.0 if share >= 1.0 else (1.0 - share) * math.log((1.0 - share) / (1.0 - chance))
@@ -208,15 +205,15 @@ def log10_chance(
 
 
 _UNKNOWN_TURN = 1.0
-"""Prior standard deviation of an unknown rotation about nadir (rad); it has no effect on a sphere."""
+"""Prior standard deviation (rad) of an unknown rotation about nadir, which has no effect on a sphere."""
 _NIGHT = np.radians(-8.0)
-"""Elevation of the Sun (rad) below which an edge is not the limb."""
+"""Elevation of the Sun at a limb point (rad) below which the limb is too dark to show an edge."""
 _LIMB_RAYS, _FINE_RAYS = 120, 720
-"""Numbers of points along the limb for its coverage and for its significance."""
+"""Number of points along the limb for its coverage, and for its significance."""
 _BORDER = 8.0
-"""Distance from the image border (px) within which the limb needs no edges."""
+"""Distance from the image border (px) within which a limb without edges is accepted."""
 _NEAR = 0.0375
-"""Distance within which an edge covers the limb, as a fraction of the image size: about two scan lines."""
+"""Distance within which an edge covers a limb point, as a fraction of the image size (two scan lines)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,18 +223,18 @@ class Hypothesis:
     Attributes:
         fit: the fitted limb.
         members: which edges of the image lie on the fitted horizon (n,).
-        limb: members at their fitted positions.
-        residual: rms distance of the members from the limb, px.
-        guess: start of the fit.
-        lighting: agreement with the brightness of the image.
-        coverage: fraction of the sunlit limb in the image that has a member nearby; 1 if no such limb is in
-            the image.
-        night: fraction of the members at which the Sun is well below the horizon.
-        allowance: standard deviation per axis of unmodelled effects, rad.
-        chance: log10 of the expected number of chance cones that fit equally well, see `log10_chance`.
-        breadth: median width of the members' edges, relative to the width expected from the air.
-        altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in its standard
-            deviations; 0 for a known altitude.
+        limb: limb points of the edges on the horizon.
+        residual: rms distance of the used edges from the limb, px.
+        guess: initial guess from which the fit started.
+        lighting: agreement of the horizon with the brightness of the image.
+        coverage: fraction of the sunlit limb in the image that has an edge nearby; 1 if the image shows no
+            sunlit limb.
+        night: fraction of the horizon's edges at which the Sun is well below the horizon.
+        allowance: standard deviation per axis of the nadir due to unmodelled effects, rad.
+        chance: log10 of the expected number of cones that chance edges fit as well, from `log10_chance`.
+        breadth: median width of the horizon's edges, relative to the width expected from the air.
+        altitude_off: distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations
+            of the altitude; 0 if the altitude is known.
     """
 
     fit: FittedLimb
@@ -255,7 +252,7 @@ class Hypothesis:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (3, 3) of the nadir, rad^2, including the allowance."""
+        """The covariance (3, 3) of the nadir, rad^2, including the allowance for unmodelled effects."""
         nadir = self.fit.view.nadir
         across = np.eye(3) - np.outer(nadir, nadir)
         return np.asarray(self.fit.nadir_covariance + self.allowance**2 * across)
@@ -268,7 +265,7 @@ def examine(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> Hypothesis | None:
-    """Return the horizon fitted from a guess, with the evidence; None if no limb can be fitted."""
+    """Return the horizon hypothesis fitted from an initial guess; None if no limb can be fitted."""
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
@@ -288,7 +285,7 @@ def examine(
     if not altitude_known:
         (low, high), altitude = settings.altitudes, view.surface.height_of(view.position)
         altitude_off = max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
-    # The part of the limb that is known to lie in the night needs no edges.
+    # The part of the limb that is known to lie on the night side is not expected to show edges.
     rays = limb_rays(view, _FINE_RAYS)
     points = camera.project(rays)
     inside = camera.contains(points, -_BORDER)
@@ -321,9 +318,10 @@ def _fitted(
     settings: HorizonSettings,
     prior: Prior,
 ) -> tuple[FittedLimb, LimbPoints] | None:
-    """Return the limb fitted to the members of a guess, and the fitted points; None if the fit fails.
+    """Return the limb fitted to the edges of an initial guess, and the limb points; None if the fit fails.
 
-    One step uses the steepest points of the edges; the fit that follows uses their profiles.
+    The first Gauss-Newton step uses the steepest points of the edges. The following fit uses limb positions
+    from the brightness profiles of the edges.
     """
     limb = _limb_points(guess.view, observation, guess.members, sun)
     if len(limb.index) < settings.least_edges:
@@ -344,7 +342,10 @@ def _fitted(
 def _coverage(
     view: LimbView, observation: Observation, used: BoolArray, sun: FloatArray | None, camera: CameraModel
 ) -> float:
-    """Return the fraction of the limb in view, of the sunlit limb if the Sun is known, near a used edge."""
+    """Return the fraction of the limb in the image that is near a `used` edge (n,).
+
+    If the Sun is known, only the sunlit limb away from the Sun's glare is counted.
+    """
     rays = limb_rays(view, _LIMB_RAYS)
     if sun is not None:
         plain = (sun_elevation(view, rays, sun) > DAYLIGHT) & (rays @ (view.rotation @ sun) < np.cos(GLARE))

@@ -1,18 +1,20 @@
 """Comparison of images with the brightness that a view of the Earth predicts, and a coarse nadir.
 
-A correct view agrees with the whole image: sky and night side are dark, and the sunlit limb has edges along
-its entire length. A view that is fitted to the terminator does not agree. The paper does not state how to
-distinguish limb and terminator (Meller 3.3).
+A correct view of the Earth agrees with the whole image: sky and night side are dark, and the sunlit limb has
+edges along its entire length. A view that is fitted to the terminator does not agree. Meller et al., section
+3.3, do not state how to distinguish the limb from the terminator.
 
-If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller 4.1).
-`coarse_nadir` then tries directions all over the sphere. For each direction it predicts which samples of all
-cameras are bright: those on the sunlit part of the Earth's disc. The directions are weighted by the number of
-samples that they explain; their mean is the nadir and their spread its covariance. The Sun's direction, if
-known, distinguishes night from sky; without it any sample on the disc may be dark.
+If no image shows a limb, the Earth fills one camera and the other cameras are dark (Meller et al., section
+4.1). In this case, `coarse_nadir` tries nadir directions that cover the sphere. For each nadir direction it
+predicts which samples of the images are bright, namely samples on the sunlit part of the Earth's disc. The
+nadir is the mean of the tried directions, weighted by their likelihood given the samples, and the covariance
+of nadir is the spread of the weighted directions. If the Sun's direction is unknown, any sample on the disc
+may be dark.
 
-`why_false` compares an image with a known attitude. An image that is mostly dark where sunlit ground must be,
-or mostly bright where there can be none, comes from a broken camera: black, blinded, random or upside down.
-Limb, twilight and the surroundings of the Sun are excluded.
+`why_false` compares an image with a known attitude. An image is false if it is mostly dark where sunlit
+ground must be, or mostly bright where only sky or night can be. Such an image comes from a camera that is
+dead, blinded, mounted upside down or sends random data. The limb, twilight and the surroundings of the Sun
+are excluded from the comparison.
 """
 
 from __future__ import annotations
@@ -30,23 +32,23 @@ from knightcube.vision.horizon.edges import Samples
 from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT, LimbView, limb_residuals
 
 _TWILIGHT = np.radians(12.0)
-"""Depression of the Sun (rad) beyond which ground and air count as night."""
+"""Depression of the Sun below the horizon (rad) beyond which ground and air count as dark."""
 DAYLIGHT = np.radians(8.0)
-"""Elevation of the Sun (rad) beyond which ground and limb count as lit."""
+"""Elevation of the Sun (rad) above which ground and limb count as sunlit."""
 GLARE = np.radians(12.0)
 """Angle from the Sun (rad) within which stray light is as bright as the Earth."""
 _ATMOSPHERE = 60e3
-"""Height (m) above which the air is darker than the Earth."""
+"""Tangent height (m) above which the air counts as dark sky."""
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a view explains the brightness of an image.
+    """Agreement of a view of the Earth with the brightness of an image.
 
     Attributes:
-        stray: fraction of the samples of sky and night that are bright.
-        missing: fraction of the samples of sunlit ground that are dark.
-        dark_samples, lit_samples: numbers of samples of sky and night, and of sunlit ground.
+        stray: fraction of the samples in the sky and on the night side that are bright.
+        missing: fraction of the samples on sunlit ground that are dark.
+        dark_samples, lit_samples: number of samples in the sky and on the night side, and on sunlit ground.
     """
 
     stray: float
@@ -56,9 +58,9 @@ class Agreement:
 
 
 def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the elevation of the Sun (n,), rad, where rays (n, 3) meet the surface or pass it nearest.
+    """Return the Sun's elevation (n,), rad, where rays (n, 3) meet the Earth's surface or pass nearest to it.
 
-    `sun` (3,) is a unit vector in inertial axes.
+    `sun` (3,) is the unit vector to the Sun in inertial axes.
     """
     stretching = view.surface.stretching()
     origin = stretching @ view.position
@@ -73,7 +75,10 @@ def sun_elevation(view: LimbView, rays: FloatArray, sun: FloatArray) -> FloatArr
 
 
 def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agreement:
-    """Return how well a view agrees with samples; without the Sun, only samples of the sky are compared."""
+    """Return how well a view agrees with samples of an image.
+
+    If the Sun's direction is unknown, only samples in the sky are compared.
+    """
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
     dark = outside > np.arctan(_ATMOSPHERE / view.limb_distance)
@@ -89,7 +94,7 @@ def agreement(view: LimbView, sun: FloatArray | None, samples: Samples) -> Agree
 
 
 def limb_rays(view: LimbView, count: int) -> FloatArray:
-    """Return `count` rays (count, 3) in camera axes, evenly spaced around the limb."""
+    """Return unit vectors (count, 3) in camera axes to points that are spaced around the limb."""
     stretching = view.surface.stretching(view.limb_height)
     centre = -(stretching @ view.position)
     size = float(np.linalg.norm(centre))
@@ -97,7 +102,7 @@ def limb_rays(view: LimbView, count: int) -> FloatArray:
     angle = np.arange(count) * (2.0 * np.pi / count)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     stretched = np.sqrt(1.0 - size**-2) * axis + circle @ (tangent_basis(axis) / size)
-    # From the stretched space, in which the Earth is the unit sphere, into camera axes.
+    # The rays are transformed into camera axes from scaled axes, in which the Earth is the unit sphere.
     rays = stretched @ (view.rotation @ view.surface.shape(view.limb_height)).T
     return np.asarray(rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None])
 
@@ -105,27 +110,27 @@ def limb_rays(view: LimbView, count: int) -> FloatArray:
 _SAMPLES = 8
 """Number of sampled rows, and of sampled columns."""
 _DIRECTIONS = 2000
-"""Number of directions that are tried, 4.5 deg apart."""
+"""Number of nadir directions that are tried, about 4.5 deg apart."""
 _STRAY = 0.03
-"""Probability that a sample is bright in the sky or dark on sunlit ground."""
+"""Probability that a sample is bright in the sky, and that a sample is dark on sunlit ground."""
 _WEIGHT = 0.2
-"""Weight of a sample, which is below 1 because the errors of neighbouring samples are correlated."""
+"""Weight of a sample in the log-likelihood; below 1 because errors of neighbours are correlated."""
 _WIDEST = math.radians(30.0)
 """Largest standard deviation per axis (rad) of a coarse nadir."""
 _SPACE = math.sqrt(4.0 * math.pi / _DIRECTIONS)
-"""Distance between neighbouring directions (rad)."""
+"""Distance between neighbouring trial directions of nadir (rad)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageBrightness:
-    """Samples of one image: directions (n, 3) in body axes, and which of them are bright (n,)."""
+    """Samples of one image: unit vectors (n, 3) in body axes, and which samples are bright (n,)."""
 
     rays: FloatArray
     bright: BoolArray
 
     @property
     def share(self) -> float:
-        """The fraction of the image that is bright."""
+        """The fraction of the samples that are bright."""
         return float(np.mean(self.bright))
 
 
@@ -135,8 +140,8 @@ class CoarseNadir:
 
     Attributes:
         direction: unit vector (3,) in body axes.
-        covariance: covariance (3, 3) of its error, rad^2, zero along the direction.
-        explained: mean probability of the samples, for the direction that explains them best.
+        covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
+        explained: mean probability of the samples for the most likely direction.
     """
 
     direction: FloatArray
@@ -145,15 +150,15 @@ class CoarseNadir:
 
     @property
     def sigma(self) -> float:
-        """The root of the mean variance over the two axes, rad."""
+        """The rms standard deviation per axis of the direction, rad."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
 def image_brightness(image: Image, camera: MountedCamera, bright: float) -> ImageBrightness:
-    """Return which of 8 x 8 samples of an image (rows, columns) are bright.
+    """Return the brightness of 8 x 8 samples of an image (rows, columns).
 
-    `bright` counts is the threshold: a dark sea under a low Sun must reach it, and the stray light of the
-    Earth beside it must not.
+    `bright` is the threshold in counts. A dark sea under a low Sun must exceed this threshold, and stray
+    light beside the Earth must not exceed it.
     """
     rows, columns = (_sample_indices(size) for size in image.shape)
     lit = bright < image[np.ix_(rows, columns)].T
@@ -167,9 +172,9 @@ def coarse_nadir(
     """Return the nadir that explains the brightness of all images; None if it is too uncertain.
 
     Args:
-        looks: brightness of each image.
-        altitude: height above the mean Earth, m.
-        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees.
+        looks: brightness of the samples of each image.
+        altitude: height of the cameras above the Earth's mean radius, m.
+        sun: unit vector (3,) to the Sun in body axes, accurate to ten degrees; None if unknown.
     """
     rays = np.concatenate([look.rays for look in looks])
     bright = np.concatenate([look.bright for look in looks])
@@ -199,7 +204,10 @@ def coarse_nadir(
 def _bright_probability(
     tried: FloatArray, rays: FloatArray, altitude: float, sun: FloatArray | None
 ) -> FloatArray:
-    """Return the probability (d, n) that each ray (n, 3) is bright if nadir is each of `tried` (d, 3)."""
+    """Return the probability (d, n) that samples in directions `rays` (n, 3) are bright.
+
+    The probability is given for each trial nadir in `tried` (d, 3).
+    """
     radius = MEAN_RADIUS + UNIT_DEPTH_HEIGHT
     distance = (MEAN_RADIUS + altitude) / radius
     cosine = tried @ rays.T
@@ -213,13 +221,13 @@ def _bright_probability(
 
 
 def _sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
-    """Return the sine of the Sun's elevation where rays meet the ground of a sphere.
+    """Return the sine of the Sun's elevation where rays meet the surface of a sphere.
 
     Args:
-        cosine: cosine of the angle between the ray and nadir.
-        ahead: cosine of the angle between the ray and the Sun.
+        cosine: cosine of the angle between each ray and nadir.
+        ahead: cosine of the angle between each ray and the Sun.
         below: cosine of the angle between nadir and the Sun.
-        distance: distance of the camera from the centre of the sphere, in its radii.
+        distance: distance of the camera from the centre of the sphere, in radii of the sphere.
     """
     depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
     return np.asarray((distance * cosine - depth) * ahead - distance * below)
@@ -231,7 +239,7 @@ def _sample_indices(size: int) -> IntArray:
 
 @lru_cache(maxsize=8)
 def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
-    """Return the directions (m, 3), camera axes, of the samples that the lens images, and which these are."""
+    """Return which samples the lens images, and unit vectors (m, 3) to these samples, camera axes."""
     x, y = np.meshgrid(_sample_indices(lens.columns), _sample_indices(lens.rows), indexing="ij")
     rays = lens.unit_vectors(np.stack([x.ravel(), y.ravel()], axis=1).astype(float))
     imaged = np.isfinite(rays[:, 0])
@@ -240,7 +248,7 @@ def _sample_rays(lens: Lens) -> tuple[FloatArray, BoolArray]:
 
 @lru_cache(maxsize=1)
 def _sphere(count: int) -> FloatArray:
-    """Return unit vectors (count, 3) evenly over the sphere, along a spiral of the golden angle."""
+    """Return unit vectors (count, 3) that cover the sphere evenly (a Fibonacci lattice)."""
     number = np.arange(count) + 0.5
     z = 1.0 - 2.0 * number / count
     turn = math.pi * (1.0 + math.sqrt(5.0)) * number
@@ -249,26 +257,25 @@ def _sphere(count: int) -> FloatArray:
 
 
 _MARGIN = math.radians(5.0)
-"""Angle beside the limb (rad) that is excluded: the air, and one degree of attitude error."""
+"""Angle on both sides of the limb (rad) that is excluded; it covers the air and 1 deg of attitude error."""
 _DAY = DAYLIGHT + math.radians(12.0)
-"""Elevation of the Sun (rad) beyond which ground is certainly bright."""
+"""Elevation of the Sun (rad) above which ground is certainly bright."""
 _STRAY_LIGHT = math.radians(25.0)
-"""Angle of a sample from the Sun (rad) within which stray light may cover the whole image."""
+"""Angle of the Sun from the nearest sample (rad) below which stray light may cover the whole image."""
 _LEAST = 8
-"""Minimum number of samples, out of 64, for a decision."""
+"""Minimum number of samples, out of 64, from which an image can be judged false."""
 _MOST = 0.6
-"""Fraction of contradicting samples above which an image is false. Cloud shadows, seas and lens ghosts cause
-a smaller fraction."""
+"""Fraction of contradicting samples above which an image is false; clouds and lens ghosts cause fewer."""
 
 
 def why_false(look: ImageBrightness, nadir: FloatArray, altitude: float, sun: FloatArray) -> str:
-    """Return why an image contradicts a known attitude; empty if it does not.
+    """Return why an image contradicts a known attitude, or an empty string if it agrees.
 
     Args:
-        look: brightness of the image.
-        nadir: unit vector (3,) in body axes, accurate to a degree.
-        altitude: height above the mean Earth, m.
-        sun: unit vector (3,) in body axes, accurate to a degree.
+        look: brightness of the samples of the image.
+        nadir: unit vector (3,) to nadir in body axes, accurate to a degree.
+        altitude: height of the camera above the Earth's mean radius, m.
+        sun: unit vector (3,) to the Sun in body axes, accurate to a degree.
     """
 
     def mostly(against: BoolArray) -> bool:

@@ -1,17 +1,17 @@
-"""The first guess of one horizon: a cone on which many edges agree, and the orientation about nadir.
+"""Initial guess of a horizon: the cone with which most edges agree, and the camera's rotation about nadir.
 
-All rays u of a sphere's limb make the same angle rho with nadir n: u.g = 1 with g = n / cos rho, linear in g
-(Christian & Robinson 2016, for a sphere). If rho is known, two rays determine n up to two directions. If rho
-is unknown, three rays determine n and rho. Every pair of edges (every triple, if the altitude is unknown),
-thinned evenly if there are too many, gives a cone. An edge agrees with a cone if it lies near the cone and
-its bright side is towards nadir. The edges of the best cone are removed and the search continues, so that the
-terminator, a coast or a band of clouds gives a separate candidate. This is sample consensus (Fischler &
-Bolles 1981) without random choice.
+All rays u to a sphere's limb make the same angle rho with nadir n: u.g = 1 with g = n / cos rho, an equation
+that is linear in g (Christian & Robinson 2016). If rho is known, two rays determine n up to two solutions. If
+rho is unknown, three rays determine n and rho. Every pair of edges gives a cone, or every triple if the
+altitude is unknown. If there are too many pairs or triples, an evenly spaced selection is used. An edge
+agrees with a cone if the edge lies near the cone and its bright side is towards nadir. The edges of the best
+cone are removed and the search continues, so that the terminator, a coast or a band of clouds gives a cone of
+its own. This is sample consensus (Fischler & Bolles 1981) without random choice.
 
-A horizon does not determine the rotation about nadir, but the flattening depends on the direction of the
-pole and the light on that of the Sun. A rough attitude, the coarse direction of the Sun or the magnetic field
-gives this rotation. Because the angle of each known direction from nadir is known too, a nadir with another
-angle is rejected.
+A horizon does not determine the rotation about nadir. The rotation is needed because the Earth's flattening
+depends on the direction of the pole, and the illumination depends on the direction of the Sun. A rough
+attitude, the coarse direction of the Sun or the magnetic field gives this rotation. The angle between nadir
+and each such direction is also known, so a nadir at a different angle is rejected.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ from knightcube.vision.horizon.limb import (
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 
 _PARALLEL = 1e-12
-"""Squared sine below which two rays count as parallel."""
+"""Squared sine of the angle between two rays below which they count as parallel."""
 
 
 def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> FloatArray:
-    """Return both directions (2, n, 3) that make the angle of `cosine` with two rays (n, 3) each.
+    """Return the two directions (2, n, 3) that make a given angle with both rays of each pair (n, 3).
 
-    They are NaN if the rays are too far apart for that angle, or parallel.
+    `cosine` is the cosine of the angle. The directions are NaN if the rays of a pair are parallel, or too far
+    apart for the angle.
     """
     dot = np.einsum("ij,ij->i", first, second)
     normal = np.cross(first, second)
@@ -63,22 +64,28 @@ def nadirs_of_pairs(first: FloatArray, second: FloatArray, cosine: float) -> Flo
 def nadirs_of_triples(
     first: FloatArray, second: FloatArray, third: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the axes (n, 3) of the cones through three rays (n, 3) each, and the half-angles' cosines (n,).
+    """Return the cones through triples of rays (n, 3): their axes (n, 3) and half-angle cosines (n,).
 
-    They are NaN if the three rays lie in one plane with the camera.
+    Axis and cosine are NaN if two rays of a triple are equal.
     """
     normal = np.cross(second - first, third - first)
     size = np.linalg.norm(normal, axis=1)
     directions = normal / np.where(size > _PARALLEL, size, np.nan)[:, None]
     cosines = np.einsum("ij,ij->i", directions, first)
-    # Nadir is within 90 deg of its limb; the opposite direction is not.
+    # Nadir is the normal within 90 deg of the rays, because the limb lies within 90 deg of nadir.
     sign = np.where(cosines < 0.0, -1.0, 1.0)
     return directions * sign[:, None], cosines * sign
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConeCandidate:
-    """A circular cone: its axis (3,), the cosine of its half-angle, and the edges that agree with it (n,)."""
+    """A circular cone that may be a horizon.
+
+    Attributes:
+        direction: axis of the cone (3,).
+        cosine: cosine of the cone's half-angle.
+        members: which edges of the image agree with the cone (n,).
+    """
 
     direction: FloatArray
     cosine: float
@@ -91,18 +98,18 @@ def best_cone(
     """Return the cone with which most of the `free` edges agree; None if no cone can be formed.
 
     Args:
-        edges: the edges.
+        edges: edges of the image as directions.
         free: which edges may be used (n,).
-        cosines: range of the cosine of the half-angle, of zero width if the half-angle is known.
-        tolerance: largest distance of an edge from its cone, px.
-        tries: number of pairs or triples of edges that are tried.
+        cosines: lower and upper limit of the cosine of the cone's half-angle; equal if the angle is known.
+        tolerance: largest distance of an agreeing edge from the cone, px.
+        tries: maximum number of pairs or triples of edges that are tried.
     """
     chosen = np.flatnonzero(free)
     if cosines[0] == cosines[1]:
         first, second = _pairs(len(chosen), tries)
         one, other = chosen[first], chosen[second]
         directions = nadirs_of_pairs(edges.rays[one], edges.rays[other], cosines[0])
-        # A pair whose edges do not agree with the pair's own cone is dropped.
+        # A cone is dropped if the bright sides of its two edges are not towards its axis.
         sides = edges.brighter[one], edges.brighter[other]
         agrees = [np.einsum("kij,ij->ki", directions, side) > 0.0 for side in sides]
         directions = directions[agrees[0] & agrees[1]]
@@ -122,14 +129,14 @@ def best_cone(
 
 
 def left_free(edges: EdgeRays, free: BoolArray, cone: ConeCandidate, tolerance: float) -> BoolArray:
-    """Return which of the `free` edges (n,) do not lie near `cone`, within twice the `tolerance`, px."""
+    """Return which of the `free` edges (n,) are farther from a cone than twice the `tolerance` (px)."""
     near = _agreeing(edges, cone.direction[None], np.array([cone.cosine]), 2.0 * tolerance)[0]
     return np.asarray(free & ~near & ~cone.members)
 
 
 @lru_cache(maxsize=64)
 def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
-    """Return two lists of indices below `count`: all pairs, or `tries` of them, evenly chosen."""
+    """Return the indices of all pairs of `count` items, or of at most `tries` evenly selected pairs."""
     first, second = np.triu_indices(count, 1)
     if len(first) > tries:
         chosen = np.linspace(0, len(first) - 1, tries).astype(int)
@@ -138,10 +145,10 @@ def _pairs(count: int, tries: int) -> tuple[IntArray, IntArray]:
 
 
 def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return three lists of indices below `count`, with strides of all sizes from every index."""
+    """Return the indices of up to `tries` triples of `count` items, with strides of all sizes."""
     number = np.arange(tries)
     first = number % count
-    # Multiples of the golden ratio and of the square root of two give strides that cover all pairs evenly.
+    # Fractional parts of multiples of the golden ratio and of sqrt(2) distribute the strides evenly.
     one = 1 + ((number * 0.6180339887) % 1.0 * (count - 1)).astype(int)
     two = 1 + ((number * 0.4142135624) % 1.0 * (count - 1)).astype(int)
     sound = one != two
@@ -149,13 +156,13 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tolerance: float) -> BoolArray:
-    """Return which of n edges agree with k cones (k, n).
+    """Return which of n edges agree with each of k cones (k, n).
 
-    An edge agrees if it lies within `tolerance` px of the cone with its bright side inside. The cones have
-    axes `directions` (k, 3) and half-angles of `cosines` (k,).
+    An edge agrees if it lies within `tolerance` px of the cone and its bright side is towards the axis. The
+    cones are given by their axes `directions` (k, 3) and the cosines (k,) of their half-angles.
     """
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
-    # Near the cone, cos(angle) - cos(rho) is sin(rho) times the distance.
+    # Near a cone of half-angle rho, cos(angle from axis) - cos(rho) is sin(rho) times the distance, rad.
     off = directions @ edges.rays.T
     off -= cosines[:, None]
     near = np.abs(off, out=off) <= sines[:, None] * (tolerance * edges.pixel)
@@ -164,22 +171,20 @@ def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tole
 
 
 MOST_MISMATCH = 4.0
-"""Largest disagreement with a coarse sensor, in standard deviations."""
+"""Largest accepted disagreement of a nadir with a coarse sensor, in standard deviations."""
 _GUESS_SIGMA = math.radians(0.2)
-"""Error (rad) of a nadir from the cone through the edges, before the fit of a limb. In frames of flights it
-is 0.07 to 0.3 deg."""
+"""Error (rad) of a cone's nadir before the limb is fitted; measured errors are 0.07 to 0.3 deg."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
-    """The orientation of a camera about an assumed nadir.
+    """The attitude of a camera for an assumed nadir, with the rotation about nadir from known directions.
 
     Attributes:
-        rotation: rotation matrix (3, 3), inertial into camera axes; its nadir is the assumed one.
-        sigma: standard deviation of the rotation about nadir, rad; infinite if unknown.
-        mismatch: largest disagreement of a known direction with this nadir, in standard deviations of the
-            direction and of a guessed nadir.
-        share: fraction of all nadirs that agree with the known directions.
+        rotation: rotation matrix (3, 3) from inertial to camera axes; it agrees with the assumed nadir.
+        sigma: standard deviation of the rotation about nadir, rad; infinite if the rotation is unknown.
+        mismatch: largest disagreement of a known direction with the assumed nadir, in standard deviations.
+        share: fraction of all possible nadirs that agree with the known directions.
     """
 
     rotation: FloatArray
@@ -189,16 +194,15 @@ class Orientation:
 
 
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
-    """Return the orientation about `nadir` (3,), camera axes, which is `inertial_nadir` (3,)."""
+    """Return the camera attitude that maps `inertial_nadir` (3,), inertial axes, to `nadir`, camera axes."""
     base = shortest_turn(inertial_nadir, nadir)
-    # Each known direction is a pair of camera and inertial direction with a standard deviation.
-    # A rough attitude is used as two directions: nadir tests the tilt, and a normal direction gives the
-    # rotation.
+    # Each known direction is given in camera axes and in inertial axes, with a standard deviation.
+    # A rough attitude gives two known directions, nadir and a direction at right angles to it.
     known = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
         known += [(matrix @ axis, axis, sigma) for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0])]
-    # Each known direction restricts nadir to a ring, and the intersection of two rings is nearly unique.
+    # Each known direction restricts nadir to a ring on the sphere, and two rings have few common directions.
     narrowest = sorted(math.hypot(sigma, _GUESS_SIGMA) for _, _, sigma in known)[:2]
     share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     down = _unit(nadir)
@@ -219,7 +223,7 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch, share)
 
 
-# For single vectors, Python floats are ten times as fast as numpy arrays.
+# For a single vector, Python floats are ten times as fast as a numpy array.
 Vector = tuple[float, float, float]
 
 
@@ -243,7 +247,10 @@ def _length(vector: Vector) -> float:
 
 
 def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
-    """Return the shortest rotation (3, 3) of a unit vector to another; any half turn for opposite vectors."""
+    """Return the smallest rotation (3, 3) from one unit vector to another.
+
+    For opposite vectors it is a half turn about any normal axis.
+    """
 
     def half_turn(axis: FloatArray, square: float) -> FloatArray:
         return np.asarray(2.0 / square * np.outer(axis, axis) - np.eye(3))
@@ -252,25 +259,25 @@ def shortest_turn(source: FloatArray, target: FloatArray) -> FloatArray:
     square = float(middle @ middle)
     if square < 1e-12:
         return half_turn(tangent_basis(source)[0], 1.0)
-    # A half turn about the source keeps it, and a half turn about the middle maps it to the target.
+    # A half turn about `source` and then one about `middle` are together the smallest rotation to `target`.
     return np.asarray(half_turn(middle, square) @ half_turn(source, 1.0))
 
 
 SPHERE_ALTITUDE_SIGMA = 10e3
-"""Error (m) of an altitude above the mean sphere, caused by the flattening of the Earth."""
+"""Error (m) of an altitude above the mean sphere due to the flattening of the Earth."""
 _TURNS = 24
-"""Number of rotations about nadir that are tried if it is unknown."""
+"""Number of rotations about nadir that are tried if the rotation is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """The position of the camera, as far as it is known.
+    """The known or assumed position of the camera.
 
     Attributes:
-        position: position (3,), m; in inertial axes if it is the real one.
-        surface: ellipsoid, or a sphere if only the altitude is known.
-        altitude_sigma: standard deviation of the altitude, m; infinite if the altitude is unknown.
-        located: whether the position is the real one.
+        position: position (3,), m, in inertial axes if `located`, otherwise in arbitrary axes.
+        surface: the Earth's ellipsoid, or a sphere if only the altitude is known.
+        altitude_sigma: standard deviation of the altitude, m; very large if the altitude is unknown.
+        located: whether the position is known; otherwise only its altitude is meaningful.
     """
 
     position: FloatArray
@@ -280,19 +287,19 @@ class Place:
 
     @property
     def cosine(self) -> float:
-        """The cosine of the half-angle of the limb's cone, for a sphere of the radius below the camera."""
+        """The cosine of the half-angle of the limb's cone for a sphere with the Earth's local radius."""
         distance = float(np.linalg.norm(self.position))
         radius = distance - self.surface.height_of(self.position) + UNIT_DEPTH_HEIGHT
         return float(np.sqrt(1.0 - min(1.0, radius / distance) ** 2))
 
 
 def above_sphere(altitude: float, sigma: float = 0.0) -> Place:
-    """Return an arbitrary place at `altitude` m above the mean sphere, known to `sigma` m."""
+    """Return an arbitrary position at an altitude above the mean sphere, m, with uncertainty `sigma`, m."""
     return Place(np.array([0.0, 0.0, MEAN_RADIUS + altitude]), mean_sphere(), sigma, False)
 
 
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
-    """Return the known place of the camera; None if its altitude is unknown."""
+    """Return the position of the camera from prior knowledge; None if the altitude is unknown."""
     if knowledge.position is not None:
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
@@ -302,7 +309,7 @@ def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | 
 
 
 def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the unit vector (3,) to the Sun in the axes of the place; None if either is unknown."""
+    """Return the unit vector (3,) to the Sun in inertial axes; None if the Sun or the position is unknown."""
     if knowledge.sun is None or not place.located:
         return None
     return np.asarray(knowledge.sun / np.linalg.norm(knowledge.sun))
@@ -310,13 +317,13 @@ def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialGuess:
-    """The start of the fit of a horizon.
+    """The starting point for the fit of a horizon.
 
     Attributes:
-        place: assumed place of the camera.
-        view: initial view.
-        orientation: orientation of the camera about nadir.
-        members: which edges of the image may lie on the horizon (n,).
+        place: known or assumed position of the camera.
+        view: assumed position and attitude of the camera and height of the limb.
+        orientation: attitude of the camera, with the uncertainty of its rotation about nadir.
+        members: which edges of the image agree with the cone of the guess (n,).
     """
 
     place: Place
@@ -328,10 +335,10 @@ class InitialGuess:
 def initial_guess(
     candidate: ConeCandidate, observation: Observation, place: Place | None, knowledge: HorizonKnowledge
 ) -> InitialGuess:
-    """Return the guess that a cone gives; `place` is None if the altitude is unknown.
+    """Return the initial guess of a horizon from a cone; `place` is None if the altitude is unknown.
 
-    If the rotation about nadir is unknown, the surface is a sphere, and the rotation is the one that explains
-    the brightness of the image best.
+    If the rotation about nadir is unknown, the Earth is assumed to be a sphere. If the Sun is known, the
+    rotation is then the trial rotation that explains the brightness of the image best.
     """
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))

@@ -1,27 +1,29 @@
 """The Earth's limb: its direction from a camera, its brightness profile, and robust fits of both.
 
-Limb cone. Stretched along its axes, an ellipsoid becomes the unit sphere, whose limb is a circular cone about
-the direction of its centre. Stretching maps rays to rays, so a ray lies on the limb exactly if its stretched
-ray lies on that cone (Christian & Robinson 2016, "Noniterative Horizon-Based Optical Navigation by Cholesky
-Factorization", J. Guid. Control Dyn. 39, 2757). The residual of a ray is its angle from the stretched centre
-minus the half-angle of the cone: 0 on the limb, positive outside. Its gradient is exact.
+Limb cone: a scaling along the axes of an ellipsoid transforms it into the unit sphere, whose limb is a
+circular cone about the direction of the centre. The scaling transforms rays into rays, so a ray lies on the
+ellipsoid's limb if and only if the scaled ray lies on the cone (Christian & Robinson 2016, "Noniterative
+Horizon-Based Optical Navigation by Cholesky Factorization", J. Guid. Control Dyn. 39, 2757). The residual of
+a ray is the angle between the scaled ray and the scaled centre minus the half-angle of the cone. The residual
+is 0 on the limb and positive outside. The gradient of the residuals is analytic.
 
-Fit of the cone. The fit is Gauss-Newton. Huber's weights, and zero weight beyond five standard deviations,
-exclude clouds, glare and the ends of the terminator. The standard deviation is that of the points (from the
-median of their residuals) if it exceeds the stated one. Parameters that the limb does not determine (its
-height, the rotation about nadir, the altitude) have a prior, so the covariance includes their uncertainty.
+Fit of the cone: the fit is a Gauss-Newton iteration. Huber's weights, and zero weight beyond five standard
+deviations, exclude clouds, glare and the ends of the terminator. The standard deviation is estimated from the
+median of the residuals if this estimate exceeds the stated standard deviation. The limb height, the rotation
+about nadir and the altitude, which the limb does not determine, have a prior, so that the covariance includes
+their uncertainty.
 
-Brightness profile. A line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H),
-t0 = t_v sqrt(2 pi R/H), with t_v the vertical depth of Rayleigh scattering and H the scale height of the air.
-Below the surface the line ends on the ground, at the elevation whose sine is sqrt(-2h/R). Sunlit air has the
-brightness 1 - exp(-t); the ground, of any brightness, is attenuated by exp(-t). Without blur the brightness
-falls fastest where t = 1, at 15.4 km. Refraction is neglected: it lowers the apparent limb by 1 to 2 km,
-within `HorizonSettings.limb_height_sigma`.
+Brightness profile: a line of sight with tangent height h passes the optical depth t(h) = t0 exp(-h/H) with
+t0 = t_v sqrt(2 pi R/H), where t_v is the vertical optical depth of Rayleigh scattering, R the Earth's radius
+and H the scale height of the air. A line of sight with h < 0 ends on the ground, where its elevation has the
+sine sqrt(-2h/R). The brightness of sunlit air is 1 - exp(-t), and the air attenuates the ground by exp(-t).
+Without blur, the brightness falls fastest where t = 1, at a tangent height of 15.4 km. Refraction is
+neglected. It lowers the apparent limb by 1 to 2 km, which is within `HorizonSettings.limb_height_sigma`.
 
-Fit of the profile. The profile across an edge is background + a air(h) + b ground(h), where h falls by a
-known number of metres per pixel. The position of unit optical depth is fitted together with the three
-brightnesses. In contrast to the steepest point, this position is not shifted inwards by bright ground behind
-the limb or outwards by haze.
+Fit of the profile: the brightness profile across an edge is background + a air(h) + b ground(h), where the
+tangent height h falls by a known number of metres per pixel. The position of unit optical depth is fitted
+together with the background and the factors a and b. In contrast to the steepest point, this position is not
+shifted inwards by bright ground behind the limb or outwards by haze.
 """
 
 from __future__ import annotations
@@ -42,11 +44,11 @@ MEAN_RADIUS = (2.0 * SEMI_MAJOR_AXIS + SEMI_MINOR_AXIS) / 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipsoid:
-    """A spheroid about the origin.
+    """A spheroid centred on the origin.
 
     Attributes:
-        pole: unit vector along the axis (3,).
-        equatorial, polar: semi-axes, m.
+        pole: unit vector (3,) along the axis of the spheroid.
+        equatorial, polar: semi-axes of the spheroid, m.
     """
 
     pole: FloatArray
@@ -58,15 +60,15 @@ class Ellipsoid:
         return self._along_axes(1.0 / (self.equatorial + height), 1.0 / (self.polar + height))
 
     def shape(self, height: float = 0.0) -> FloatArray:
-        """Return the inverse (3, 3) of `stretching`, which maps the unit sphere to the surface."""
+        """Return the inverse (3, 3) of `stretching`, which transforms the unit sphere into the ellipsoid."""
         return self._along_axes(self.equatorial + height, self.polar + height)
 
     def stretching_by_height(self, height: float = 0.0) -> FloatArray:
-        """Return the derivative (3, 3) of `stretching` by the height."""
+        """Return the derivative (3, 3) of `stretching` with respect to the height, 1/m^2."""
         return self._along_axes(-1.0 / (self.equatorial + height) ** 2, -1.0 / (self.polar + height) ** 2)
 
     def height_of(self, position: FloatArray) -> float:
-        """Return the height above the surface, m, of a position (3,), along its own radius."""
+        """Return the height of a position (3,) above the surface, m, measured along the radius."""
         distance = float(np.linalg.norm(position))
         return distance - distance / float(np.linalg.norm(self.stretching() @ position))
 
@@ -85,18 +87,18 @@ def mean_sphere() -> Ellipsoid:
 
 
 PARAMETERS = 5
-"""Number of parameters: small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
+"""Number of fitted parameters: small rotation in camera axes (3, rad), limb height (m), altitude (m)."""
 LIMB_HEIGHT, ALTITUDE = 3, 4
-"""Indices of limb height and altitude among the parameters."""
+"""Indices of limb height and altitude among the fitted parameters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbView:
-    """Position and attitude of a camera, and the height of the limb that it images.
+    """Position and attitude of a camera, and the apparent height of the limb.
 
     Attributes:
-        rotation: rotation matrix (3, 3), inertial into camera axes.
-        position: position (3,), m, inertial axes.
+        rotation: rotation matrix (3, 3) from inertial to camera axes.
+        position: position (3,) of the camera, m, inertial axes.
         surface: surface of the Earth, without atmosphere.
         limb_height: height above the surface, m, at which the limb appears.
     """
@@ -108,7 +110,7 @@ class LimbView:
 
     @property
     def nadir(self) -> FloatArray:
-        """The direction (3,) to the Earth's centre, camera axes."""
+        """The unit vector (3,) to the Earth's centre, camera axes."""
         return np.asarray(-(self.rotation @ self.position) / math.sqrt(self.position @ self.position))
 
     @property
@@ -117,7 +119,7 @@ class LimbView:
         return math.sqrt(max(float(self.position @ self.position) - self.surface.equatorial**2, 1.0))
 
     def moved(self, step: FloatArray) -> LimbView:
-        """Return the view after a step (5,) of the parameters."""
+        """Return the view changed by a step (5,) of the fitted parameters."""
         distance = float(np.linalg.norm(self.position))
         return LimbView(
             turn(step[:3]) @ self.rotation,
@@ -128,7 +130,7 @@ class LimbView:
 
 
 def turn(vector: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) that rotates vectors by |vector| rad about `vector` (3,) (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad, by Rodrigues' formula."""
     # For a single vector, Python floats are ten times as fast as numpy arrays.
     x, y, z = vector.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
@@ -146,7 +148,7 @@ def turn(vector: FloatArray) -> FloatArray:
 
 
 def limb_residuals(view: LimbView, rays: FloatArray) -> FloatArray:
-    """Return the angles (n,), rad, by which unit rays (n, 3), camera axes, lie outside the limb."""
+    """Return the angles (n,), rad, by which unit vectors (n, 3) in camera axes lie outside the limb."""
     stretching = view.surface.stretching(view.limb_height)
     centre = -(stretching @ view.position)
     size = math.sqrt(centre @ centre)
@@ -161,7 +163,7 @@ _AFTER, _BEFORE = [1, 2, 0], [2, 0, 1]
 
 
 def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the residuals (n,) of rays (n, 3) and their gradients (n, 5) by the parameters."""
+    """Return the residuals (n,) of rays (n, 3), rad, and their gradients (n, 5) by the fitted parameters."""
     stretching = view.surface.stretching(view.limb_height)
     by_height = view.surface.stretching_by_height(view.limb_height)
     centre = -(stretching @ view.position)
@@ -172,8 +174,8 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     lengths = np.sqrt(np.einsum("ij,ij->i", stretched, stretched))
     cosine = stretched @ towards / lengths
     sine = np.sqrt(1.0 - cosine * cosine)
-    # The derivative by the stretched ray is transformed into camera axes.
-    # The permuted columns for a cross product are computed at the same time.
+    # The derivative with respect to the scaled ray is transformed into camera axes.
+    # The same product also gives the permuted components that a cross product needs.
     slope = (stretched * (cosine / lengths)[:, None] - towards) / (lengths * sine)[:, None]
     back = to_stretched.T
     by_ray = slope @ np.concatenate(
@@ -182,7 +184,7 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
     gradients = np.empty((len(rays), PARAMETERS))
     # A rotation d of the camera displaces a fixed direction u by -d x u.
     gradients[:, :3] = by_ray[:, :3] * rays[:, _BEFORE] - by_ray[:, 3:6] * rays[:, _AFTER]
-    # Derivative of the half-angle arcsin(1 / size) by the distance of the centre.
+    # This is minus the derivative of the half-angle arcsin(1 / size) with respect to the centre's distance.
     by_size = 1.0 / (size * math.sqrt(size * size - 1.0))
     step = -(by_height @ view.position)
     along = float(towards @ step)
@@ -197,20 +199,20 @@ def limb_gradients(view: LimbView, rays: FloatArray) -> tuple[FloatArray, FloatA
 
 _MOST_STEPS = 10
 _LAST_STEP = 3e-5
-"""Step (rad) that ends the iteration: an eightieth of a pixel."""
+"""Largest rotation (rad) in the last step of the iteration, about an eightieth of a pixel."""
 _SAME_GRADIENTS = 3e-3
-"""Step (rad) below which the gradients change by less than 1 % and are not computed again."""
+"""Rotation step (rad) below which the gradients change by less than 1 % and are not computed again."""
 _HUBER, _BEYOND = 1.5, 5.0
-"""Residuals, in standard deviations, from which Huber's weights fall and beyond which they are zero."""
+"""Residuals, in standard deviations, above which Huber's weights decrease and above which they are zero."""
 _MOST_CORRELATED = 0.8
 """Largest assumed correlation between neighbouring residuals."""
 UNKNOWN = 1e9
-"""Standard deviation (m) of an unknown height."""
+"""Standard deviation (m) of an unknown altitude or height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """Standard deviations of the initial view: rotation about nadir (rad), limb height and altitude (m)."""
+    """Standard deviations of the rotation about nadir (rad), the limb height (m) and the altitude (m)."""
 
     azimuth: float
     limb_height: float
@@ -219,13 +221,13 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedLimb:
-    """A view fitted to edges.
+    """A limb fitted to edges.
 
     Attributes:
-        view: the fitted view.
-        covariance: covariance (5, 5) of the parameters.
-        residuals: residuals (n,), rad, positive outside the limb.
-        used: which edges lie within five standard deviations (n,).
+        view: fitted position and attitude of the camera and height of the limb.
+        covariance: covariance (5, 5) of the fitted parameters.
+        residuals: angles of the edges from the fitted limb (n,), rad, positive outside the limb.
+        used: which edges lie within five standard deviations of the limb (n,).
     """
 
     view: LimbView
@@ -241,14 +243,15 @@ class FittedLimb:
         return np.asarray(cross @ self.covariance[:3, :3] @ cross.T)
 
     def altitude_sigma(self, allowance: float) -> float:
-        """Return the standard deviation of the altitude, m, with an `allowance` for unmodelled effects."""
+        """Return the altitude's standard deviation, m, with an `allowance`, m, for unmodelled effects."""
         return float(np.hypot(np.sqrt(self.covariance[ALTITUDE, ALTITUDE]), allowance))
 
 
 def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior) -> FittedLimb | None:
-    """Return the limb through rays (n, 3) with standard deviations `sigma` (n,), rad, from a view near it.
+    """Return the limb fitted to rays (n, 3) with standard deviations `sigma` (n,), rad.
 
-    Returns None if the edges do not determine the nadir, or the fit diverges.
+    The iteration begins at the view `start`. Returns None if the rays do not determine the nadir, or if the
+    fit diverges.
     """
     information = _information(start, prior)
     view, moved = start, np.zeros(PARAMETERS)
@@ -278,14 +281,14 @@ def fit_limb(start: LimbView, rays: FloatArray, sigma: FloatArray, prior: Prior)
 def shared_error(
     fit: FittedLimb, rays: FloatArray, sigma: FloatArray, prior: Prior, groups: IntArray, error: FloatArray
 ) -> FloatArray:
-    """Return the covariance (5, 5) that errors shared by all points of a group add to that of a fit.
+    """Return the covariance (5, 5) of a fit's parameters due to errors that all rays of a group share.
 
     Args:
-        fit: the fit, which weights its points as if their errors were independent.
+        fit: the fitted limb, whose covariance assumes independent errors of the rays.
         rays: the fitted rays (n, 3).
-        sigma: their standard deviations (n,), rad.
+        sigma: standard deviations of the rays (n,), rad.
         prior: the prior of the fit.
-        groups: number of the group of each ray (n,), from 0.
+        groups: index of the group of each ray (n,).
         error: standard deviation of the shared error of each group (groups,), rad.
     """
     _, gradients = limb_gradients(fit.view, rays)
@@ -299,9 +302,9 @@ def shared_error(
 def stepped(
     start: LimbView, residuals: FloatArray, gradients: FloatArray, sigma: FloatArray, prior: Prior
 ) -> LimbView | None:
-    """Return the view after one step of `fit_limb`, from given residuals (n,) and gradients (n, 5).
+    """Return the view after one Gauss-Newton step, from given residuals (n,) and gradients (n, 5).
 
-    Returns None if the equations are singular, or the camera would lie inside the Earth.
+    Returns None if the equations are singular, or if the step places the camera inside the Earth.
     """
     weighted = gradients * _weights(residuals, sigma)[0][:, None]
     step = _solved(weighted.T @ gradients + _information(start, prior), -(weighted.T @ residuals))
@@ -310,7 +313,7 @@ def stepped(
 
 
 def _information(start: LimbView, prior: Prior) -> FloatArray:
-    """Return the prior information (5, 5) about the parameters."""
+    """Return the information matrix (5, 5) of the prior."""
     nadir = start.nadir
     information = np.zeros((PARAMETERS, PARAMETERS))
     information[:3, :3] = np.outer(nadir, nadir) / prior.azimuth**2
@@ -320,7 +323,7 @@ def _information(start: LimbView, prior: Prior) -> FloatArray:
 
 
 def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the weights (n,), rad^-2, of residuals (n,), and which edges have any weight (n,)."""
+    """Return the weights (n,), rad^-2, of residuals (n,), and which weights are not zero (n,)."""
     scaled = np.abs(residuals) / sigma
     middle = len(scaled) // 2
     spread = max(1.0, MAD_TO_SIGMA * float(np.partition(scaled, middle)[middle]))
@@ -331,17 +334,18 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, Bool
 
 
 def _correlation_factor(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
-    """Return the factor by which correlation raises the variance of the mean of residuals `scaled` (n,).
+    """Return the factor by which correlation of the residuals increases the variance of their mean.
 
-    Clouds and coasts behind the limb shift neighbouring points together. For a first-order process with the
-    correlation r between neighbours around the limb, the factor is (1 + r)/(1 - r).
+    Clouds and coasts behind the limb displace neighbouring points in the same direction. For a first-order
+    process with the correlation r between neighbours around the limb, the factor is (1 + r)/(1 - r). The
+    residuals `scaled` (n,) are in standard deviations.
     """
     square = float(scaled @ scaled)
     if len(scaled) < 3 or square == 0.0:
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # The order starts after the widest gap, because the points on both sides of it are not neighbours.
+    # The order starts after the widest gap, because points on opposite sides of a gap are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]
@@ -363,7 +367,7 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
 
 
 def _is_outside(view: LimbView) -> bool:
-    """Return whether the camera is outside of the surface on which the limb lies."""
+    """Return whether the camera is outside the surface on which the limb lies."""
     if view.surface.polar + view.limb_height <= 0.0:
         return False
     stretched = view.surface.stretching(view.limb_height) @ view.position
@@ -371,30 +375,29 @@ def _is_outside(view: LimbView) -> bool:
 
 
 SCALE_HEIGHT = 8000.0
-"""Scale height of the lower air (m; US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
+"""Scale height of the lower air, m (US Standard Atmosphere 1976: 8.4 km at the ground, 6.4 km at 15 km)."""
 _VERTICAL_DEPTH = 0.097
-"""Vertical optical depth of the whole air at 550 nm (Bucholtz 1995, Appl. Opt. 34, 2765, Table 3)."""
+"""Vertical optical depth of the atmosphere at 550 nm (Bucholtz 1995, Appl. Opt. 34, 2765, Table 3)."""
 UNIT_DEPTH_HEIGHT = SCALE_HEIGHT * math.log(
     _VERTICAL_DEPTH * math.sqrt(2.0 * math.pi * SEMI_MAJOR_AXIS / SCALE_HEIGHT)
 )
 """Tangent height (m), 15.4 km, at which the optical depth along the line of sight is one."""
 
 _LOWEST, _HIGHEST, _STEP = -320e3, 240e3, 500.0
-"""Tangent heights of the table: first, last and step (m)."""
+"""Lowest and highest tangent height of the brightness table, and the step between its heights (m)."""
 _SHARPEST, _BROADEST, _WIDTHS = 500.0, 50e3, 61
-"""Smallest and largest standard deviation of the blur in the table (m), and number of logarithmically spaced
-values."""
+"""Smallest and largest blur in the brightness table (standard deviation, m), and number of blurs."""
 
 
 def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return the brightness of air and of ground, and their slopes per m, (4, n, k), at tangent heights.
+    """Return the brightness of air and of ground, and their slopes per m, at tangent heights, as (4, n, k).
 
-    Sunlit air of infinite depth and ground without air have the brightness 1. The blur is rounded to the
-    nearest of the table, which are 8 % apart.
+    Sunlit air of infinite optical depth and ground without air have the brightness 1. The blur is rounded to
+    the nearest blur of the table; neighbouring blurs of the table differ by 8 %.
 
     Args:
-        heights: tangent heights (n, k), m.
-        blur: standard deviation of the Gaussian blur of each line (n,), m.
+        heights: tangent heights along n scan lines (n, k), m.
+        blur: standard deviation of the Gaussian blur of each scan line (n,), m.
     """
     table = _limb_table()
     width = np.log(np.clip(blur, _SHARPEST, _BROADEST) / _SHARPEST) / math.log(_BROADEST / _SHARPEST)
@@ -408,9 +411,9 @@ def limb_light(heights: FloatArray, blur: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def _limb_table() -> FloatArray:
-    """Return the brightness of air and of ground, and their slopes per m, (4, widths, heights)."""
+    """Return the brightness of air and of ground and their slopes per m, as (4, blurs, heights)."""
     heights = np.arange(_LOWEST, _HIGHEST, _STEP)
-    # Below the surface: the optical depth from the ground outwards, by the trapezium rule.
+    # For tangent heights below the surface, the optical depth from the ground outwards is integrated.
     sines = np.sqrt(np.maximum(-2.0 * heights / SEMI_MAJOR_AXIS, 0.0))
     way = np.linspace(0.0, 1200e3, 601)
     above = (
@@ -431,7 +434,10 @@ def _limb_table() -> FloatArray:
 
 
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
-    """Return the profile (m,), extended beyond its ends, after Gaussian blurs `widths` (k,), m, as (k, m)."""
+    """Return a profile (m,) after Gaussian blurs with standard deviations `widths` (k,), m, as (k, m).
+
+    Beyond its ends the profile is continued with its end values.
+    """
     margin = int(4.0 * _BROADEST / _STEP)
     padded = np.pad(profile, margin, mode="edge")
     frequency = 2.0 * np.pi * np.fft.rfftfreq(len(padded), _STEP)
@@ -441,9 +447,9 @@ def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
 
 _PROFILE_STEPS = 2
 _OUTSIDE, _INSIDE = -8.0, 4.0
-"""Ends of the part of the profile that is fitted, px from the steepest point."""
+"""Limits of the fitted section of the profile, in px from the steepest point towards the bright side."""
 _FLOOR, _SHARE = 0.02, 0.08
-"""Noise of a sample: fractions of the limb's brightness and of the sample's own brightness."""
+"""Noise of a sample: a fraction of the profile's maximum plus a fraction of the sample's own brightness."""
 _FARTHEST = 2.0
 """Largest distance (px) of the fitted limb from the steepest point."""
 _LEAST_SAMPLES = 7
@@ -452,13 +458,13 @@ _LEAST_SAMPLES = 7
 def fit_profiles(
     profiles: FloatArray, steps: FloatArray, metres: FloatArray, blur: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return the limb positions (n,), px, their standard deviations (n,), px, and which are valid (n,).
+    """Return the limb positions on n scan lines, px, their standard deviations, px, and which are valid.
 
     Args:
-        profiles: brightness along n scan lines (n, m); NaN where a line has no sample.
-        steps: positions of the samples (n, m), px, towards the bright side; the results use this scale.
-        metres: tangent height per pixel (n,), m.
-        blur: standard deviation of the blur (n,), m.
+        profiles: brightness along n scan lines (n, m); NaN for missing samples.
+        steps: positions of the samples (n, m), px, towards the bright side, relative to the edge.
+        metres: change of the tangent height per pixel on each scan line (n,), m.
+        blur: standard deviation of the blur on each scan line (n,), m.
     """
     usable = np.isfinite(profiles) & (steps >= _OUTSIDE) & (steps <= _INSIDE)
     light = np.where(usable, profiles, 0.0)
@@ -476,7 +482,7 @@ def fit_profiles(
         heights = UNIT_DEPTH_HEIGHT - (steps - place[:, None]) * metres[:, None]
         air, ground, air_slope, ground_slope = limb_light(heights, blur)
         if not amounts.any():
-            # The brightnesses of background, air and ground that fit best at the initial position.
+            # The brightnesses of background, air and ground are first fitted at the initial position.
             columns = np.stack([np.ones_like(air), air, ground], axis=2)
             weighted = (columns * weights[:, :, None]).transpose(0, 2, 1)
             amounts = np.linalg.solve(weighted @ columns + np.eye(3), weighted @ light[:, :, None])[:, :, 0]

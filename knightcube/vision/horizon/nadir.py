@@ -4,15 +4,17 @@
     if solution:
         filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
 
-`find_nadir` finds edges on scan lines and cones on which many of them agree, fits the ellipsoid's limb to
-each, and tests each fit against chance, the breadth of the air, the brightness of the whole image, the coarse
-sensors and the rough attitude. A single consistent fit is the result; several are ambiguous; without one the
-image is refused with the reason.
+`find_nadir` finds edges on scan lines and cones with which many edges agree, and fits the ellipsoid's limb to
+the edges of each cone. Each fitted limb is tested against chance edges, the width of the atmosphere's
+brightness profile, the brightness of the whole image, the coarse sensors and the rough attitude. If a single
+limb passes all tests, it gives the nadir. If several limbs pass, the image is ambiguous. If no limb passes,
+the image is refused and the reason is stated.
 
-`nadir_of_cameras` searches each image alone (Meller et al., chapter 4: three or four cameras). The nadirs of
-different cameras must agree; an image that gave none, or several, is searched again with the nadir of the
-other cameras known. One limb is then fitted to the points of all images: the unknown height of the air shifts
-every limb outwards, which shifts nadir only if a single side of the limb is visible.
+`nadir_of_cameras` first searches each image alone (Meller et al., chapter 4, use three or four cameras). The
+nadirs of different cameras must agree. An image that gave no nadir, or several, is searched again with the
+nadir of the other cameras as prior knowledge. One limb is then fitted to the limb points of all images. The
+unknown height of the air displaces every limb outwards, which displaces nadir only if a single side of the
+limb is visible.
 """
 
 from __future__ import annotations
@@ -63,11 +65,11 @@ class HorizonStatus(Enum):
 
     FOUND = "found"
     AMBIGUOUS = "ambiguous"
-    """Several fits are possible, or the fit may be the terminator; see `candidates`."""
+    """Several horizons fit the image; `HorizonSolution.candidates` lists them."""
     NO_HORIZON = "no-horizon"
-    """The image has too few edges, or its edges lie on no common horizon."""
+    """The image has too few edges, or its edges do not lie on a common horizon."""
     REFUSED = "refused"
-    """A horizon was fitted but contradicts prior knowledge; see `reason`."""
+    """A horizon was fitted but contradicts the image or prior knowledge; `reason` states how."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,8 +78,8 @@ class NadirMeasurement:
 
     Attributes:
         direction: unit vector (3,) towards the Earth's centre (geocentric nadir), camera axes.
-        covariance: covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction.
-        altitude: height above the ellipsoid, or above the mean sphere, m. It is fitted if it is unknown.
+        covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction (rank 2).
+        altitude: height above the ellipsoid, or above the mean sphere if the position is unknown, m.
         altitude_sigma: standard deviation of the altitude, m.
         residual: rms distance of the used points from the fitted horizon, px.
         used: number of points on the horizon.
@@ -92,35 +94,35 @@ class NadirMeasurement:
 
     @property
     def basis(self) -> FloatArray:
-        """Two unit vectors (2, 3) normal to the direction and to each other."""
+        """Two unit vectors (2, 3) normal to the nadir direction and to each other."""
         return tangent_basis(self.direction)
 
     @property
     def tangent_covariance(self) -> FloatArray:
-        """The covariance (2, 2), rad^2, along `basis`."""
+        """The covariance (2, 2) of the nadir direction along the two vectors of `basis`, rad^2."""
         return np.asarray(self.basis @ self.covariance @ self.basis.T)
 
     @property
     def sigma(self) -> float:
-        """The root of the mean variance over the two axes, rad."""
+        """The rms standard deviation per axis of the nadir direction, rad."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonSolution:
-    """The outcome of one image. It is true (`if solution:`) if a nadir was found.
+    """The result of the horizon search in one image, which is true (`if solution:`) if a nadir was found.
 
     Attributes:
-        status: the outcome.
-        reason: why there is no nadir, in one sentence; empty with a nadir.
-        nadir: the measurement; None unless the status is FOUND.
-        candidates: the horizons that were not chosen; all of them if the status is AMBIGUOUS.
-        points: all edges from dark to bright (n, 2), px.
-        on_horizon: whether the fit used each edge (n,).
-        limb: fitted directions of the used edges (k, 3), unit vectors in camera axes.
-        limb_sigma: standard deviations of these directions normal to the limb (k,), rad.
-        view: position and attitude of the camera by the best fit, accepted or not; None without a fit.
-        pixels_read: number of pixels read.
+        status: outcome of the search.
+        reason: why no nadir was found, in one sentence; empty if a nadir was found.
+        nadir: the measured nadir; None unless the status is FOUND.
+        candidates: the horizons that were not selected, or all horizons if no nadir was found.
+        points: positions of all edges from dark to bright (n, 2), px.
+        on_horizon: which edges lie on the best horizon (n,).
+        limb: unit vectors (k, 3) to the limb points on the best horizon, camera axes.
+        limb_sigma: standard deviations of the limb points normal to the limb (k,), rad.
+        view: position and attitude of the camera from the best fit, even if refused; None without a fit.
+        pixels_read: number of pixels that the search read.
     """
 
     status: HorizonStatus
@@ -140,24 +142,25 @@ class HorizonSolution:
 
 
 _WIDER = 2.0
-"""Ratio of the altitude range of the search for cones to the range of an unknown altitude. The search needs a
-wider range, because a cone through three edges is inaccurate."""
+"""Factor by which the altitude range for cones is wider, because a cone through three edges is inaccurate."""
 _MOST_ALTITUDE = 3.0
-"""Largest distance of a fitted altitude from the range of an unknown altitude, in standard deviations."""
+"""Largest distance of a fitted altitude from `HorizonSettings.altitudes`, in standard deviations."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
-"""Largest fraction of bright samples in sky and night, minimum coverage of the lit limb, and largest fraction
-of the limb's points that lie in the night."""
+"""Limits of the tests of a horizon.
+
+The values are the largest fraction of bright samples in the sky and on the night side, the minimum coverage
+of the sunlit limb by edges, and the largest fraction of limb points on the night side.
+"""
 _RIVAL = 0.3
-"""Fraction of the best horizon's edges from which a second horizon, or that of other cameras, makes the
-result ambiguous."""
+"""Fraction of the best horizon's edges above which a second horizon makes the result ambiguous."""
 _SAME = np.radians(1.0)
-"""Angle (rad) below which two nadirs of one image count as the same."""
+"""Angle (rad) below which two nadirs in one image count as the same nadir."""
 _MOST_CHANCE = -6.0
-"""Largest log10 of the expected number of cones that chance edges fit equally well."""
+"""Largest accepted log10 of the expected number of cones that chance edges fit as well as a horizon."""
 _BREADTH = 0.125, 2.0
 """Minimum and maximum ratio of the width of the limb's edges to the width expected from the air."""
 _GAIN = 1.5
-"""Minimum ratio by which the number of edges on a horizon must increase with three times as many lines."""
+"""Minimum ratio by which a second search on more scan lines must increase the number of horizon edges."""
 
 
 def find_nadir(
@@ -166,22 +169,22 @@ def find_nadir(
     knowledge: HorizonKnowledge | None = None,
     settings: HorizonSettings | None = None,
 ) -> HorizonSolution:
-    """Return the nadir from the Earth's limb in an image, or the reason why there is none.
+    """Return the nadir from the Earth's limb in an image, or the reason why no nadir is found.
 
-    Few columns and rows are read first. More lines are read near a horizon of few edges, and everywhere if no
-    horizon is found among the edges.
+    The first search reads few columns and rows. If it finds a horizon of few edges, more columns and rows are
+    read near this horizon; if it finds no horizon, more are read in the whole image.
 
     Args:
         image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
-        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size.
-        knowledge: prior knowledge of position, altitude, Sun and attitude; None: none. Without position and
-            altitude the altitude is fitted too.
-        settings: settings of the search; None: the defaults.
+        camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`.
+        knowledge: prior knowledge of position, altitude, Sun and attitude. If it contains neither position
+            nor altitude, the altitude is fitted too.
+        settings: settings of the search; None for the defaults.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
 
-    Source: Meller et al., chapter 3; the fit follows Christian & Robinson 2016 (`limb`).
+    Source: Meller et al., chapter 3; the fit of the limb follows Christian & Robinson 2016.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     check_image(image, camera)
@@ -198,7 +201,7 @@ def find_nadir(
         read += closer.read
         second = closer.solution()
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
-            # The first search has already compared the horizon with its rivals.
+            # The first search has already compared this horizon with the other horizons.
             return replace(second, candidates=found.candidates, pixels_read=read)
     second = _search(image, camera, knowledge, again).solution()
     return replace(second, pixels_read=read + second.pixels_read)
@@ -206,7 +209,14 @@ def find_nadir(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """One search: its edges, brightness levels, hypotheses (the best first), and number of pixels read."""
+    """One horizon search in an image.
+
+    Attributes:
+        observation: edges and sampled pixels as directions.
+        levels: brightness levels of dark and bright pixels.
+        hypotheses: horizons found, the best first.
+        read: number of pixels read.
+    """
 
     observation: Observation
     levels: Levels
@@ -214,12 +224,12 @@ class _Search:
     read: int
 
     def solution(self) -> HorizonSolution:
-        """Return the result of this search."""
+        """Return the result of the horizon search."""
         points, hypotheses = self.observation.edges.points, self.hypotheses
         if not hypotheses:
             return HorizonSolution(
                 HorizonStatus.NO_HORIZON,
-                f"{len(points)} edges lie on no horizon better than chance edges would",
+                f"no significant horizon among {len(points)} edges",
                 points=points,
                 on_horizon=np.zeros(len(points), dtype=bool),
                 pixels_read=self.read,
@@ -247,7 +257,7 @@ class _Search:
 def _search(
     image: Image, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
 ) -> _Search:
-    """Return the search of a whole image."""
+    """Search a whole image for horizons."""
     edges, lines = find_edges(image, settings.edges)
     observation = observe(edges, lines, camera)
     hypotheses = _hypotheses(observation, place_of(knowledge, settings), knowledge, settings, camera)
@@ -261,12 +271,12 @@ def _closer_search(
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
 ) -> _Search:
-    """Return the best horizon of a search again, with more lines across it."""
+    """Search an image again near the best horizon of a first search, on more scan lines."""
     best, before = search.hypotheses[0], search.observation
     points = before.edges.points[best.members]
     box = np.stack([points.min(axis=0) - before.space, points.max(axis=0) + before.space])
     edges, lines = find_edges(image, settings.edges, ImagePart(box, search.levels))
-    # The samples of the first search have already tested the brightness of the whole image.
+    # The samples of the first search are used again, because they cover the whole image.
     observation = observe(edges, lines, camera, before.samples)
     members = near_limb(best.fit.view, observation, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
@@ -282,7 +292,7 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return the horizons fitted to the cones that the most edges agree on, the best first."""
+    """Return the horizons fitted to the cones with which most edges agree, the best first."""
     if place is None:
         least, most = settings.altitudes
         low, high = (above_sphere(altitude).cosine for altitude in (least / _WIDER, most * _WIDER))
@@ -291,7 +301,7 @@ def _hypotheses(
     free = np.ones(len(observation.edges), dtype=bool)
     sound: list[Hypothesis] = []
     contradicted: list[InitialGuess] = []
-    # Cones too small to rival an accepted horizon are skipped.
+    # Cones with too few edges to make an accepted horizon ambiguous are skipped.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:
@@ -310,14 +320,14 @@ def _hypotheses(
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
-        # Guesses that contradict prior knowledge are fitted only to state the reason of the refusal.
+        # Guesses that contradict prior knowledge are fitted only in order to report why they are refused.
         fitted = (examine(each, observation, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
 
 
 def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
-    """Return status and reason for hypotheses, the best first."""
+    """Return the status of the search, and its reason, from the hypotheses in order of quality."""
     best = hypotheses[0]
     flaw = _flaw(best)
     if flaw:
@@ -336,29 +346,29 @@ def _angle(one: FloatArray, other: FloatArray) -> float:
 
 
 def _is_limb(one: Hypothesis) -> bool:
-    """Return whether chance edges do not explain a hypothesis, and its edges are as broad as the air."""
+    """Return whether a horizon is significant and its edges have the width expected from the air."""
     return one.chance < _MOST_CHANCE and _BREADTH[0] < one.breadth < _BREADTH[1]
 
 
 def _flaw(one: Hypothesis) -> str:
-    """Return the reason against a hypothesis, or an empty string."""
+    """Return why a hypothesis is refused, or an empty string if it is accepted."""
     light = one.lighting
     if one.guess.orientation.mismatch > MOST_MISMATCH:
-        return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"
+        return f"the nadir contradicts a coarse direction by {one.guess.orientation.mismatch:.1f} sigma"
     if one.altitude_off > _MOST_ALTITUDE:
         altitude = one.fit.view.surface.height_of(one.fit.view.position)
-        return f"a limb of that size is seen from {1e-3 * altitude:.0f} km: give the altitude if so"
+        return f"the limb implies an altitude of {1e-3 * altitude:.0f} km: give the altitude if this is right"
     if light.stray > _STRAY:
-        return f"{100.0 * light.stray:.0f} % of sky and night are bright"
+        return f"{100.0 * light.stray:.0f} % of the sky and the night side are bright"
     if one.coverage < _COVERED:
-        return f"only {100.0 * one.coverage:.0f} % of the lit limb in view show an edge"
+        return f"only {100.0 * one.coverage:.0f} % of the sunlit limb in the image show an edge"
     if one.night > _NIGHT:
-        return f"{100.0 * one.night:.0f} % of the horizon's points lie in the night"
+        return f"{100.0 * one.night:.0f} % of the horizon's points lie on the night side"
     return ""
 
 
 def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residual: float) -> NadirMeasurement:
-    """Return the nadir of a fit; `located` is whether the position of the camera is known."""
+    """Return the nadir of a fitted limb; `located` states whether the camera's position is known."""
     view = fit.view
     return NadirMeasurement(
         view.nadir,
@@ -371,15 +381,17 @@ def _measurement(fit: FittedLimb, covariance: FloatArray, located: bool, residua
 
 
 _IMPROBABLE = 1e-6
-"""Probability below which the nadirs of two cameras differ significantly."""
+"""Probability of the difference between two cameras' nadirs below which the nadirs disagree."""
 _COMMON = 2.0
-"""Largest ratio of the variance of the difference of two nadirs to the sum of their variances. It exceeds 1,
-because an unknown height of the air shifts the nadirs of opposite limbs in opposite directions."""
+"""Largest ratio of the variance of the difference of two nadirs to the sum of the variances of the nadirs.
+
+The ratio exceeds 1, because an unknown height of the air displaces the nadirs from opposite limbs in opposite
+directions.
+"""
 _UNKNOWN_TURN = 1.0
 """Prior standard deviation of an unknown rotation about nadir (rad)."""
 _OWN_AIR = 400.0
-"""Standard deviation (m) of the limb's height in one image relative to another image, due to different light
-and background."""
+"""Standard deviation (m) of the difference between the limb heights in the images of two cameras."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -387,11 +399,11 @@ class JointNadir:
     """The nadir from the images of several cameras at one instant.
 
     Attributes:
-        status, reason: the outcome, and why there is no nadir.
-        nadir: the measurement in body axes; None unless the status is FOUND.
+        status, reason: outcome of the search, and why no nadir was found.
+        nadir: the measured nadir in body axes; None unless the status is FOUND.
         cameras: indices of the cameras whose limb was used.
-        each: solution of each image, in the axes of its camera.
-        limb_height: fitted height of the limb above the ellipsoid, m; NaN without a measurement.
+        each: solution of each image by the index of its camera, in camera axes.
+        limb_height: fitted height of the limb above the ellipsoid, m; NaN if no nadir was found.
     """
 
     status: HorizonStatus
@@ -404,7 +416,14 @@ class JointNadir:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Vote:
-    """A horizon that a camera proposes: nadir (3,) and covariance (3, 3), body axes; number of its edges."""
+    """A horizon in the image of one camera, as a proposal for the common nadir.
+
+    Attributes:
+        camera: index of the camera.
+        nadir: unit vector (3,) to nadir, body axes.
+        covariance: covariance (3, 3) of nadir, rad^2, body axes.
+        edges: number of edges on the horizon.
+    """
 
     camera: int
     nadir: FloatArray
@@ -421,13 +440,13 @@ def nadir_of_cameras(
     """Return the nadir in body axes from the images of several cameras.
 
     Args:
-        images: images (rows, columns) of one instant, by the numbers of their cameras.
+        images: images (rows, columns) taken at the same instant, by the index of the camera.
         cameras: all cameras of the body.
-        knowledge: prior knowledge as for `find_nadir`, with the axes of the body instead of a camera's.
-        settings: settings of the search.
+        knowledge: prior knowledge as for `find_nadir`, but in body axes instead of camera axes.
+        settings: settings of the search; None for the defaults.
 
     Raises:
-        ValueError: as `find_nadir`.
+        ValueError: if an image does not have the size of its camera, or has pixels that are not finite.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
     each = {
@@ -442,7 +461,7 @@ def nadir_of_cameras(
         return JointNadir(*_why_none(each), None, (), each)
     vote = max(group, key=lambda one: one.edges)
     view = each[vote.camera].view
-    assert view is not None  # a camera with a vote has fitted a horizon
+    assert view is not None  # the camera of a vote has fitted a horizon
     position = knowledge.position if knowledge.position is not None else view.position
     sigma = float(np.sqrt(0.5 * np.trace(vote.covariance)))
     sensed = (*knowledge.sensed, SensedDirection(vote.nadir, -position, _COMMON * sigma))
@@ -462,7 +481,7 @@ def nadir_of_cameras(
 
 
 def _in_camera(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKnowledge:
-    """Return knowledge given in body axes in the axes of a camera."""
+    """Transform prior knowledge from body axes to the axes of a camera."""
     rough = knowledge.attitude
     if rough is not None:
         rough = RoughAttitude(multiply(camera.mounting, rough.quaternion), rough.sigma)
@@ -471,7 +490,7 @@ def _in_camera(camera: MountedCamera, knowledge: HorizonKnowledge) -> HorizonKno
 
 
 def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> list[_Vote]:
-    """Return the horizon found in an image, or all candidates of an ambiguous image."""
+    """Return the nadir found in an image as a vote, or all candidates of an ambiguous image as votes."""
     if solution.nadir is not None:
         left: tuple[NadirMeasurement, ...] = (solution.nadir,)
     else:
@@ -481,9 +500,10 @@ def _votes(number: int, solution: HorizonSolution, camera: MountedCamera) -> lis
 
 
 def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
-    """Return the votes for the nadir with the most cameras and edges, or no vote and the reason.
+    """Return the votes for the nadir on which most cameras agree, or no vote and the reason.
 
-    The candidates of one camera never agree with each other.
+    If two nadirs have the same number of cameras, the nadir with more edges is selected. Two candidates of
+    the same camera never support each other.
     """
     groups = []
     for first in votes:
@@ -498,7 +518,7 @@ def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
     for other in groups[1:]:
         if any(v is w for v in other for w in best) or any(_same(v, w) for v in other for w in best):
             continue
-        # A larger group of cameras outvotes a smaller one.
+        # A smaller group of cameras never makes the result of a larger group ambiguous.
         if len(other) == len(best) and sum(v.edges for v in other) > _RIVAL * count:
             apart = np.degrees(_angle(other[0].nadir, best[0].nadir))
             return [], f"the cameras show two horizons {apart:.1f} deg apart"
@@ -506,7 +526,7 @@ def _agreed(votes: Sequence[_Vote]) -> tuple[list[_Vote], str]:
 
 
 def _same(one: _Vote, other: _Vote) -> bool:
-    """Return whether two nadirs agree within their covariances."""
+    """Return whether the nadirs of two votes agree within their covariances."""
     if float(one.nadir @ other.nadir) < 0.0:
         return False
     across = tangent_basis(one.nadir)
@@ -516,12 +536,12 @@ def _same(one: _Vote, other: _Vote) -> bool:
 
 
 def _why_none(each: Mapping[int, HorizonSolution]) -> tuple[HorizonStatus, str]:
-    """Return status and reason of the image that came nearest to a horizon."""
+    """Return the most favourable status among the cameras' images, and its reason."""
     for status in (HorizonStatus.AMBIGUOUS, HorizonStatus.REFUSED, HorizonStatus.NO_HORIZON):
         for number, solution in each.items():
             if solution.status is status:
                 return status, f"camera {number}: {solution.reason}"
-    return HorizonStatus.NO_HORIZON, "no picture"
+    return HorizonStatus.NO_HORIZON, "no image"
 
 
 def _joint_fit(
@@ -531,7 +551,7 @@ def _joint_fit(
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
 ) -> JointNadir:
-    """Return one limb fitted to the points of all cameras that agree."""
+    """Return the nadir of one limb fitted to the limb points of all agreeing cameras."""
     most = max(numbers, key=lambda number: len(each[number].limb))
     view, camera = each[most].view, cameras[most]
     assert view is not None  # the camera has found a horizon
@@ -546,7 +566,7 @@ def _joint_fit(
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, altitude)
     fit = fit_limb(body, rays, sigma, prior)
     if fit is None:
-        return JointNadir(HorizonStatus.REFUSED, "no limb fits all the cameras", None, (), each)
+        return JointNadir(HorizonStatus.REFUSED, "no limb fits the edges of all cameras", None, (), each)
     groups = np.repeat(np.arange(len(numbers)), [len(each[number].limb) for number in numbers])
     own = np.full(len(numbers), _OWN_AIR / fit.view.limb_distance)
     shared = shared_error(fit, rays, sigma, prior, groups, own)

@@ -1,7 +1,7 @@
-"""Settings of the horizon search, the response of the camera, and prior knowledge for one image.
+"""Settings of the horizon search, the response of the detector, and prior knowledge for one image.
 
-A horizon does not determine the rotation about nadir. The prior knowledge (position, Sun, rough attitude,
-directions from other sensors) resolves it and tests a fitted horizon.
+A horizon does not determine the rotation about nadir. Prior knowledge (position, Sun, rough attitude,
+directions from other sensors) determines this rotation and tests a fitted horizon.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 from knightcube.errors import UsageError
 
 LEAST_ALTITUDE = 50e3
-"""Lowest altitude (m) from which a limb is visible: below, the camera is inside the air."""
+"""Lowest altitude (m) from which a limb is visible; a lower camera is inside the atmosphere."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensedDirection:
-    """A direction known in camera and inertial axes, such as the coarse Sun or the magnetic field.
+    """A direction known in camera and inertial axes, such as the direction of the Sun or the magnetic field.
 
     Attributes:
         camera: measured direction (3,) in camera axes, of any length.
-        inertial: direction (3,) by ephemeris or field model in inertial axes, of any length.
-        sigma: standard deviation per axis, rad.
+        inertial: direction (3,) from an ephemeris or field model in inertial axes, of any length.
+        sigma: standard deviation of the measured direction per axis, rad.
     """
 
     camera: FloatArray
@@ -36,7 +36,12 @@ class SensedDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RoughAttitude:
-    """An attitude (4,), inertial into camera axes, scalar last, and its standard deviation per axis, rad."""
+    """An approximate attitude of a camera.
+
+    Attributes:
+        quaternion: attitude quaternion (4,) from inertial to camera axes, scalar last.
+        sigma: standard deviation of the attitude per axis, rad.
+    """
 
     quaternion: FloatArray
     sigma: float
@@ -47,13 +52,12 @@ class HorizonKnowledge:
     """Optional data from GPS, ephemerides and coarse sensors for one image.
 
     Attributes:
-        position: position (3,), m from the Earth's centre, inertial axes. It gives the altitude and, with
-            `pole`, the limb of the ellipsoid.
-        altitude: height above a sphere of the mean radius, m, if the position is unknown.
+        position: position (3,) of the camera, m from the Earth's centre, inertial axes.
+        altitude: height of the camera above the Earth's mean radius, m, used if the position is unknown.
         sun: direction (3,) to the Sun, inertial axes, of any length.
-        pole: direction (3,) of the Earth's axis, inertial axes.
-        attitude: rough attitude of the camera, for instance predicted by a filter.
-        sensed: directions from coarse sensors.
+        pole: direction (3,) of the Earth's rotation axis, inertial axes.
+        attitude: approximate attitude of the camera, for instance as predicted by a filter.
+        sensed: directions measured by coarse sensors.
 
     Raises:
         ValueError: if a value is not finite, has another shape, or lies inside the Earth.
@@ -81,18 +85,18 @@ class HorizonKnowledge:
 
 @dataclass(frozen=True, slots=True)
 class LogarithmicResponse:
-    """The response counts = pedestal + counts_per_decade log10(1 + light / dark current) of a detector."""
+    """A detector whose counts are pedestal + counts_per_decade log10(1 + light / dark current)."""
 
     pedestal: float
     counts_per_decade: float
 
     def light(self, counts: Image) -> FloatArray:
-        """Return the light of `counts` (...), in units of the dark current."""
+        """Return the light intensity for `counts` (...), in units of the dark current."""
         return np.asarray(10.0 ** ((counts - self.pedestal) / self.counts_per_decade) - 1.0)
 
 
 def light_of(counts: Image, response: LogarithmicResponse | None) -> FloatArray:
-    """Return the light of counts (...) in any unit; without a response, the light is proportional to them."""
+    """Return the light intensity for counts (...), in arbitrary units; `response` None means proportional."""
     if response is None:
         return np.asarray(counts, dtype=float)
     if counts.dtype == np.uint8:
@@ -105,14 +109,17 @@ class EdgeSettings:
     """Settings of the search for edges along scan lines.
 
     Attributes:
-        lines: number of columns, and of rows, that are read.
-        more_lines: the same number for a second search.
-        run: window of the filter that removes short fluctuations, px, odd (Meller 3.1).
-        threshold: threshold of bright pixels, as a fraction of the span from dark to bright pixels.
-        contrast: height of the weakest edge, as a fraction of the same span.
-        most: maximum number of edges per line; the edges with the darkest dark side are kept.
-        psf_sigma: blur of the optics, px.
-        response: response of the detector; None: linear.
+        lines: number of columns, and of rows, that the first search reads.
+        more_lines: number of columns, and of rows, that a second search reads.
+        run: window of the majority filter that removes short fluctuations, px, odd (Meller et al., section
+            3.1).
+        threshold: brightness above which a pixel counts as bright, as a fraction of the range from the dark
+            level to the bright level.
+        contrast: minimum height of an edge, as a fraction of the range from the dark level to the bright
+            level.
+        most: maximum number of edges per scan line; the edges with the darkest dark side are kept.
+        psf_sigma: standard deviation of the blur of the optics, px.
+        response: response of the detector; None for a linear detector.
     """
 
     lines: int = 32
@@ -136,22 +143,25 @@ class EdgeSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HorizonSettings:
-    """Settings of the choice of the horizon among edges, and its assumed errors.
+    """Settings of the search for the horizon among edges, and its assumed errors.
 
     Attributes:
         edges: settings of the search for edges.
         limb_height_sigma: standard deviation of the apparent limb's height, m. The default holds for air of
-            unknown scale height (6.5 to 9.5 km) and haze (a third more or less); 1,000 holds for known air.
-        altitude_sigma: standard deviation of the altitude of a given position, m.
-        altitudes: range of an unknown altitude, m. A disc of any size is the limb from some altitude: the
-            default, for low orbits, excludes logos and lens ghosts.
-        tolerance: distance of an edge from a circular cone, px; it covers the flattening of the Earth.
-        least_edges: minimum number of edges of a horizon.
-        enough_edges: number of edges below which a horizon is searched again on more lines.
-        some_edges: number of edges below which an image is not searched again.
-        candidates: maximum number of horizons searched for in one image.
-        tries: number of pairs or triples of edges tried for each candidate.
-        sphere_sigma: standard deviation per axis, rad, added if the direction of the flattening is unknown.
+            unknown scale height (6.5 to 9.5 km) and unknown haze; use 1,000 m if scale height and haze are
+            known.
+        altitude_sigma: standard deviation of the altitude of a known position, m.
+        altitudes: range of an unknown altitude, m. The default is for low orbits; a range without limits
+            would accept any bright disc as the Earth, for instance a lens ghost.
+        tolerance: largest distance of an edge from a circular cone, px; it must cover the flattening of the
+            Earth.
+        least_edges: minimum number of edges on a horizon.
+        enough_edges: number of edges on a horizon below which the image is searched again on more scan lines.
+        some_edges: number of edges in an image below which the image is not searched again.
+        candidates: maximum number of horizons that are searched for in one image.
+        tries: maximum number of pairs or triples of edges that are tried for each horizon.
+        sphere_sigma: standard deviation per axis, rad, that is added to nadir if the direction of the Earth's
+            flattening is unknown.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)
