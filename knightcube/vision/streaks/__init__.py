@@ -1,9 +1,9 @@
-"""Star streaks in one long exposure: from the pixels to directions and the camera's rate.
+"""Estimation of star directions and of the camera's rate from the star streaks in one long exposure.
 
-The maximum-likelihood estimator fits one rotation and all stars to all pixels. In the order of the
-computation: `frame` (background, noise, regions), `first_guess` (axis and angle of the rotation),
-`faint_stars` (matched filter along the motion), `joint_fit` (motion and stars together, with
-`normal_equations` and `streak_model`), `uncertainty` (covariance) and `estimate`, which runs them all.
-`geometry` describes the paths of the stars. All functions are pure, and their arguments and results can be
-pickled for a worker process.
+The maximum-likelihood estimator fits one camera rotation and the parameters of all stars to all pixels. The
+modules in the order of the computation are `frame` (background, noise and bright regions), `first_guess`
+(axis and angle of the rotation), `faint_stars` (matched filter along the motion), `joint_fit` (simultaneous
+fit of motion and stars, with `normal_equations` and `streak_model`) and `uncertainty` (covariance).
+`estimate` runs all of them. The module `geometry` computes the paths of the stars on the detector. All
+functions of this package are pure, and their arguments and results can be pickled for a worker process.
 """

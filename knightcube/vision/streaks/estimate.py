@@ -1,14 +1,17 @@
-"""The motion over one exposure from all pixels of all its streaks, from the frame to the covariance.
+"""Estimation of the camera's motion during one exposure from all pixels of all star streaks.
 
-Bright regions give first guesses of the motion, which are fitted to the brightest stars. Along each fitted
-motion, a matched filter detects faint stars. The joint fit of the bright stars, with the faint ones accounted
-for, gives the result. A final check requires entire streaks: a rotation that is too small divides streaks
-into pieces, and a rotation that is too large joins several streaks. The functions are pure and deterministic.
+The bright regions of the frame give initial guesses of the motion, and each guess is fitted to the brightest
+stars. A matched filter along each fitted motion then detects faint stars. The result is a joint fit of the
+motion and the bright stars, in which the flux of the faint stars is modelled. A final check verifies that
+each modelled streak matches one complete streak. A rotation that is too small divides a streak into segments,
+and a rotation that is too large joins several streaks. The functions of this module are pure and
+deterministic.
 
-With a rolling shutter, a star that moves down the frame, with the readout, is exposed longer than one that
-moves up: a motion and its time reversal draw streaks of different lengths. A prior rate decides between the
-two directions of time before the fit. Without a prior, both directions are fitted and the stars decide. If
-the stars do not agree, the result lies between the two motions, and its covariance includes both.
+With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
+against it. A motion and its time reversal therefore produce streaks of different lengths. A prior rate
+determines the sign of the rotation before the fit. Without a prior rate, both signs of the rotation are
+fitted, and the better fit is selected. If neither sign fits significantly better, the sign remains unknown.
+The reported rate is then the mean of both fits up to sign, and its covariance includes their difference.
 """
 
 from __future__ import annotations
@@ -78,55 +81,55 @@ from knightcube.vision.streaks.uncertainty import (
     rotation_uncertainty,
 )
 
-# Relative difference of two rotation angles below which they count as the same angle.
+# Relative difference between two rotation angles that count as equal.
 _SAME_ANGLE = 0.05
-# Relative difference of two rotation vectors below which they count as the same motion.
+# Relative difference between two rotation vectors that count as the same motion.
 _SAME_MOTION = 0.005
-# Number of the brightest stars in a first fit.
+# Number of the brightest stars in a preliminary fit of the motion.
 _FIRST_STARS = 12
-# Maximum number of first guesses that are fitted.
+# Maximum number of initial guesses of the motion that are fitted.
 _MOST_GUESSES = 5
-# Maximum number of first guesses with a changing rate.
+# Maximum number of initial guesses with an angular acceleration.
 _MOST_GROWING = 2
-# Maximum number of rotation angles that are taken from the scan of the whole frame.
+# Maximum number of rotation angles from the scan of the whole frame.
 _MOST_ANGLES = 2
-# Maximum number of rounds of the fit of stars at rest.
+# Maximum number of iterations of the fit for a camera at rest.
 _STILL_ROUNDS = 12
-# Minimum number of entire streaks for a guess from streak lengths, without a scan.
+# Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
 _WHOLE = 8
-# Maximum fraction of the light in regions longer than the guess, for a guess without a scan.
+# Maximum fraction of flux in regions that are too long for a guess from streak lengths alone.
 _CONTRADICTED = 0.3
-# Minimum number of stars of a first fit that is accepted without comparison with others.
+# Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
 _MANY = 3
-# Minimum fraction of explained stars in a first fit that is accepted without comparison with others.
+# Minimum fraction of well-fitted stars in a preliminary fit that is accepted without comparison.
 _EXPLAINED = 0.4
-# Minimum fraction of correct streak ends in a first fit that is accepted without comparison.
+# Minimum fraction of confirmed streak ends in a preliminary fit that is accepted without comparison.
 _IN_PLACE = 0.6
-# Minimum explained light (squared standard deviations) of a fit accepted without comparison.
+# Minimum explained chi-square of a preliminary fit that is accepted without comparison.
 _EVIDENT = 3000.0
-# Largest median chi-square per degree of freedom of a first fit that is kept.
+# Largest median chi-square per degree of freedom of a usable preliminary fit.
 _WORST_FIRST = 12.0
-# Fraction of lit pixels above which a frame counts as crowded: its brightest regions are blends.
+# Fraction of pixels above the threshold from which the brightest regions count as blends of stars.
 _CROWDED = 0.05
-# Explained light (squared standard deviations) below which a crowded frame is scanned completely.
+# Explained chi-square below which a frame of blended stars is scanned completely.
 _BEYOND_CROWD = 100_000.0
-# Largest residual of an explained star, relative to its light.
+# Largest residual chi-square of a well-fitted star, relative to the star's squared significance.
 _MOST_RESIDUAL = 0.01
-# Largest significance (standard deviations) with which a star counts as explained light.
+# Upper limit of a star's significance (standard deviations) in the explained chi-square.
 _ENOUGH = 200.0
-# Weight of the light in regions longer than a guess.
-# It is below 1, because a long region may be two streaks.
+# Weight of the flux in regions that are longer than the guessed streak length.
+# The weight is below 1, because a long region may be a blend of two streaks.
 _CONTRADICTION = 0.6
-# Last step (standard deviations) below which a first fit counts as settled.
+# Last step (standard deviations) below which a preliminary fit counts as converged.
 _CALM = 2.0
-# Fraction of correct streak ends that a wrong rotation can reach, by fitting one end of each streak.
+# Fraction of confirmed streak ends that a wrong rotation reaches by matching one end of each streak.
 _ENDS_BY_CHANCE = 0.4
 
 
 def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[StreakFit]:
-    """Yield fits of the brightest stars, likeliest motion first.
+    """Yield preliminary fits of the motion to the brightest stars, most likely motion first.
 
-    `near` (rad) is a prior angle of rotation, None if unknown.
+    `near` (rad) is the rotation angle expected from a prior rate, or None.
     """
     rivals: list[tuple[float, StreakFit]] = []
     yielded: list[FloatArray] = []
@@ -149,7 +152,7 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     if rivals and not yielded:
-        # The regions do not determine the rotation angle, but the light of the whole frame may.
+        # If the bright regions do not determine the rotation angle, a scan of the whole frame may.
         axis = max(rivals, key=lambda rival: rival[0])[1].scene.motion.rotation
         angles = _frame_angles(camera, axis)
         for explained, convincing, done in _rescanned(camera, axis, angles):
@@ -166,9 +169,10 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
 def _likelier(
     camera: FitProblem, regions: BrightRegions, explained: float, done: StreakFit
 ) -> StreakFit | None:
-    """Return a fit from a scan of the whole frame that explains more light than `done`.
+    """Return a fit from a scan of the whole frame that explains more chi-square than the fit `done`.
 
-    The result is None if no fit does, if the frame is not crowded, or if `done` explains enough light.
+    Returns None if the scan finds no better fit, if the frame has few blended stars, or if `done` already
+    explains enough chi-square.
     """
     if regions.lit <= _CROWDED or explained >= _BEYOND_CROWD:
         return None
@@ -190,7 +194,7 @@ def _likelier(
 
 
 def _frame_angles(camera: FitProblem, rotation: FloatArray) -> list[float]:
-    """Return the likeliest angles (rad) about the axis of `rotation` (3,) by a scan of the whole frame."""
+    """Return the likely rotation angles (rad) about the axis of `rotation` (3,) from a whole-frame scan."""
     camera.work.passed(camera.frame.signal.size)
     return frame_angles(camera.frame, camera.pinhole, rotation, _MOST_ANGLES)
 
@@ -198,7 +202,7 @@ def _frame_angles(camera: FitProblem, rotation: FloatArray) -> list[float]:
 def _rescanned(
     camera: FitProblem, rotation: FloatArray, angles: list[float]
 ) -> Iterator[tuple[float, bool, StreakFit]]:
-    """Yield the results of `_tried` for motions about the axis of `rotation` (3,) near `angles` (rad)."""
+    """Yield preliminary fits with rotation angles near `angles` (rad) about the axis of `rotation` (3,)."""
     settings, pinhole = camera.settings, camera.pinhole
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     frame = polar_grid(pinhole, CameraMotion.steady(rotation)).frame
@@ -223,15 +227,15 @@ def _rescanned(
 
 
 def alike(one: FloatArray, other: FloatArray) -> bool:
-    """Return whether two rotations (3,) are the same motion, up to the direction of time."""
+    """Return whether two rotation vectors (3,) are equal or opposite within the tolerance `_SAME_MOTION`."""
     apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
     return float(apart) < _SAME_MOTION * float(np.linalg.norm(one))
 
 
 def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> Iterator[MotionGuess]:
-    """Yield first guesses of the motion, likeliest first.
+    """Yield initial guesses of the motion, most likely guess first.
 
-    They follow from the lengths of entire streaks if there are many, otherwise from a scan.
+    The guesses are derived from streak lengths if many streaks are complete, otherwise from a scan.
     """
     guess = find_axis(regions, camera.pinhole)
     if guess is None:
@@ -251,9 +255,9 @@ def _guesses(camera: FitProblem, regions: BrightRegions, near: float | None) -> 
 
 
 def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakFit] | None:
-    """Fit a guess, and return the light that it explains, whether it needs no comparison, and the fit.
+    """Fit the motion of `guess`; return the explained chi-square, whether the fit is convincing, and the fit.
 
-    The explained light is in squared standard deviations. The result is None if the fit fails.
+    A convincing fit is accepted without comparison with other fits. Returns None if the fit does not succeed.
     """
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
@@ -266,13 +270,13 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
     done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
-    # A wrong rotation angle leaves light unexplained at one end, or models absent light.
+    # A wrong rotation angle leaves a residual at one end of each streak.
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, _LIGHT, _LIGHT], 1e-30)
     residual = done.evaluation.chi2 - done.evaluation.pixels
     good = residual < _MOST_RESIDUAL * light + done.evaluation.pixels
     calm = 1.0 if done.last_step < _CALM else 0.3
     evidence, share = calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
-    # Smaller of the fractions of correct ends and of unbroken streaks; 1 if no streak can be judged.
+    # `ends` is the smaller of two fractions: confirmed streak ends, and streaks without gaps.
     correct = true_ends(camera, done.scene)
     judged = correct[np.isfinite(correct)], unbroken(camera, done.scene)
     ends = min(float(np.mean(each)) if len(each) else 1.0 for each in judged)
@@ -282,7 +286,7 @@ def _tried(camera: FitProblem, guess: MotionGuess) -> tuple[float, bool, StreakF
 
 
 def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
-    """Return the fit of positions, light and point-spread width to stars of a camera at rest."""
+    """Return a fit of star positions, fluxes and the point-spread width for a camera at rest."""
     count = min(len(regions), camera.settings.most_stars)
     width = float(np.hypot(camera.sigma, 0.29))
     everyone = np.ones(count, dtype=np.bool_)
@@ -292,24 +296,24 @@ def still_fit(camera: FitProblem, regions: BrightRegions) -> StreakFit | None:
     return iterate(camera, scene, free, replace(LAST, rounds=_STILL_ROUNDS))
 
 
-# Largest fraction of stars that look like pieces of longer streaks.
+# Largest fraction of stars that look like segments of a longer streak.
 _MOST_CHAINED = 0.45
-# Minimum fractions of correct streak ends of a motion that is accepted, and of one that is doubtful.
+# Minimum fraction of confirmed streak ends, for an accepted and for a doubtful motion.
 _TRUE_ENDS = (0.75, 0.6)
-# Largest fractions of stars with dark stretches for a motion that is accepted, and for a doubtful one.
+# Largest fraction of streaks with gaps, for an accepted and for a doubtful motion.
 _BROKEN = (0.12, 0.35)
-# Number of stars with two correct ends from which a motion is accepted in spite of dark stretches.
+# Number of streaks with two confirmed ends from which gaps in other streaks are tolerated.
 _CONFIRMING = 3
-# Minimum fraction of the light of streaks with both ends in the frame that agrees with the motion.
+# Minimum fraction of the flux of complete streaks that must come from streaks that agree with the motion.
 _AGREEING_LIGHT = 0.5
-# Relative change of the rate above which trails beyond the ends of the streaks are tested.
+# Relative change of the rate above which streaks are tested for flux beyond their ends.
 _UNEVEN = 0.4
-# Largest fraction of stars with a trail beyond an end.
+# Largest fraction of stars with flux beyond a streak end.
 _MOST_TRAILING = 0.5
 
 
 class StreakVerdict(Enum):
-    """Whether the ends of the streaks and the light between them support a motion."""
+    """Verdict on a motion from the ends of its streaks and from gaps in the streaks."""
 
     CONFIRMED = "confirmed"
     DOUBTFUL = "doubtful"
@@ -317,12 +321,12 @@ class StreakVerdict(Enum):
 
 
 def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> StreakVerdict:
-    """Return whether the trusted streaks have correct ends and are bright along their whole length.
+    """Return whether the trusted streaks of `scene` have confirmed ends and no gaps.
 
-    In a crowded frame an apparent star may be several stars. A few dark streaks therefore make a motion only
-    doubtful, unless enough streaks with two correct ends confirm it. A motion is also doubtful if no streak
-    has both ends in the frame, or if most streaks with both ends in the frame disagree with it. A motion with
-    too many wrong ends is rejected.
+    In a crowded frame, one apparent star may be a blend of several stars. A few streaks with gaps therefore
+    make a motion only doubtful, and enough streaks with two confirmed ends outweigh them. A motion is also
+    doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
+    contradict the motion. A motion with too many wrong streak ends is rejected.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -355,37 +359,38 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
 
 
 def _most_disagree(camera: FitProblem, scene: StreakScene) -> bool:
-    """Return whether untrusted stars have most of the light of bright streaks with both ends in the frame."""
+    """Return whether untrusted stars have most of the flux of the bright, complete streaks."""
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
         inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
-    # Stars fainter than all trusted stars were never tested against the majority.
+    # Stars fainter than all trusted stars are ignored, because they were never tested for agreement.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]
     return float(light[scene.trusted[bright]].sum()) < _AGREEING_LIGHT * float(light.sum())
 
 
-# Largest distance (px) between the streaks of one star in the fits of both directions of time.
+# Largest distance (px) between two fits of the same star, one for each sign of the rotation.
 _SAME_STAR = 3.0
-# Minimum difference of chi-square between the two directions of time that decides between them.
+# Minimum chi-square difference between the two signs of the rotation for a decision.
 _LEAST_MARGIN = 50.0
-# Minimum difference of chi-square between the directions of time, relative to the stars' scatter.
+# Minimum ratio of the chi-square difference to its scatter over the stars, for a decision on the sign.
 _LEAST_AGREEMENT = 3.0
-# Largest difference of chi-square that one star contributes to the choice of the direction.
+# Upper limit of a single star's chi-square difference in the decision on the sign of the rotation.
 _MOST_DIFFERENCE = 50.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A motion after the joint fit.
+    """A motion from the joint fit, with its streaks.
 
     Attributes:
-        result: result with this motion.
-        rotation: (3,) rad over the exposure.
-        verdict: verdict on its streaks.
-        middles: (n, 2) px, centres of the bright streaks; only with a rolling shutter.
-        excess: (n,) chi-square minus number of pixels, of each bright streak; only with a rolling shutter.
+        result: result of the estimation with this motion.
+        rotation: (3,) rad, rotation vector over the exposure.
+        verdict: verdict of the streak check on this motion.
+        middles: (n, 2) px, centres of the bright streaks. It is empty for a global shutter.
+        excess: (n,) chi-square minus the number of pixels of each bright streak. It is empty for a global
+            shutter.
     """
 
     result: MotionResult
@@ -396,7 +401,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the motion is not rejected."""
+        """Whether the streak check did not reject the motion."""
         return self.verdict is not StreakVerdict.REJECTED
 
 
@@ -407,14 +412,14 @@ def _rolling_result(
     prior_sigma: float,
     sigmas: float,
 ) -> MotionResult | None:
-    """Return the motion under a rolling shutter, None if no motion fits.
+    """Return the result for a camera with a rolling shutter, or None if no motion fits.
 
     Args:
-        fit_along: returns the motion with a rotation along a vector (3,).
-        axis: (3,) first guess of the axis, of arbitrary sign.
+        fit_along: function that fits a motion whose rotation has a positive component along a vector (3,).
+        axis: (3,) initial guess of the rotation axis, with arbitrary sign.
         prior_rate: (3,) rad/s; None if unknown.
-        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
-        sigmas: minimum significance of the prior.
+        prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
+        sigmas: minimum significance (standard deviations) with which the prior rate determines the sign.
     """
     if prior_rate is not None:
         sign = direction_of_time(axis, prior_rate, prior_sigma, sigmas)
@@ -430,7 +435,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # The direction of time whose fit failed may be the true one.
+        # The sign of the rotation whose fit did not succeed may be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -449,31 +454,31 @@ def _rolling_result(
     return replace(first, rate=first.rate - 0.5 * sum_of_both, covariance=covariance)
 
 
-# Indices of rate, acceleration, x and y in the parameter vector of a star and the shared parameters.
+# Indices of rate, acceleration, x and y among the shared parameters and the parameters of a star.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
-# Index of the light in the parameter vector of a star and the shared parameters.
+# Index of the flux among the shared parameters and the parameters of a star.
 _LIGHT = 9
-# Last step (standard deviations) above which a fit counts as not converged.
+# Last step (standard deviations) above which the joint fit counts as not converged.
 _UNSETTLED = 2.0
-# Minimum improvement of chi-square from which a rotation counts as reversed within the exposure.
+# Minimum decrease of chi-square by which a motion that reverses during the exposure is preferred.
 _REVERSED = 30.0
-# Largest distance (px) between two streaks that count as one double streak.
-# Vibration doubles streaks, because the light gathers at the turning points.
+# Largest distance (px) between two streaks that count as a double image of one star.
+# Vibration causes double images, because a star spends most time at the turning points of the vibration.
 _DOUBLE = 8.0
-# Minimum ratio of the light of the fainter to the brighter part of a double streak.
+# Minimum flux ratio of the fainter to the brighter component of a double image.
 _DOUBLE_RATIO = 0.3
-# Largest fraction of double streaks in a frame that gives a rate.
+# Largest fraction of double images in a frame whose rate is accepted.
 _MOST_DOUBLE = 0.4
-# Distance (px) below which two fitted streaks count as one.
+# Distance (px) below which two fitted streaks count as the same star.
 _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return the result `seen` with the fitted stars, the ends of their streaks, and their covariances."""
+    """Return `seen` completed by the fitted stars, their streak ends and the covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
-    # A fit may move one star onto another; only the brighter of the two is kept.
+    # If a fit moves one star onto another, only the brighter star is kept.
     stars, light = last.scene.stars[kept], last.scene.light[kept]
     near = np.linalg.norm(stars[:, None] - stars, axis=2) < _SAME
     kept = kept[~(near & (light > light[:, None])).any(axis=1)]
@@ -511,7 +516,7 @@ def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> Motio
 def with_rate(
     result: MotionResult, camera: FitProblem, last: StreakFit, verdict: StreakVerdict
 ) -> MotionResult:
-    """Return `result` with the rate, or with the reason for a missing rate."""
+    """Return `result` with the rate, or with the reason why no rate is reported."""
     settings = camera.settings
     if result.used_count < settings.least_stars:
         why = f"{result.used_count} streaks agree, at least {settings.least_stars} are needed"
@@ -543,7 +548,7 @@ def _rejection(
     verdict: StreakVerdict,
     known: RotationUncertainty,
 ) -> str:
-    """Return why a fitted motion is rejected, in one line; empty if it is accepted."""
+    """Return the reason for rejecting a fitted motion, or an empty string if it is accepted."""
     settings, common = camera.settings, known.common_motion
     distance = np.linalg.norm(result.stars[result.used, None] - result.stars, axis=2)
     bright = result.flux > _DOUBLE_RATIO * result.flux[result.used, None]
@@ -574,17 +579,17 @@ def _rejection(
     return reason
 
 
-# Number of motions that are fitted completely before a frame is rejected.
+# Maximum number of motions for which the joint fit is run before a frame is rejected.
 _MOST_MOTIONS = 2
-# Median length (px) of the regions below which a frame without a common motion shows stars at rest.
+# Median region length (px) below which a frame without a common motion shows stars at rest.
 _AT_REST = 4.0
-# Median length (px) of the brightest regions below which a frame counts as one without streaks.
+# Median length (px) of the brightest regions below which a frame counts as free of streaks.
 _SPOT = 2.2
 # Number of the brightest regions whose median length is compared with `_SPOT`.
 _BRIGHTEST = 12
-# Reason for a missing rate after a fit.
+# Reason reported if no fitted motion passes the streak check.
 _NO_CONSISTENT_MOTION = "no motion is consistent with the brightness and the ends of the streaks"
-# Reason for a missing rate without a fit.
+# Reason reported if no motion could be fitted.
 _NO_COMMON_MOTION = "the bright regions do not share one motion"
 
 
@@ -597,19 +602,22 @@ def estimate_rate(
     prior_sigma: float = 0.0,
     settings: LikelihoodSettings | None = None,
 ) -> MotionResult:
-    """Return the rate of a camera from the star streaks in one image, or the reason for a missing rate.
+    """Return a camera's rate estimated from the star streaks in one image.
 
-    The result has the mean `rate` (3,), rad/s, with respect to the stars in camera axes, and its `covariance`
-    (3, 3). Its quaternion `start_to_end` (4,) is the rotation over the exposure. One image does not show the
-    direction of time: without a prior, the status is `ambiguous` and the rate is known up to its sign. If
-    `rate` is None, `reason` says why.
+    The result holds the mean `rate` (3,), rad/s, of the camera relative to the stars in camera axes, and the
+    rate's `covariance` (3, 3). The quaternion `start_to_end` (4,) of the result is the rotation over the
+    exposure. A single image does not show the sign of the rotation. Without a prior rate, the status is
+    therefore `ambiguous` and the rate is known except for its sign. If `rate` is None, the attribute `reason`
+    says why.
 
     Args:
-        image: (rows, columns) raw counts, of an unsigned integer type.
-        camera: pinhole, or calibrated lens, whose distortion counts as an uncertainty of the pinhole.
+        image: raw counts (rows, columns), of an unsigned integer type.
+        camera: pinhole model or calibrated lens. The distortion of a lens is treated as an uncertainty of the
+            pinhole.
         exposure: exposure time, s.
-        prior_rate: (3,) rad/s, approximate rate in camera axes. It determines only the direction of rotation.
-        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
+        prior_rate: approximate rate (3,) in camera axes, rad/s. The prior rate determines only the sign of
+            the rotation.
+        prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
         settings: gain, saturation, point spread and line time of the camera, and limits of the fit.
 
     Raises FlightError for an invalid image, exposure or prior.
@@ -636,20 +644,23 @@ def estimate_motion(
     """Return the mean rate over one exposure with its covariance, and the stars of the frame `pixels`.
 
     Args:
-        pixels: (rows, columns) raw counts, of an unsigned integer type.
-        pinhole: camera, of the same shape.
+        pixels: raw counts (rows, columns), of an unsigned integer type.
+        pinhole: pinhole model of a camera with the shape of `pixels`.
         exposure: exposure time, s.
-        settings: settings of the camera and the fit.
-        prior_rate: (3,) rad/s, camera axes; determines only the direction of rotation. None: unknown.
-        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
-        previous_checksum: checksum of the previous frame; equal pixels indicate a frozen camera.
-        prior_course: rotation during the exposure as navigation knows it; None if unknown.
+        settings: settings of the camera and of the fit.
+        prior_rate: approximate rate (3,) in camera axes, rad/s, which determines only the sign of the
+            rotation. None: unknown.
+        prior_sigma: standard deviation of each component of `prior_rate`, rad/s.
+        previous_checksum: checksum of the previous frame. A frame with the same checksum indicates a frozen
+            camera.
+        prior_course: course of the rotation during the exposure, as estimated by the navigation filter; None
+            if unknown.
 
-    Raises FlightError for an invalid frame, exposure or prior. If a frame has no rate, the status and
-    `reason` of the result state why.
+    Raises FlightError for an invalid frame, exposure or prior. If the frame yields no rate, the `status` and
+    `reason` of the result say why.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    # A frame may saturate below the saturation level of the settings, but never above it.
+    # A frame may saturate at a lower count than the settings say, but never at a higher count.
     saturation = min(saturation_count(pixels), settings.saturation or np.inf)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
@@ -677,7 +688,7 @@ def estimate_motion(
         if found is not None:
             return binning.in_pixels(found)
     length = float(np.median(regions.length))
-    # With a crowded sky and a camera at rest, faint regions merge, but the brightest regions do not.
+    # In a crowded frame from a camera at rest, faint regions merge, but the brightest regions do not.
     if length >= _AT_REST and not spots:
         seen = replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_COMMON_MOTION)
     else:
@@ -695,7 +706,7 @@ def _in_direction(
     prior_sigma: float,
     course: Course | None,
 ) -> MotionResult | None:
-    """Return the motion in the direction of time of the prior, None without a motion."""
+    """Return the result with the sign of the rotation from the prior rate, or None if no motion fits."""
     sigmas = camera.settings.sign_sigmas
     near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * seen.exposure
     if camera.shutter.delay_per_row:
@@ -708,7 +719,7 @@ def _in_direction(
 
         return _rolling_result(fit_along, axis[0], prior_rate, prior_sigma, sigmas)
     if course is not None and camera.course is not None:
-        # The motion known from navigation is used unless the pixels contradict it.
+        # The motion estimated by the navigation filter is used unless the pixels contradict it.
         found = _best_motion(camera, seen, regions, near)
         if found is not None and found.result.status is not StreakStatus.FAILED:
             result = found.result
@@ -723,9 +734,9 @@ def _in_direction(
 def _best_motion(
     camera: FitProblem, seen: MotionResult, regions: BrightRegions, near: float | None
 ) -> _Candidate | None:
-    """Return the first motion that passes all tests, otherwise the likeliest motion without a rate.
+    """Return the first motion that passes all tests, otherwise the most likely motion without a rate.
 
-    The result is None if no motion is found.
+    Returns None if no motion is found.
     """
     rivals = islice(first_fits(camera, regions, near), _MOST_MOTIONS)
     first = next(rivals, None)
@@ -734,9 +745,9 @@ def _best_motion(
     leading = _fitted(camera, seen, first)
     if leading.verdict is StreakVerdict.CONFIRMED:
         return leading
-    # A doubtful motion is accepted if the light of the whole frame gives the same angle.
-    # This test takes less time than the fit of another motion.
-    # Pieces of streaks often give the correct axis, but not the angle.
+    # A doubtful motion is accepted if a scan of the whole frame gives the same rotation angle.
+    # A scan of the whole frame takes less time than the fit of another motion.
+    # Streaks in fragments often give the correct rotation axis but a wrong angle.
     angles = _frame_angles(camera, leading.rotation)
     if leading.possible and _has_angle(leading.rotation, angles):
         return leading
@@ -758,15 +769,15 @@ def _best_motion(
 
 
 def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
-    """Return whether the angle of `rotation` (3,) equals the likeliest of `angles` (rad)."""
+    """Return whether the angle of `rotation` (3,) equals the first and most likely of `angles` (rad)."""
     size = float(np.linalg.norm(rotation))
     return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
 
 
 def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candidate:
-    """Return the motion of the joint fit that starts from `first`.
+    """Return the motion of the joint fit that starts from the preliminary fit `first`.
 
-    If the fit fails, the motion has the verdict REJECTED.
+    If the joint fit does not succeed, the motion has the verdict REJECTED.
     """
     last, faint = final_fit(camera, first)
     middles, excess = np.empty((0, 2)), np.empty(0)
@@ -786,7 +797,7 @@ def _fitted(camera: FitProblem, seen: MotionResult, first: StreakFit) -> _Candid
     if result.status is StreakStatus.FAILED:
         verdict = StreakVerdict.REJECTED
     if camera.shutter.delay_per_row:
-        # The residuals of the brightest streaks are evaluated without clipping of pixels.
+        # The residuals of the brightest streaks are evaluated without clipping of outlier pixels.
         whole = camera.evaluate(scene, last.windows, clip=0.0)
         bright = slice(camera.settings.most_stars)
         stars = scene.stars[bright]

@@ -1,15 +1,16 @@
-"""Detection of faint streaks under a known motion, and a search for the angle of rotation, on polar grids.
+"""Detection of faint star streaks under a known motion, and search for the rotation angle, on polar grids.
 
-The 3 x 3 sums of the frame are sampled on circles about the axis of rotation, where every streak is straight
-and of the same length. A running sum over the length of a streak is its matched filter. Along the circle, the
-response of a star is a triangle, truncated at the border of the detector. Across the circle, it is the
-profile of the star. Peaks of the response are stars, and a linear system gives the heights of overlapping
-responses. For bright stars, the second difference along the circle separates merging triangles.
+The 3 x 3 pixel sums of the frame are sampled on circles about the rotation axis, where all streaks are
+straight and equally long. The matched filter of a streak is a running sum over the length of the streak.
+Along a circle, the filter response of a star is a triangle that is truncated at the border of the detector.
+Across the circles, the filter response of a star is the star's profile. Peaks of the filter response are
+stars, and a linear system separates the heights of overlapping peaks. For bright stars, the second difference
+along the circle separates overlapping triangles.
 
-If the brightest regions do not determine the rotation angle, because streaks are faint and fragmented or the
-border cuts all of them, all circles are searched. The mean light in a box along a circle is compared with
-that of the pixels before and behind the box, which together are as long as the box. The sum of the squared
-significances of all significant boxes is largest if the boxes have the true streak length.
+If the brightest regions do not determine the rotation angle, all circles are searched. This happens if
+streaks are faint and fragmented, or if the border truncates all of them. The mean of the pixels in a box
+along a circle is compared with the mean of the pixels on both sides of the box. The box length with the
+largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
@@ -32,25 +33,25 @@ from knightcube.vision.streaks.geometry import CameraMotion, paths
 _ACROSS = 1.8
 # Spacing (px) of the samples along a circle.
 _ALONG = 4.0
-# Number of circles processed at a time, so that their samples fit into the processor's cache.
+# Number of circles processed at once, small enough for the samples to fit into the processor's cache.
 _CHUNK = 64
-# Smallest polar angle (rad) of a circle of the grid.
+# Smallest angle (rad) between a circle of the grid and the rotation axis.
 _NEAREST = 0.003
-# Spacing (px) of the points that represent the border of the detector.
+# Spacing (px) of the points that trace the border of the detector.
 _BORDER_STEP = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarGrid:
-    """Samples (r, c) on circles about the axis of rotation.
+    """Samples (r, c) on r circles about the rotation axis.
 
     Attributes:
-        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
-        polar: (r,) rad, angle of each circle from the axis.
-        azimuth: (c,) rad, of each sample on a circle.
-        length: number of samples in a streak.
-        angle: rad, rotation over the exposure.
-        speed: (r,) px per rad of azimuth.
+        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
+        polar: (r,) angle between each circle and the rotation axis, rad.
+        azimuth: (c,) azimuth of each sample on a circle, rad.
+        length: number of samples in the length of a streak.
+        angle: rotation angle over the exposure, rad.
+        speed: (r,) displacement in the image per azimuth on each circle, px/rad.
     """
 
     frame: FloatArray
@@ -67,7 +68,7 @@ class PolarGrid:
 
     @property
     def off_centre(self) -> float:
-        """The offset of the centre of a running sum from a sample: 0.5 for an even number of samples."""
+        """Offset (samples) of the centre of a running sum from a sample: 0.5 for an even sample count."""
         return 0.0 if round(self.length) % 2 else 0.5
 
     def pixels(self, pinhole: Pinhole, row: FloatArray, column: FloatArray) -> FloatArray:
@@ -79,7 +80,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarGrid:
-    """Return the polar grid of the circles that cross the detector, thinned out to one in `every` circles."""
+    """Return a polar grid whose circles cross the detector, with one in `every` circles kept."""
     angle = float(np.linalg.norm(motion.rotation))
     axis = motion.rotation / angle
     middle = np.array([0.0, 0.0, 1.0])
@@ -107,13 +108,13 @@ def polar_grid(pinhole: Pinhole, motion: CameraMotion, every: int = 1) -> PolarG
 def sampled(
     sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
 ) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
-    """Yield groups of circles: rows, columns, samples, and a mask of the samples on the detector.
+    """Yield groups of circles as rows, columns, samples, and a mask of the samples on the detector.
 
-    The samples are taken from `sums`, which must be zero along the border. They are rounded to integer
-    multiples of `unit`, for fast and exact summation. If the circles are complete, the columns include `room`
-    samples on either side of the detector.
+    The samples are taken from the pixel sums `sums`, which must be zero along the border of the frame. The
+    samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. If the
+    circles are complete, the columns include a margin of `room` samples on both sides of the detector.
     """
-    # Direction over sine of the polar angle is the sum of a term of the azimuth and a term of the circle.
+    # A direction divided by the sine of its polar angle is a term of the azimuth plus a term of the circle.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
@@ -127,7 +128,7 @@ def sampled(
         for axis, limit in ((0, last[0]), (1, last[1])):
             place = around[axis, crossing] + aloft[axis, part, None]
             place *= depth
-            # The added 0.5 turns the truncation to an integer into rounding.
+            # With the added 0.5, truncation to an integer rounds to the nearest integer.
             place += np.float32(pinhole.centre[axis] + 0.5)
             np.maximum(place, np.float32(0.0), out=place)
             np.minimum(place, np.float32(limit), out=place)
@@ -142,7 +143,7 @@ def sampled(
 
 
 def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
-    """Yield groups of circles, and the range of azimuths in which they cross the detector."""
+    """Yield groups of circles with the range of azimuths in which they cross the detector."""
     x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
     sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
     along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
@@ -154,7 +155,7 @@ def _groups(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slic
     for start in range(0, len(grid.polar), _CHUNK):
         part = slice(start, min(start + _CHUNK, len(grid.polar)))
         near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
-        # The azimuth pi points away from the image centre.
+        # The azimuth pi points from the rotation axis away from the image centre.
         behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
         if grid.full and pinhole.contains(behind, margin=2.0)[0]:
             yield part, slice(0, count)
@@ -170,20 +171,20 @@ Int32Array = npt.NDArray[np.int32]
 
 # Side (px) of the square of pixels that is summed for one sample.
 _BOX = 3.0
-# Largest cumulative sum of samples, in units of the integer rounding.
+# Largest cumulative sum of samples, in units of the rounding step.
 _HIGHEST = 2.0**30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunningSums:
-    """Running sums of the samples over the length of a streak.
+    """Running sums of the samples along the circles, over the length of a streak.
 
     Attributes:
         light: (r, c) counts.
-        count: (r, c) number of existing samples.
-        span: (r, 2) first and last column with a sample on each circle; infinite if the samples are not
-            contiguous.
-        excess: (r,) noise of each circle's sums, relative to the noise of samples that share no pixels.
+        count: (r, c) number of samples on the detector in each running sum.
+        span: (r, 2) first and last column of each circle on the detector. It is infinite if a circle leaves
+            the detector in between.
+        excess: (r,) noise of the running sums on each circle, relative to the noise of independent samples.
     """
 
     light: Float32Array
@@ -193,21 +194,21 @@ class RunningSums:
 
 
 def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
-    """Return the running sums of samples of `sums` within half a streak of each sample.
+    """Return the running sums over one streak length, centred on each sample of the polar grid.
 
-    `sums` must be zero along the border, because positions outside the frame use the border's value. Its
-    values are rounded to multiples of `unit` counts.
+    `sums` must be zero along the border of the frame, because samples outside the frame take the border's
+    value. The samples are rounded to multiples of `unit` counts.
     """
     width = max(round(grid.length), 1)
     before, after = width // 2, width - width // 2
     rows, columns = len(grid.polar), len(grid.azimuth)
-    # The operating system allocates no memory for zeros that are never written, outside the detector.
+    # Memory is only allocated for elements that are written, which lie on the detector.
     response, count = np.zeros((rows, columns), dtype=np.float32), np.zeros((rows, columns), dtype=np.int32)
     span = np.tile([-np.inf, np.inf], (rows, 1))
     unit = max(unit, float(sums.max()) * width / _HIGHEST)
     for part, crossing, samples, inside in sampled(sums, pinhole, grid, width, unit):
         wide = samples.shape[1]
-        # The samples and the mask of existing samples have a margin of one streak length on either side.
+        # Samples and mask are padded by one streak length on both sides.
         padded = np.zeros((2, len(samples), wide + 2 * width + 1), dtype=np.int32)
         middle = slice(width + 1, width + 1 + wide)
         padded[0, :, middle] = samples
@@ -224,10 +225,10 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
         count[part, low:high] = held[1]
         begin, end = inside.argmax(axis=1), wide - 1 - inside[:, ::-1].argmax(axis=1)
         whole = inside.sum(axis=1) == end - begin + 1
-        # The centre of an even number of samples lies half a sample before the sample of index n/2.
+        # The centre of an even number n of samples lies half a sample before the sample with index n/2.
         edges = np.stack([begin - 0.5, end + 0.5], axis=1) + crossing.start + grid.off_centre
         span[part] = np.where(whole[:, None], edges, span[part])
-    # Samples on the slow circles near the axis share pixels, so that their noise is correlated.
+    # On circles near the rotation axis, neighbouring samples share pixels, so that their noise is correlated.
     spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
     slow = np.flatnonzero(spacing < _BOX)
     steps = np.arange(1, width)
@@ -238,7 +239,7 @@ def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: fl
 
 
 def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the cumulative sums (r, c + 1) of all samples that precede each sample on its circle."""
+    """Return the cumulative sums (r, c + 1) of the samples before each sample of a circle."""
     out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
     for part, crossing, samples, _ in sampled(sums, pinhole, grid, 0, 1.0):
         out[part, crossing.start + 1 : crossing.stop + 1] = np.cumsum(samples, axis=1, dtype=np.float64)
@@ -246,41 +247,41 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
     return out
 
 
-# Minimum fraction of a streak that lies on the detector, for its detection.
+# Minimum fraction of a streak that must lie on the detector for its detection.
 _LEAST_SEEN = 0.35
-# Number of circles between two stars from which they share no light.
+# Number of circles between two stars from which their profiles do not overlap.
 _FARTHEST = 5
-# Standard deviation (px) that the filter assumes for the point spread convolved with a pixel.
+# Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05
-# Step (samples) of the second difference of the response along a circle.
+# Step (samples) of the second difference of the filter response along a circle.
 _SHARP_STEP = 3
-# Minimum length (samples) of streaks that are separated by the second difference.
+# Minimum streak length (samples) for the separation of stars by the second difference.
 _SHARP_FROM = 40.0
-# Minimum second difference of the response of a star, in standard deviations of the noise.
+# Minimum second difference of a star's filter response, in standard deviations of its noise.
 _SHARP_SIGMAS = 6.0
-# Minimum second difference of the response of a star, relative to the star's height.
+# Minimum second difference of a star's filter response, relative to the response.
 _SHARP_SHARE = 0.3
-# Minimum fraction of a peak's response that no stronger, overlapping peak explains.
+# Minimum fraction of a peak's response that is not explained by stronger peaks.
 _OWN_SHARE = 0.45
-# Maximum number of peaks per pass.
+# Maximum number of peaks in one pass of the search.
 _MOST_PEAKS = 1000
-# Offsets in rows and columns from a local maximum to its neighbours, nearest first.
+# Offsets in rows and columns to the neighbours with which a local maximum is compared, nearest first.
 _NEIGHBOURS = sorted(
     ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# Number of entries per px in the table of the response across the circles.
+# Number of entries per px in the table of a star's profile across the circles.
 _PER_PX = 50.0
-# Table of the response of a star against the distance across the circles.
+# Profile of a star as a function of the distance across the circles.
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
 
 
 def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: float) -> FloatArray:
-    """Return the overlap of streaks centred at columns `one` and `other` (...), relative to their length.
+    """Return the fraction of the streak length by which streaks at columns `one` and `other` (...) overlap.
 
-    `span` (..., 2) is the range of columns in which samples exist; `length` is in samples.
+    `span` (..., 2) is the range of columns on the detector. `length` is in samples.
     """
     first = np.maximum(np.maximum(one, other) - 0.5 * length, span[..., 0])
     last = np.minimum(np.minimum(one, other) + 0.5 * length, span[..., 1])
@@ -288,7 +289,7 @@ def overlap_of(one: FloatArray, other: FloatArray, span: FloatArray, length: flo
 
 
 def profile(distance: FloatArray) -> FloatArray:
-    """Return the response of a star at `distance` (px) across its circle, relative to the maximum."""
+    """Return a star's filter response at `distance` (px) across its circle, relative to its maximum."""
     index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
     return np.asarray(_PROFILE[index])
 
@@ -296,11 +297,11 @@ def profile(distance: FloatArray) -> FloatArray:
 def sharp_peaks(
     held: RunningSums, place: IntArray, deviation: FloatArray, grid: PolarGrid
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rows and columns of the bright stars from the second difference of the response.
+    """Return rows and columns of bright stars, found by the second difference of the filter response.
 
-    The second difference has narrow peaks, so that it separates stars that are close to each other on one
-    circle. `place` (p,) are flat indices of high responses, and `deviation` (p,) is the noise at these
-    indices.
+    The peaks of the second difference are narrow, so that stars close to each other on one circle are
+    separated. `place` (p,) are flat indices of high filter responses, and `deviation` (p,) is the noise at
+    these indices.
     """
     step = _SHARP_STEP
     if grid.length < _SHARP_FROM:
@@ -310,7 +311,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference is scaled to the height of an isolated star, which scales its noise as well.
+    # The second difference of an isolated star is scaled to its response, and its noise by the same factor.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -323,10 +324,10 @@ def sharp_peaks(
 def standing_peaks(
     significance: Float32Array, span: FloatArray, place: IntArray, grid: PolarGrid, sigmas: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return fractional rows and columns of the peaks that no stronger peak explains, strongest first.
+    """Return fractional rows and columns of the peaks that stronger peaks do not explain, strongest first.
 
-    Only the flat indices `place` (p,) are searched. `span` (r, 2) is the range of existing samples, as in
-    `RunningSums`.
+    Only the flat indices `place` (p,) of the filter response are searched. `span` (r, 2) is the range of
+    columns on the detector, as in `RunningSums`.
     """
     row, column = _local_maxima(significance, place)
     value, spans = significance[row, column].astype(np.float64), span[row]
@@ -335,7 +336,7 @@ def standing_peaks(
     count = np.searchsorted(row[by_row], row + _FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
-    # A crowded frame has hundreds of thousands of pairs of peaks, most of them too far apart to overlap.
+    # A crowded frame has hundreds of thousands of pairs of peaks, most of which are too far apart to overlap.
     near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
     stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
@@ -358,10 +359,10 @@ def standing_peaks(
 
 
 def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the flat indices `place` (p,) that are local maxima, highest first."""
+    """Return rows and columns of the local maxima among the flat indices `place` (p,), highest first."""
     flat, columns = values.reshape(-1), values.shape[1]
     value = flat[place]
-    # The index after the last column is on the next circle, a neighbour if the circles are complete.
+    # If the circles are complete, the first column of a circle is a neighbour of the last column.
     for down, beside in _NEIGHBOURS:
         summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
         place, value = place[summit], value[summit]
@@ -371,7 +372,7 @@ def _local_maxima(values: Float32Array, place: IntArray) -> tuple[IntArray, IntA
 
 
 def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
-    """Return the fractional positions of peaks along `axis`, from a parabola through three values."""
+    """Return the fractional positions of peaks along `axis`, each from a parabola through three values."""
     place = (row, column)[axis]
     size = significance.shape[axis]
     before, after = np.maximum(place - 1, 0), np.minimum(place + 1, size - 1)
@@ -382,31 +383,31 @@ def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: 
     return np.asarray(place + np.clip(offset, -0.5, 0.5))
 
 
-# Ratio of a sample's noise to the unit to which the samples are rounded.
+# Ratio of the noise of a sample to the rounding step of the samples.
 _ROUNDING = 30.0
-# Number of passes of the search; the first one uses second differences.
+# Number of passes of the search for stars. The first pass uses second differences.
 _PASSES = 3
-# Relative ridge added to the normal equations of the heights, for stars that nearly coincide.
+# Relative regularisation of the normal equations for peak heights, for stars that nearly coincide.
 _RIDGE = 0.01
-# Absolute ridge added to the normal equations of the heights.
+# Absolute regularisation of the normal equations for peak heights.
 _TINY = 1e-6
-# Relative accuracy at which the iteration for the heights stops.
+# Relative accuracy at which the solution for the peak heights stops.
 _SOLVED = 1e-4
-# Maximum number of conjugate-gradient steps for the heights.
+# Maximum number of conjugate-gradient iterations for the peak heights.
 _MOST_GRADIENTS = 200
-# Number of responses computed at a time, to limit the memory.
+# Number of filter responses computed at once, which limits the memory.
 _SOME_PLACES = 1 << 16
-# Minimum length (px) of a streak for the matched filter.
+# Minimum streak length (px) for the matched filter.
 _LEAST_LENGTH = 6.0
-# Fraction of a streak's light within three pixels across it.
+# Fraction of a star's flux within three pixels across the streak.
 _CAPTURED = 0.83
-# Noise of a sum of n overlapping 3 x 3 samples, relative to a pixel's noise times the root of n.
+# Noise of a sum of n overlapping 3 x 3 samples, relative to the noise of a pixel times sqrt(n).
 _SAMPLE_NOISE = 3.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaintStars:
-    """Detected streaks: stars (n, 2) px at mid-exposure, light (n,) counts, significance (n,)."""
+    """Detected streaks: positions (n, 2) px at mid-exposure, fluxes (n,) counts and significances (n,)."""
 
     stars: FloatArray
     light: FloatArray
@@ -421,9 +422,9 @@ def find_faint(
     sigmas: float,
     most: int,
 ) -> FaintStars:
-    """Return the `most` significant streaks along `motion` after subtraction of the `modelled` light.
+    """Return the `most` significant streaks along `motion` after subtraction of the modelled stars.
 
-    `modelled` consists of flat pixel indices (m,) and the light (m,) of these pixels in counts.
+    `modelled` holds flat pixel indices (m,) and the modelled counts (m,) of these pixels.
     """
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
     reach = (
@@ -434,7 +435,7 @@ def find_faint(
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
     held = running_sums(_residual_sums(frame, modelled), pinhole, grid, usual / _ROUNDING)
-    # The noise of a running sum depends on its number of samples; sums of too few samples are excluded.
+    # The noise of a running sum depends on its number of samples. Sums of too few samples are excluded.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(_LEAST_SEEN * grid.length)] = np.inf
     row, column, height = _found_stars(held, noise, grid, sigmas, most)
@@ -449,10 +450,10 @@ def find_faint(
 
 
 def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
-    """Return the 3 x 3 sums (rows * columns,) of the frame without `modelled` light and bad pixels."""
+    """Return the 3 x 3 sums (rows * columns,) of the frame without modelled stars and bad pixels."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
-    # Residuals of bright stars, which are mostly the stars' own photon noise, are attenuated.
+    # Residuals of bright stars are attenuated, because they are mostly photon noise of the subtracted stars.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
     left = (signal - light) * share
     left[frame.bad[pixels]] = 0.0
@@ -470,11 +471,11 @@ def _residual_sums(frame: ReducedFrame, modelled: tuple[IntArray, Float32Array])
 def _found_stars(
     held: RunningSums, noise: FloatArray, grid: PolarGrid, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return fractional rows, columns and heights of the stars whose summed responses reproduce `held`.
+    """Return fractional rows, columns and peak heights of the stars that reproduce the response `held`.
 
-    Each pass finds peaks in the residual response, solves for the heights of all stars together, and
-    subtracts them. `noise` is the noise of a sum, indexed by its number of samples. All passes search only
-    the indices whose initial response exceeds the noise.
+    Each pass finds peaks in the residual response, solves for the heights of all stars, and subtracts these
+    stars. `noise` is the noise of a running sum, indexed by its number of samples. All passes search only the
+    indices whose initial response is significant.
     """
     flat = held.light.reshape(-1)
     place = np.flatnonzero(flat > sigmas * noise.min())
@@ -510,7 +511,7 @@ def _significance(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the significance (k,) of stars of `height` (k,), in standard deviations of the noise."""
+    """Return the significance (k,) of stars with peak heights `height` (k,), in standard deviations."""
     middle = np.rint(row).astype(int)
     seen = overlap_of(column, column, held.span[middle], grid.length)
     own = noise[held.count[middle, np.rint(column).astype(int) % held.light.shape[1]]] * held.excess[middle]
@@ -525,9 +526,9 @@ def _responses(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return the summed responses (p,) of stars of `height` (k,) at ascending flat indices `place` (p,)."""
+    """Return the summed filter responses (p,) of stars at the ascending flat indices `place` (p,)."""
     rows, columns = held.light.shape
-    # On each neighbouring circle the response of a star is a contiguous range of columns.
+    # On each neighbouring circle, the filter response of a star covers a contiguous range of columns.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - _FARTHEST, _FARTHEST + 1)
     weight = height[:, None] * profile((circle - row[:, None]) * _ACROSS)
     weight = np.where((circle >= 0) & (circle < rows), weight, 0.0)
@@ -541,7 +542,7 @@ def _responses(
     circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
     star = reached // (2 * _FARTHEST)
     out = np.zeros(len(place))
-    # Ranges are processed in groups, because many stars need more memory than the frame.
+    # Ranges of columns are processed in groups, which limits the memory.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
     for some in np.split(np.arange(len(reached)), np.unique(cuts)):
         many = count[some]
@@ -559,9 +560,9 @@ def _responses(
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
-    """Return the heights (k,) of stars whose overlapping responses add up to the measured response."""
+    """Return the peak heights (k,) of stars whose overlapping responses add up to the measured response."""
     middle = np.rint(row).astype(int)
-    # Pairs of stars, including each star with itself, whose responses may overlap.
+    # The arrays `one` and `other` list all pairs of stars that may overlap, including each star with itself.
     order = np.argsort(row, kind="stable")
     first = np.searchsorted(row[order], row - _FARTHEST, side="right")
     count = np.searchsorted(row[order], row + _FARTHEST) - first
@@ -576,7 +577,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * _ACROSS
     )
-    # The ridge regularises nearly coincident stars; the right-hand side compensates it for other stars.
+    # The regularisation of nearly coincident stars is compensated for isolated stars on the right-hand side.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(
@@ -586,9 +587,9 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
 
 
 def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution (k,) of sparse equations by conjugate gradients.
+    """Return the solution (k,) of sparse symmetric linear equations by conjugate gradients.
 
-    The nonzero matrix elements `overlap` (e,) are at rows `one` and columns `other`, both (e,).
+    The nonzero matrix elements `overlap` (e,) are at the rows `one` (e,) and columns `other` (e,).
     """
     k = len(right)
     scale = 1.0 / np.sqrt(overlap[one == other])
@@ -608,21 +609,21 @@ def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArr
     return np.asarray(x * scale)
 
 
-# Ratio of consecutive trial lengths of the box.
+# Ratio of consecutive box lengths in the angle search.
 _FACTOR = 1.1
-# Shortest trial length (samples) of the box.
+# Shortest box length (samples) in the angle search.
 _SHORTEST = 5
-# Ratio of all circles of the polar grid to the circles that the angle search uses.
+# Factor by which the angle search reduces the number of circles.
 _SPARSE = 2
-# Minimum significance (standard deviations) of a box that counts.
+# Minimum significance (standard deviations) of a box in the angle search.
 _LEAST_SIGMAS = 5.0
-# Value (standard deviations) to which the significance of a box is limited.
+# Upper limit of the significance (standard deviations) of a box in the angle search.
 _ENOUGH = 40.0
 
 
 def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, most: int) -> list[float]:
-    """Return the `most` likeliest angles (rad) about the axis of `rotation` (3,), likeliest first."""
-    # A rotation by one radian, the largest one, gives the coarsest sampling.
+    """Return the `most` likely rotation angles (rad) about the axis of `rotation` (3,), most likely first."""
+    # The sampling is chosen for a rotation by one radian, the largest angle in the search.
     grid = polar_grid(pinhole, CameraMotion.steady(rotation / np.linalg.norm(rotation)), _SPARSE)
     step = grid.angle / grid.length
     held = cumulative_sums(frame.sums, pinhole, grid)
@@ -633,7 +634,7 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
-    # The azimuth is the first axis, so that memory is read contiguously.
+    # The azimuth is the first array axis, so that memory is read contiguously.
     padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
     score = np.array([_box_significance(padded, room, int(width)) for width in widths])
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
@@ -648,9 +649,9 @@ def frame_angles(frame: ReducedFrame, pinhole: Pinhole, rotation: FloatArray, mo
 
 
 def _box_significance(padded: Float32Array, room: int, width: int) -> float:
-    """Return the sum of squared significances of the boxes of `width` samples that are local maxima.
+    """Return the sum of squared significances over all locally best boxes of `width` samples.
 
-    `padded` (c, r) are the cumulative sums along the azimuth, with a margin of `room` samples on either side.
+    `padded` (c, r) holds the cumulative sums along the azimuth, with a margin of `room` samples at both ends.
     """
     stretches = (len(padded) - 2 * room - width) // width
     outer, inner, behind, beyond = (
@@ -661,7 +662,7 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
     light *= np.float32(2.0)
     light -= beyond
     light += outer
-    # The highest box of each stretch of a circle counts if neither neighbouring stretch has a higher box.
+    # Each circle is divided into intervals of one box length, and only local maxima over the intervals count.
     best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)
@@ -673,6 +674,6 @@ def _box_significance(padded: Float32Array, room: int, width: int) -> float:
 
 
 def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the integer box widths (samples) within half a trial step of `width`, at most `longest`."""
+    """Return the integer box lengths (samples) within half a search step of `width`, up to `longest`."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
     return np.arange(max(width - room, 2), min(width + room, longest) + 1)

@@ -1,18 +1,19 @@
-"""First guesses of the motion from the bright regions of a frame, without their end points.
+"""Initial guesses of the camera's motion from the bright regions of a frame.
 
-A streak at pixel p runs along B(p) u, where u is the rotation vector and B(p) the image flow. The normal n of
-the streak therefore gives one linear equation n.B(p) u = 0, independent of the order of the streak's ends.
-Pairs of regions propose axes, the other regions vote for them, and least squares refines the best axis. All
-stars rotate by the same angle about the axis, and the lengths of the regions vote for this angle. A region
-that the frame's border cuts gives only a lower bound of the angle, and fragments on one circle about the axis
-vote together.
+A streak at the pixel p is parallel to B(p) u, where u is the rotation vector and B(p) the image-flow matrix.
+The unit normal n of the streak therefore gives the linear equation n.B(p) u = 0, which holds for either
+direction of motion along the streak. Pairs of regions propose rotation axes, the other regions vote for the
+proposed axes, and least squares refines the axis with most votes. All stars rotate by the same angle, and the
+lengths of the regions vote for this angle. A region that is truncated by the border of the frame gives only a
+lower limit of the angle. Fragments on the same circle about the rotation axis vote together.
 
-If few streaks are entirely in the frame, a scan finds the angle. Along a circle about the axis, the light of
-a star is a box whose length is the rotation angle. The samples around the brightest regions are summed in
-boxes of every trial length, and each box is placed at the maximum of its light. A box of the correct length
-contains all light of a star and no other pixels. A box that is too long or too short by a factor of two
-explains half the chi-square. The scan therefore finds the angle from far away, whereas a fit of the pixels
-converges only within a few widths of the point spread.
+If few streaks lie completely in the frame, a scan finds the rotation angle. Along a circle about the rotation
+axis, the intensity of a star is a box function whose length is the rotation angle. The samples around the
+brightest regions are summed in boxes of each trial length, and each box is moved to the position of its
+largest sum. A box of the correct length contains all flux of a star and no background pixels. A box that is
+too long or too short by a factor of two explains only half of the chi-square. The scan therefore finds the
+angle without a good initial guess, whereas a fit of the pixels converges only from within a few point-spread
+widths.
 """
 
 from __future__ import annotations
@@ -28,34 +29,34 @@ from knightcube.vision.streaks.frame import BrightRegions, ReducedFrame
 from knightcube.vision.streaks.geometry import CameraMotion, image_flow, path_lengths, positions
 
 SCANNED_STARS = 14
-"""Number of the brightest regions that determine the angle of the scan."""
+"""Number of the brightest regions that are used in the scan for the rotation angle."""
 
-# Spacing (px) of the samples on the circle with the fastest image motion.
+# Spacing (px) of samples along the circle with the fastest image motion.
 _STEP = 2.0
-# Ratio of consecutive trial lengths of the box.
+# Ratio of consecutive box lengths in the scan for the rotation angle.
 _FACTOR = 1.04
-# Shortest trial length (samples) of the box.
+# Shortest box length (samples) in the scan for the rotation angle.
 _SHORTEST = 6
-# Number of the likeliest angles that are sorted by their distance from a prior angle.
+# Number of the most likely angles among which the prior rate chooses.
 _WEIGHED = 3
-# Largest light of a sample relative to the region's own, to limit the effect of crossing stars.
+# Upper limit of a sample relative to its region's median, which limits the effect of crossing stars.
 _CAP = 2.0
-# Value (standard deviations) to which the significance of a star in the scan is limited.
+# Upper limit of the significance (standard deviations) of a star in the scan.
 _ENOUGH = 60.0
 # Minimum significance (standard deviations) of a star that the scan passes to the fit.
 _CERTAIN = 8.0
-# Minimum fraction of a star's box inside the frame, for a star that the scan passes to the fit.
+# Minimum fraction of a streak that lies in the frame, for a star that the scan passes to the fit.
 _LEAST_SEEN = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circles:
-    """Circles (n,) about the axis of rotation, each through one of the brightest regions.
+    """Circles (n,) about the rotation axis, each through one of the brightest regions.
 
     Attributes:
-        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
-        height: (n,) cosine of the angle from the axis.
-        azimuth: (n,) rad, azimuth of each region's light.
+        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
+        height: (n,) cosine of the angle between each circle and the rotation axis.
+        azimuth: (n,) azimuth of the centroid of each region, rad.
     """
 
     frame: FloatArray
@@ -65,11 +66,11 @@ class Circles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleCandidate:
-    """A candidate for the angle of rotation, with its stars.
+    """A candidate for the rotation angle, with the stars found under it.
 
     Attributes:
         angle: rad.
-        stars: (n, 2) px at mid-exposure.
+        stars: (n, 2) positions of the stars at mid-exposure, px.
         light: (n,) counts.
     """
 
@@ -81,16 +82,16 @@ class AngleCandidate:
 def scan_angles(
     frame: ReducedFrame, pinhole: Pinhole, circles: Circles, most: int, near: float | None = None
 ) -> Iterator[AngleCandidate]:
-    """Yield the `most` likeliest angles, sorted by their distance from `near` (rad) if it is given."""
+    """Yield the `most` likely rotation angles, nearest to `near` (rad) first if `near` is given."""
     boxes = _boxes(frame, pinhole, circles)
     longest = boxes.total.shape[1] - 2
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     gain = np.array([boxes.best(int(width)).gain for width in widths])
-    # The weight of a bright star is limited, because it may be two stars.
+    # The weight of a bright star is limited, because it may be a blend of two stars.
     scale = np.minimum(_ENOUGH**2 / np.maximum(gain.max(axis=0), 1.0), 1.0)
     score = gain @ scale
-    # If the border cuts all stars, longer rotations explain no more light, and the shortest one is taken.
+    # If the border truncates all stars, longer rotations explain no more flux, and the shortest is chosen.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -103,7 +104,7 @@ def scan_angles(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BestBoxes:
-    """The best boxes (n,): chi-square, first sample, light, and number of samples in the frame."""
+    """Best boxes (n,): chi-square, first sample, flux, and number of samples in the frame."""
 
     gain: FloatArray
     first: IntArray
@@ -113,9 +114,9 @@ class _BestBoxes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Boxes:
-    """Cumulative sums (n, c + 1) of light and of samples in the frame along the circles.
+    """Cumulative sums (n, c + 1) along the circles: samples, and number of samples in the frame.
 
-    The first azimuth is `begin` and the spacing `step`, both in rad.
+    The first azimuth is `begin` (rad), and the spacing of the samples is `step` (rad).
     """
 
     total: FloatArray
@@ -126,7 +127,7 @@ class _Boxes:
     step: float
 
     def best(self, width: int) -> _BestBoxes:
-        """Return the box of `width` samples with the largest chi-square around each region."""
+        """Return the box of `width` samples with the largest chi-square at each region."""
         last = self.total.shape[1] - 1
         first = self.middle[:, None] - np.arange(width + 1)
         start, stop = np.clip(first, 0, last), np.clip(first + width, 0, last)
@@ -139,7 +140,7 @@ class _Boxes:
 
 
 def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return the light on the circles, limited to `_CAP` times the region's own."""
+    """Return cumulative sums of samples on the circles, each at most `_CAP` times the region's median."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -174,7 +175,7 @@ def _boxes(frame: ReducedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
 def _refined_angle(
     boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatArray, width: int
 ) -> AngleCandidate:
-    """Return the best angle near `width` samples, with its stars."""
+    """Return the best rotation angle near `width` samples, with the stars found under it."""
     room = max(2, round(_FACTOR * width) - width + 1)
     widths = np.arange(max(width - room, 2), width + room + 1)
     held = [boxes.best(int(each)) for each in widths]
@@ -182,7 +183,7 @@ def _refined_angle(
     best = int(np.argmax(score))
     chosen, across = held[best], int(widths[best])
     certain = (chosen.gain > _CERTAIN**2) & (chosen.seen > _LEAST_SEEN * across)
-    # The position of a star along its path is determined only if at least one end is in the frame.
+    # A star's position along its path is determined only if at least one end of its streak is in the frame.
     bounded = np.zeros(len(certain), dtype=np.bool_)
     for sample in (chosen.first, chosen.first + across):
         here = np.clip(sample, 0, boxes.exist.shape[1] - 2)
@@ -195,7 +196,7 @@ def _refined_angle(
     local = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), height])
     pixel = pinhole.project((circles.frame.T @ local).T)
     spacing = boxes.step * pinhole.focal_length * sine
-    # A sample of 3 x 3 pixels contains 83 % of the light of 3 px of path.
+    # A sample of 3 x 3 pixels contains 83 % of the flux of a streak segment of 3 px.
     light = chosen.light[certain] * spacing / (3.0 * 0.83) * across / np.maximum(chosen.seen[certain], 1.0)
     good = np.isfinite(pixel).all(axis=1)
     order = np.flatnonzero(good)[np.argsort(-light[good], kind="stable")]
@@ -204,43 +205,43 @@ def _refined_angle(
     return AngleCandidate(across * boxes.step, pixel[order], light[order])
 
 
-# Number of the regions whose pairs propose axes of rotation.
+# Number of bright regions whose pairs propose rotation axes.
 _PROPOSERS = 16
-# Smallest sine of the angle between the equations of two regions that propose an axis.
+# Smallest sine of the angle between the equations of two regions that propose a rotation axis.
 _PARALLEL = 1e-9
-# Error (px) of a region's orientation, to be divided by the region's length (px).
+# Standard error (px) of a region's orientation times its length.
 _SIDE_ERROR = 1.2
-# Minimum error (rad) of a region's orientation.
+# Minimum standard error (rad) of a region's orientation.
 _LEAST_ERROR = 0.012
-# Minimum length (px) of a region with a usable orientation.
+# Minimum length (px) of a region whose orientation is used.
 _LEAST_LENGTH = 3.5
-# Error (px) of a region's length.
+# Constant part (px) of the standard error of a region's length.
 _LENGTH_ERROR = 1.0
-# Error of a region's length, as a fraction of the length.
+# Proportional part of the standard error of a region's length.
 _LENGTH_SHARE = 0.015
-# Number of rotation angles taken from each ranking of the angles.
+# Maximum number of rotation angles from each of the two rankings.
 _MOST_HYPOTHESES = 3
-# Largest distance (px) between the circles of two fragments of one star.
+# Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0
-# Largest difference of a region's length from a known streak length, relative to it.
+# Largest relative difference between a region's length and the expected streak length.
 _LIKELY_LENGTH = 0.2
-# Number of instants at which a known motion is evaluated.
+# Number of instants at which a known motion is sampled.
 _INSTANTS = 65
-# Minimum number of entire regions for a changing rate in the first guess.
+# Minimum number of complete regions for an estimate of the angular acceleration.
 _LEAST_GROWING = 3
-# Minimum relative change of the rate for a changing rate in the first guess.
+# Minimum relative change of the rate that an initial guess includes.
 _LEAST_GROWTH = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGuess:
-    """A first guess of the motion and the stars, from which a fit starts.
+    """An initial guess of the motion and of the stars, from which a fit starts.
 
     Attributes:
-        motion: motion of the camera.
-        stars: (n, 2) px, centres of the streaks.
+        motion: guessed motion of the camera.
+        stars: (n, 2) centres of the streaks, px.
         light: (n,) counts.
-        contradicted: fraction of the light in regions that are longer than the rotation allows.
+        contradicted: fraction of the flux in regions that are too long for the guessed rotation.
     """
 
     motion: CameraMotion
@@ -250,14 +251,17 @@ class MotionGuess:
 
 
 def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, BoolArray] | None:
-    """Return the axis (3,) of arbitrary sign and which regions (n,) agree with it, None if fewer than two."""
+    """Return the rotation axis (3,) on which most regions agree, and a mask (n,) of these regions.
+
+    The sign of the axis is arbitrary. Returns None if fewer than two regions agree.
+    """
     long = np.flatnonzero(regions.length >= _LEAST_LENGTH)
     if len(long) < 2:
         return None
     flow = image_flow(pinhole, regions.centre)
     equation = np.einsum("ni,nij->nj", regions.normal, flow)
     tolerance = np.maximum(_SIDE_ERROR / np.maximum(regions.length, 1.0), _LEAST_ERROR)
-    # Long and bright regions have a large weight, because they are rarely blends of several stars.
+    # Long and bright regions get a large weight, because they are rarely blends of several stars.
     worth = np.sqrt(regions.flux) * np.minimum(regions.length, 100.0)
     leaders = long[np.argsort(-worth[long], kind="stable")[:_PROPOSERS]]
     i, j = (leaders[index] for index in np.triu_indices(len(leaders), k=1))
@@ -282,26 +286,26 @@ def guess_axis(regions: BrightRegions, pinhole: Pinhole) -> tuple[FloatArray, Bo
 
 
 def _misalignment(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> FloatArray:
-    """Return the sines (k, n) of the angles between regions and the image flow about `axes` (k, 3)."""
+    """Return the sines (k, n) of the angles between n regions and the image flow about k `axes` (k, 3)."""
     speed = np.linalg.norm(np.einsum("nij,kj->kni", flow, axes), axis=-1)
     return np.asarray(axes @ equation.T / np.maximum(speed, 1e-9))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisGuess:
-    """The axis on which regions agree, and the n regions as arcs about it.
+    """A rotation axis on which regions agree, and the n regions as arcs about this axis.
 
     Attributes:
-        agree: (n,) which regions agree with the axis.
-        frame: (3, 3) rows: two unit vectors normal to the axis, and the axis.
-        height: (n,) cosine of the angle from the axis.
-        middle: (n,) rad, azimuth of the centre of light.
-        first: (n,) rad, lowest azimuth.
-        last: (n,) rad, highest azimuth.
-        width: (n,) rad, length by the second moment.
-        speed: (n,) px per rad of azimuth.
-        cut_first: (n,) whether the frame's border cuts the first end.
-        cut_last: (n,) whether the frame's border cuts the last end.
+        agree: (n,) whether each region agrees with the rotation axis.
+        frame: rows (3, 3): two unit vectors normal to the rotation axis, and the rotation axis.
+        height: (n,) cosine of the angle between each region and the rotation axis.
+        middle: (n,) azimuth of the centroid of each region, rad.
+        first: (n,) lowest azimuth of each region, rad.
+        last: (n,) highest azimuth of each region, rad.
+        width: (n,) arc length of each region from its second moment, rad.
+        speed: (n,) displacement in the image per azimuth at each region, px/rad.
+        cut_first: (n,) whether the border of the frame truncates the end at the lowest azimuth.
+        cut_last: (n,) whether the border of the frame truncates the end at the highest azimuth.
     """
 
     agree: BoolArray
@@ -317,14 +321,14 @@ class AxisGuess:
 
 
 def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
-    """Return the axis on which the regions agree, None without one."""
+    """Return the rotation axis and the regions as arcs about it, or None if fewer than two regions agree."""
     found = guess_axis(regions, pinhole)
     if found is None:
         return None
     axis, agree = found
     n, owner, light = len(regions), regions.owner, regions.light
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # The azimuth zero points to the image centre; if the axis is at the image centre, it is arbitrary.
+    # The azimuth zero points to the image centre, or anywhere if the axis is at the image centre.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]
@@ -343,7 +347,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     height = np.bincount(owner, light * z, n) / flux
     speed = np.linalg.norm(image_flow(pinhole, regions.centre) @ axis, axis=-1)
     low, high = _outermost(azimuth, owner, n)
-    # The variance of a uniform arc is a twelfth of its squared length, plus the variance of the point spread.
+    # The variance of a uniform arc is its squared length / 12 plus the variance of the point spread.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return AxisGuess(
         agree,
@@ -362,13 +366,13 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
 def motions_by_length(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, most: int, growth: float = 0.0
 ) -> list[MotionGuess]:
-    """Return guesses from the lengths of the regions, likeliest first, each with at most `most` stars.
+    """Return guesses from the lengths of the regions, most likely first, each with at most `most` stars.
 
-    `growth` is the relative change of the rate, see `measured_rate_change`.
+    `growth` is the relative change of the rate over the exposure, see `measured_rate_change`.
     """
     guesses = []
     for wide, contradicted in _angles(guess, regions):
-        # The second moment of a path with a changing rate is slightly larger.
+        # A changing rate slightly increases the second moment of a streak.
         angle = wide / np.sqrt(1.0 + growth**2 / 60.0)
         stars, light = _stars_of_angle(guess, regions, pinhole, angle, most, growth)
         if len(light):
@@ -380,10 +384,10 @@ def motions_by_length(
 def motion_by_course(
     course: CameraMotion, regions: BrightRegions, pinhole: Pinhole, most: int
 ) -> MotionGuess:
-    """Return a guess with a known motion, its stars being the brightest regions of similar length."""
+    """Return a guess with the known motion `course` and the brightest regions of matching length."""
     time = np.linspace(-0.5, 0.5, _INSTANTS)
     progress = course.progress(time)
-    # The second moment of a region is the variance of the star's positions over the exposure.
+    # The second moment of a region is the variance of the star's position over the exposure.
     wide = np.sqrt(12.0 * np.var(progress))
     length = path_lengths(pinhole, course, regions.centre) * wide
     likely = np.abs(regions.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length
@@ -394,10 +398,11 @@ def motion_by_course(
 
 
 def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
-    """Return the relative change of the rate over the exposure from the regions' asymmetry; 0 if small.
+    """Return the relative change of the rate over the exposure from the asymmetry of the regions.
 
-    If the rate increases from zero to twice its mean, the centroid lies a sixth of the length from the middle
-    of the streak. The sign is positive if acceleration and rotation have the same sense.
+    If the rate increases linearly from zero, the centroid of a streak lies a sixth of its length from its
+    midpoint. The sign is positive if the rate increases in magnitude during the exposure. The result is 0 if
+    the change is small.
     """
     whole = guess.agree & ~regions.cut & (guess.width * guess.speed > _LEAST_LENGTH)
     if np.count_nonzero(whole) < _LEAST_GROWING:
@@ -410,7 +415,7 @@ def measured_rate_change(guess: AxisGuess, regions: BrightRegions) -> float:
 def motions_by_scan(
     guess: AxisGuess, frame: ReducedFrame, pinhole: Pinhole, most: int, near: float | None
 ) -> Iterator[MotionGuess]:
-    """Yield guesses from the light along circles about the axis, see `scan_angles`."""
+    """Yield guesses from a scan for the rotation angle, see `scan_angles`."""
     chosen = np.flatnonzero(guess.agree)[:SCANNED_STARS]
     circles = Circles(guess.frame, guess.height[chosen], guess.middle[chosen])
     for candidate in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
@@ -420,7 +425,7 @@ def motions_by_scan(
 
 
 def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
-    """Return the pixels of lowest and of highest azimuth of each of `n` regions, both (n,)."""
+    """Return the pixels with the lowest and the highest azimuth of each of `n` regions, both (n,)."""
     order = np.argsort(owner.astype(np.int16), kind="stable")
     theirs, whose = azimuth[order], owner[order]
     start = np.searchsorted(whose, np.arange(n))
@@ -432,7 +437,7 @@ def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, 
 
 
 def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> BoolArray:
-    """Return which pixels `pixel` (n,) of the regions lie at the frame's border."""
+    """Return whether each of the pixels `pixel` (n,) lies at the border of the frame."""
     x, y, margin = regions.column[pixel], regions.row[pixel], 4
     inside_x = (x >= margin) & (x < pinhole.columns - margin)
     inside_y = (y >= margin) & (y < pinhole.rows - margin)
@@ -440,7 +445,7 @@ def _at_border(regions: BrightRegions, pinhole: Pinhole, pixel: IntArray) -> Boo
 
 
 def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float]]:
-    """Return the likeliest angles (rad), each with the fraction of the light in longer regions."""
+    """Return the most likely rotation angles (rad), each with the fraction of flux in longer regions."""
     whole = guess.agree & ~regions.cut & (guess.width > 0.0)
     candidates, weight = guess.width[whole], np.sqrt(regions.flux[whole])
     spread = _LENGTH_ERROR / guess.speed[whole] + _LENGTH_SHARE * candidates
@@ -453,7 +458,7 @@ def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float
         return [(float(np.max(reach[cut])), 0.0)] if cut.any() else []
     nearness = np.exp(-0.5 * ((candidates[:, None] - candidates) / np.hypot(spread[:, None], spread)) ** 2)
     votes = nearness @ weight
-    # A region longer than the angle contradicts it, or consists of two stars.
+    # A region that is longer than the rotation angle contradicts it, or is a blend of two stars.
     long = guess.agree & (guess.speed * reach > 20.0)
     longer = (reach - 10.0 / guess.speed)[long] > candidates[:, None] + 3.0 * spread[:, None]
     doubted = votes - longer @ np.sqrt(regions.flux[long])
@@ -473,10 +478,10 @@ def _angles(guess: AxisGuess, regions: BrightRegions) -> list[tuple[float, float
 
 
 def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
-    """Return angle, error and weight (k, 3) of pairs of neighbouring fragments on one circle."""
+    """Return rotation angle, standard error and weight (k, 3) from pairs of fragments on one circle."""
     part = np.flatnonzero(guess.agree & ~regions.cut)
     sine = np.sqrt(np.maximum(1.0 - guess.height[part] ** 2, 1e-12))
-    # The scale converts a difference of `height`, a cosine, into px across the circles.
+    # The factor `scale` converts a difference of `height`, a cosine, into px across the circles.
     scale = guess.speed[part] / sine**2
     near = np.abs(guess.height[part, None] - guess.height[part]) * scale < _SAME_CIRCLE
     gap = guess.first[part][None, :] - guess.last[part][:, None]
@@ -491,14 +496,14 @@ def _joined(guess: AxisGuess, regions: BrightRegions) -> FloatArray:
 def _stars_of_angle(
     guess: AxisGuess, regions: BrightRegions, pinhole: Pinhole, angle: float, most: int, growth: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return centres (n, 2) px and light (n,) of the streaks of the brightest regions that fit the angle."""
+    """Return centres (n, 2) px and fluxes (n,) of the brightest streaks that fit the rotation angle."""
     spread = _LENGTH_ERROR / guess.speed + _LENGTH_SHARE * angle
     whole = guess.agree & ~regions.cut & (np.abs(guess.width - angle) < 4.0 * spread)
     reach = np.abs(guess.last - guess.first)
     one = guess.cut_first ^ guess.cut_last
     cut = guess.agree & regions.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # The end inside the frame gives the centre of a cut streak.
-    # A region extends about 2 px beyond the end of the streak.
+    # The centre of a truncated streak follows from its end inside the frame.
+    # A bright region extends about 2 px beyond the end of the streak.
     past = 2.0 / guess.speed
     middle = np.where(guess.cut_first, guess.last - past - 0.5 * angle, guess.first + past + 0.5 * angle)
     middle = np.where(whole, guess.middle - growth / 12.0 * angle, middle)
