@@ -1,8 +1,8 @@
-"""Preparation of a frame for the fit: background, noise, unusable pixels, bright regions, width of the stars.
+"""Preparation of a frame for the fit: background, noise, unusable pixels, bright regions and star width.
 
-If the point spread is several pixels wide, pixels are summed (`Binning`). The sums determine the motion
-equally well and take a fraction of the computing time. The unequal responses of a colour camera's raw pixels
-are equalised, and light from other sources than stars, such as the Earth's limb, is excluded.
+If the point spread is several pixels wide, the frame is binned (`Binning`). A binned frame determines the
+motion equally well in a fraction of the computing time. The responses of a colour camera's raw pixels are
+equalised, and extended sources such as the Earth's limb are excluded.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from knightcube.vision.streaks.streak_result import MotionResult
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReducedFrame:
-    """A frame of (rows, columns) as flat arrays, in counts of the analogue-to-digital converter.
+    """A frame as flat arrays of rows * columns pixels, in counts of the analogue-to-digital converter.
 
     Attributes:
         shape: rows, columns.
-        signal: counts above the background.
-        sums: 3 x 3 sums of `signal`.
-        floor: counts^2, variance of a pixel without a star.
+        signal: counts above the background, of each pixel.
+        sums: sums of `signal` over 3 x 3 pixels.
+        floor: noise variance of each pixel without a star, counts^2.
         counts: raw counts.
-        top: raw counts at which a pixel saturates.
-        bad: which pixels are saturated or hot, and excluded.
-        gain: electrons per count.
-        hot_pixels: number of hot pixels.
+        top: raw counts from which a pixel is saturated.
+        bad: mask of the saturated and hot pixels, which the fit excludes.
+        gain: gain of the camera, electrons per count.
+        hot_pixels: number of hot pixels in the frame.
     """
 
     shape: tuple[int, int]
@@ -56,16 +56,16 @@ class ReducedFrame:
 
 
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:
-    """Return `pixels` (rows, columns) with background subtracted and noise estimated.
+    """Return the frame `pixels` (rows, columns) with its background subtracted and its noise estimated.
 
-    `saturation` is in counts and `gain` in electrons per count of `pixels`. If `saturation` is None, the
-    highest count is used if many pixels have it, otherwise the maximum of the integer type.
+    `saturation` is in counts, and `gain` in electrons per count. If `saturation` is None, it is the highest
+    count if many pixels have that count, otherwise the maximum of the integer type.
     """
     top = saturation_count(pixels) if saturation is None else saturation
     pixels, step, offset = in_steps(pixels)
     top, gain = (top - offset) / step, gain * step
     background = estimate_background(pixels)
-    # The arithmetic is in place, because the allocation of megabytes takes more time than the arithmetic.
+    # The arithmetic is in place, because allocating large arrays takes more time than the arithmetic.
     signal = background.map(background.level)
     np.subtract(pixels, signal, out=signal)
     floor = background.map(np.square(background.noise))
@@ -86,27 +86,27 @@ def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> Reduce
     )
 
 
-# Minimum area (pixels) of a bright region; a noise peak fills nine pixels of the 3 x 3 sums.
+# Minimum area (pixels) of a bright region. A single noise peak fills nine pixels of the 3 x 3 sums.
 _LEAST_AREA = 12
-# Distance (px) by which threshold and point spread extend a region beyond each end of a streak.
+# Distance (px) by which a bright region extends beyond each end of its streak.
 _BORDER = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BrightRegions:
-    """Connected bright regions, brightest first, and their pixels.
+    """Connected regions of bright pixels, brightest first, and the pixels of these regions.
 
     Attributes:
-        centre: (n, 2) px, centre of light.
-        normal: (n, 2) unit vector across the region.
-        length: (n,) px, length of a uniform line with the region's second moments.
+        centre: (n, 2) centroid of each region, px.
+        normal: (n, 2) unit vector perpendicular to each region's long axis.
+        length: (n,) length of the uniform line with the second moments of each region, px.
         flux: (n,) counts.
-        cut: (n,) whether the region reaches the frame's border.
-        owner: (m,) region of each pixel.
-        column: (m,) column of each pixel.
-        row: (m,) row of each pixel.
-        light: (m,) counts of each pixel.
-        lit: fraction of the frame's pixels above the threshold.
+        cut: (n,) whether each region touches the border of the frame.
+        owner: (m,) index of the region to which each pixel belongs.
+        column: (m,) column index of each pixel.
+        row: (m,) row index of each pixel.
+        light: (m,) counts of each pixel above the background.
+        lit: fraction of the frame's pixels that exceed the threshold.
     """
 
     centre: FloatArray
@@ -125,7 +125,7 @@ class BrightRegions:
 
 
 def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> BrightRegions:
-    """Return the `most` brightest regions in which the 3 x 3 sums exceed `sigmas` times their noise."""
+    """Return the `most` brightest regions in which the 3 x 3 sums exceed `sigmas` standard deviations."""
     threshold = 3.0 * sigmas
     pixel = np.flatnonzero(frame.sums > np.float32(threshold * np.sqrt(frame.floor.min())))
     pixel = pixel[frame.sums[pixel] > np.float32(threshold) * np.sqrt(frame.floor[pixel])]
@@ -158,23 +158,22 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
     )
 
 
-# Minimum mean width (px) of a region that may be a limb or a reflection; the brightest stars have half this
-# width.
+# Minimum mean width (px) of a limb or a reflection, twice the width of the brightest stars.
 _BROAD = 25.0
-# Minimum length (px) by which a region's area is divided to obtain its mean width.
+# Minimum length (px) in the mean width of a region, which is its area divided by its length.
 _LEAST_LENGTH = 40.0
-# Side (px) of a square that fits into a limb or a reflection.
+# Side (px) of a square that fits into a limb or a reflection, but not into a star.
 _SOLID = 31
-# Margin (px) around a limb or a reflection that is excluded too.
+# Margin (px) that is excluded around a limb or a reflection.
 _ABOUT = 12
 
 
 def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with limbs and reflections excluded, None if it has no limb or reflection.
+    """Return `frame` with limbs and reflections excluded, or None if there are none.
 
-    A limb or a reflection is a region that is solid over a square larger than any star; a net of crossing
-    streaks is not solid. The pixels around such a region are excluded too, because the background map does
-    not follow its light.
+    A limb or a reflection is a region that contains a square larger than any star. A net of crossing streaks
+    contains no such square. A margin around such a region is also excluded, because the background map does
+    not follow its steep gradient.
     """
     area = np.bincount(regions.owner, minlength=len(regions))
     broad = area > _BROAD * np.maximum(regions.length, _LEAST_LENGTH)
@@ -198,25 +197,26 @@ def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame |
     return replace(frame, signal=signal, sums=sums, bad=frame.bad | out)
 
 
-# Maximum number of the brightest regions that determine the responses of a colour mosaic.
+# Maximum number of bright regions from which the responses of a colour mosaic are estimated.
 _MOST_MOSAIC_REGIONS = 24
-# Minimum number of bright regions that determine the responses of a colour mosaic.
+# Minimum number of bright regions from which the responses of a colour mosaic are estimated.
 _LEAST_MOSAIC_REGIONS = 6
-# Minimum relative difference of a response from the mean that indicates a colour mosaic.
+# Minimum relative deviation of a pixel's response from the mean response that indicates a colour mosaic.
 _UNEVEN_RESPONSE = 0.06
-# Minimum difference of a response from the mean, in standard deviations, that indicates a mosaic.
+# Minimum deviation (standard deviations) of a response from the mean that indicates a colour mosaic.
 _UNEVEN_SIGMAS = 8.0
 # Interquartile range of a normal distribution, in standard deviations.
 _QUARTILES = 1.35
 MEDIAN_ERROR = 1.25
-"""Standard error of a median of normal values, relative to that of their mean."""
+"""Standard error of the median of normal values, relative to the standard error of their mean."""
 
 
 def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame | None:
-    """Return `frame` with equalised responses of its pixels, None if the responses are already equal.
+    """Return `frame` with equalised pixel responses, or None if the responses are already equal.
 
-    A colour camera's raw pixels lie behind a pattern of 2 x 2 filters. Each bright region has about the same
-    light on all four pixels of the pattern, which gives the mean response of each pixel to stars.
+    The raw pixels of a colour camera lie behind a repeated pattern of 2 x 2 filters. Each bright region has
+    about the same flux on the four pixels of the pattern, so that the ratios of their sums are the responses
+    to starlight.
     """
     count = min(len(regions), _MOST_MOSAIC_REGIONS)
     if count < _LEAST_MOSAIC_REGIONS:
@@ -241,22 +241,22 @@ def without_mosaic(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame 
     )
 
 
-# Displacements (px) at which the autocorrelation is measured.
-# At zero displacement it contains the noise.
+# Displacements (px) at which the autocorrelation of a streak is measured.
+# The displacement zero is not used, because noise adds to the autocorrelation there.
 _NEAR, _FAR = 1, 3
-# Maximum number of the brightest regions that determine the width of the point spread.
+# Maximum number of bright regions from which the point-spread width is estimated.
 _MOST_WIDTH_REGIONS = 12
-# Minimum number of bright regions that determine the width of the point spread.
+# Minimum number of bright regions from which the point-spread width is estimated.
 _LEAST_WIDTH_REGIONS = 3
 
 
 def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | None:
-    """Return the standard deviation (px) of the point spread without the pixel, None for too few regions.
+    """Return the standard deviation (px) of the point spread without the pixel, or None for few regions.
 
-    The autocorrelation of a streak of Gaussian width w at a displacement d across it is exp(-d^2/(4 w^2)).
-    The product of the autocorrelations along columns and along rows has this value for every direction and
-    curvature of the streak. The median over the brightest regions ignores neighbouring stars and bright
-    limbs.
+    The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
+    to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and rows has this form for every
+    direction and curvature of the streak. The median over the brightest regions is insensitive to blended
+    stars and bright limbs.
     """
     chosen = np.flatnonzero(regions.owner < _MOST_WIDTH_REGIONS)
     owner, columns = regions.owner[chosen], frame.shape[1]
@@ -279,13 +279,13 @@ def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | N
     return float(np.sqrt(max(float(np.median(known)) - PIXEL_VARIANCE, 0.0)))
 
 
-# Minimum standard deviation (px) of the point spread after binning.
+# Minimum standard deviation (px) of the point spread in binned pixels.
 _NARROWEST = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Sums of `size` x `size` pixels, starting at pixel `first` (x, y), as the pixels of `pinhole`."""
+    """Bins of `size` x `size` pixels, from pixel `first` (x, y), as the pixels of the camera `pinhole`."""
 
     size: int
     first: tuple[int, int]
@@ -293,9 +293,10 @@ class Binning:
 
     @classmethod
     def suited(cls, pinhole: Pinhole, psf_sigma: float) -> Binning:
-        """Return the binning for a point spread of `psf_sigma` px; a narrow point spread needs no binning.
+        """Return the binning for a point spread of `psf_sigma` px, with one pixel per bin if it is narrow.
 
-        The same number of pixels is excluded on opposite sides, so that the optical axis stays in the centre.
+        Opposite sides of the frame lose the same number of pixels, so that the optical axis stays in the
+        centre.
         """
         for size in range(int(psf_sigma / _NARROWEST), 1, -1):
             columns, rows = (_centred_count(length, size) for length in (pinhole.columns, pinhole.rows))
@@ -306,20 +307,20 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the sums of `pixels`, and the value of a sum with a pixel of at least `top` counts."""
+        """Return the binned `pixels`, and the value of a bin with a pixel of at least `top` counts."""
         if self.size == 1:
             return pixels, top
         x, y = self.first
         shape = self.pinhole.rows, self.size, self.pinhole.columns, self.size
         cut = pixels[y : y + shape[0] * self.size, x : x + shape[2] * self.size].reshape(shape)
-        # The value is an integer, so that all sums remain multiples of one count.
+        # The saturated value is an integer, so that all bins remain multiples of one count.
         full = max(int(cut.max()), int(np.ceil(top))) * self.size**2
         sums = cut.sum(axis=(1, 3), dtype=np.uint64)
         sums[at_least(cut, top).any(axis=(1, 3))] = full
         return sums, float(full)
 
     def settings(self, settings: LikelihoodSettings) -> LikelihoodSettings:
-        """Return the `settings` of the full frame converted to binned pixels."""
+        """Return the `settings` for the full frame converted to binned pixels."""
         if self.size == 1:
             return settings
         return replace(
@@ -334,7 +335,7 @@ class Binning:
         )
 
     def in_pixels(self, result: MotionResult) -> MotionResult:
-        """Return a `result` in binned pixels converted to pixels of the full frame."""
+        """Return the `result` of a binned frame with its pixel coordinates converted to the full frame."""
         size = self.size
         if size == 1:
             return result
@@ -353,22 +354,22 @@ class Binning:
 
 
 def _centred_count(length: int, size: int) -> int:
-    """Return the number of bins of `size` pixels in `length`, one fewer if the remainder is odd."""
+    """Return the number of bins of `size` pixels in `length`, reduced by one if an odd number remains."""
     count = length // size
     return count - 1 if (length - size * count) % 2 and size % 2 else count
 
 
-# Maximum number of bright regions that are kept.
+# Maximum number of bright regions in a frame.
 _MOST_REGIONS = 48
-# Minimum measured width (px) of the point spread for binning.
+# Minimum measured point-spread width (px) that selects binning.
 _WIDE = 2.2
-# Minimum ratio of the measured to the described width of the point spread, for binning by the measurement.
+# Minimum ratio of the measured to the configured point-spread width that selects binning.
 _WIDER = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedFrame:
-    """A frame in the pixels of `binning`, its bright regions, and the width `sigma` (px) of its stars."""
+    """A binned frame, its bright regions, and the point-spread width `sigma` in binned pixels."""
 
     binning: Binning
     frame: ReducedFrame
@@ -379,9 +380,9 @@ class PreparedFrame:
 def prepare_frame(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings
 ) -> PreparedFrame:
-    """Return `pixels` (rows, columns) prepared for the described point spread, or for a larger measured one.
+    """Return `pixels` (rows, columns) prepared for the configured or a much larger measured point spread.
 
-    `saturation` is in counts.
+    `saturation` is the count from which a pixel is saturated.
     """
     prepared = _prepared(pixels, pinhole, saturation, settings, settings.psf_sigma)
     if prepared.binning.size > 1:
@@ -395,7 +396,7 @@ def prepare_frame(
 def _prepared(
     pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
 ) -> PreparedFrame:
-    """Return the frame prepared for a point spread of `sigma` px."""
+    """Return the frame `pixels` prepared for a point spread with standard deviation `sigma` px."""
     binning = Binning.suited(pinhole, sigma)
     frame = reduce_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
     regions = find_bright_regions(frame, settings.threshold_sigmas, _MOST_REGIONS)

@@ -1,10 +1,11 @@
-"""Paths of stars over the detector while the camera rotates, and how they depend on the camera's motion.
+"""Paths of stars over the detector of a rotating camera, and the derivatives of these paths.
 
-Time is in units of the exposure and zero at mid-exposure. With the rate u at mid-exposure and the angular
-acceleration g, both in camera axes, the rate is u + g t and the direction v of a star obeys
-v' = -(u + g t) x v. The rotation since mid-exposure is the vector u t + g t^2/2 + (u x g) t^3/12 (Magnus
-expansion). It is exact if g is zero, and otherwise of fourth order. Terms of t^3 and higher that are known
-from navigation are added to this vector. A star is identified by its pixel at mid-exposure.
+Time is measured in exposures and is zero at mid-exposure. With the rate u at mid-exposure and the angular
+acceleration g in camera axes, the rate at time t is u + g t, and the direction v of a star obeys v' = -(u + g
+t) x v. The rotation vector since mid-exposure is u t + g t^2/2 + (u x g) t^3/12 (Magnus expansion). This
+rotation vector is exact if g is zero, and has an error of fourth order in t otherwise. Terms of third and
+higher order in t that the navigation filter provides are added to the rotation vector. A star is identified
+by its pixel coordinates at mid-exposure.
 """
 
 from __future__ import annotations
@@ -20,21 +21,22 @@ from knightcube.vision.camera.lens import Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
-# Number of iterations that invert the lens distortion, which amounts to about 1 % of the radius.
+# Number of iterations that invert the lens distortion, which is about 1 % of the radius.
 _ROUNDS = 6
 _TINY = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class DistortedPinhole(Pinhole):
-    """A pinhole with small errors of its calibration: image centre, focal length and cubic distortion.
+    """A pinhole camera with small calibration errors: image centre, focal length and cubic distortion.
 
-    The inherited projections are those of the ideal pinhole; only `paths` applies the distortion.
+    The inherited projections are those of the ideal pinhole, and only the function `paths` applies the
+    distortion.
 
     Attributes:
-        shift: (x, y) px, displacement of the image.
+        shift: displacement (x, y) of the image centre, px.
         scale: relative error of the focal length.
-        cubic: cubic distortion at the corner of the image, as a fraction of the radius.
+        cubic: cubic distortion at the corner of the image, as a fraction of the distance from the centre.
     """
 
     shift: tuple[float, float]
@@ -46,13 +48,13 @@ class DistortedPinhole(Pinhole):
         return self.cubic / float(np.hypot(*self.centre)) ** 2
 
     def distorted(self, points: FloatArray) -> FloatArray:
-        """Return the distorted positions of ideal `points`; both (m, 2) px."""
+        """Return the distorted positions (m, 2), px, of ideal `points` (m, 2), px."""
         away = points - np.array(self.centre)
         grown = self.scale + self._per_square * np.sum(away**2, axis=1, keepdims=True)
         return np.asarray(points + np.array(self.shift) + grown * away)
 
     def undistorted(self, points: FloatArray) -> FloatArray:
-        """Return the ideal positions of distorted `points`; both (m, 2) px."""
+        """Return the ideal positions (m, 2), px, of distorted `points` (m, 2), px."""
         shifted = points - np.array(self.centre) - np.array(self.shift)
         away = shifted
         for _ in range(_ROUNDS):
@@ -67,9 +69,9 @@ class DistortedPinhole(Pinhole):
         return np.asarray(grown[:, None, None] * np.eye(2) + 2.0 * self._per_square * outer)
 
     def curvature(self, points: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the acceleration (m, 2) of the distorted image of points that move at constant `velocity`.
+        """Return the acceleration (m, 2) of distorted image points whose ideal `velocity` is constant.
 
-        Ideal `points` (m, 2) are in px, `velocity` (m, 2) in px per exposure.
+        The ideal `points` (m, 2) are in px, the `velocity` (m, 2) in px per exposure.
         """
         away = points - np.array(self.centre)
         closing = np.sum(away * velocity, axis=1, keepdims=True)
@@ -79,12 +81,12 @@ class DistortedPinhole(Pinhole):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
-    """The rotation of the camera over one exposure, in camera axes and units of the exposure.
+    """Rotation of the camera over one exposure, in camera axes, with the exposure as unit of time.
 
     Attributes:
-        rate: (3,) rad per exposure, at mid-exposure.
-        acceleration: (3,) rad per exposure^2.
-        higher_terms: (k, 3) rad, known coefficients of t^3, t^4, ... of the rotation vector.
+        rate: (3,) rate at mid-exposure, rad per exposure.
+        acceleration: (3,) angular acceleration, rad per exposure^2.
+        higher_terms: (k, 3) known coefficients of t^3, t^4, ... in the rotation vector, rad.
     """
 
     rate: FloatArray
@@ -93,7 +95,7 @@ class CameraMotion:
 
     @classmethod
     def steady(cls, rate: FloatArray) -> CameraMotion:
-        """Return the motion at a constant rate (3,) rad per exposure."""
+        """Return the motion at a constant `rate` (3,), rad per exposure."""
         return cls(np.asarray(rate, dtype=float), np.zeros(3))
 
     @classmethod
@@ -104,13 +106,13 @@ class CameraMotion:
 
     @property
     def constant(self) -> bool:
-        """Whether the rate is constant."""
+        """Whether the angular rate is constant over the exposure."""
         return not (self.acceleration.any() or self.higher_terms.any())
 
     def directed(self, direction: FloatArray) -> CameraMotion:
-        """Return this motion or its time reversal, whichever rotates along `direction` (3,).
+        """Return this motion or its time reversal, whichever has a positive rotation along `direction` (3,).
 
-        The angular acceleration of the time-reversed motion is the same.
+        A motion and its time reversal have the same angular acceleration.
         """
         if self.rotation @ direction >= 0.0:
             return self
@@ -118,13 +120,13 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, odd[:, None] * self.higher_terms)
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return this motion scaled to a `rotation` (3,), rad, over the exposure, up to its sign."""
+        """Return this motion with the mean rate changed to give `rotation` (3,), rad, or its negative."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
     @property
     def rotation(self) -> FloatArray:
-        """The rotation vector (3,), rad, from start to end of the exposure: mean rate times exposure time."""
+        """The rotation vector (3,), rad, from start to end of the exposure."""
         return np.asarray(self.rate + self.higher(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0]))
 
     @property
@@ -134,25 +136,25 @@ class CameraMotion:
 
     @property
     def relative_acceleration(self) -> float:
-        """The change of the rate about the mean axis over the exposure, relative to the mean rate."""
+        """Relative change of the rate along the mean rotation axis over the exposure."""
         square = float(self.rotation @ self.rotation)
         rate = self.higher(np.array([-0.5, 0.5]), 1)
         change = self.acceleration + rate[:, 1] - rate[:, 0]
         return float(self.rotation @ change) / square if square else 0.0
 
     def progress(self, time: FloatArray) -> FloatArray:
-        """Return the fraction of the rotation completed between mid-exposure and `time`; both (m,)."""
+        """Return the fraction (m,) of the rotation that is completed between mid-exposure and `time` (m,)."""
         vector = self.rate[:, None] * time + 0.5 * self.acceleration[:, None] * time**2 + self.higher(time)
         return np.asarray(self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY))
 
     def relative_rate(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rate about the mean axis over the mean rate at `time` (m,), or its derivative."""
+        """Return the relative rate along the mean rotation axis at `time` (m,), or its derivative."""
         vector = _rate(self, time) if derivative == 0 else self.acceleration[:, None] + self.higher(time, 2)
         relative = self.rotation @ vector / max(float(self.rotation @ self.rotation), _TINY)
         return np.asarray(np.broadcast_to(relative, time.shape))
 
     def higher(self, time: FloatArray, derivative: int = 0) -> FloatArray:
-        """Return the rotation (3, m) of `higher_terms` at `time` (m,), or its first or second derivative."""
+        """Return the rotation (3, m) due to `higher_terms` at `time` (m,), or a time derivative of it."""
         out = np.zeros((3, len(time)))
         for power, term in enumerate(self.higher_terms, start=3):
             factor = (1, power, power * (power - 1))[derivative]
@@ -162,9 +164,9 @@ class CameraMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarPaths:
-    """Points on the paths of stars: position (m, 2) px, velocity (m, 2) and acceleration (m, 2).
+    """Points on the paths of stars: position (m, 2), velocity (m, 2) and acceleration (m, 2).
 
-    The velocity is in px per exposure, the acceleration in px per exposure^2.
+    The position is in px, the velocity in px per exposure, and the acceleration in px per exposure^2.
     """
 
     position: FloatArray
@@ -173,7 +175,7 @@ class StarPaths:
 
 
 def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> StarPaths:
-    """Return the paths at `time` (m,) of stars at pixels `stars` (m, 2) at mid-exposure."""
+    """Return points at `time` (m,) on the paths of stars with the pixels `stars` (m, 2) at mid-exposure."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     w = _rate(motion, time)
     velocity = _cross(v, w)  # -omega x v
@@ -197,16 +199,16 @@ def paths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: Float
 
 
 def positions(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the positions (m, 2), px, of `paths` without velocities, which is faster than `paths`."""
+    """Return only the positions (m, 2), px, of `paths`, in less time than `paths`."""
     v = _rotated(_rotation_until(motion, time), _directions(pinhole, stars))
     points = _pixels(pinhole, v[:2] / v[2])
     return pinhole.distorted(points) if isinstance(pinhole, DistortedPinhole) else points
 
 
 def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
-    """Return the image-flow matrices B (n, 2, 3), px per rad, at `points` (n, 2) px.
+    """Return the image-flow matrices B (n, 2, 3), px/rad, at `points` (n, 2), px.
 
-    At a rate u (rad per exposure), a star moves B u px per exposure.
+    If the camera rotates at the rate u (rad per exposure), a star moves by B u px per exposure.
     """
     return _flow(pinhole, _directions(pinhole, points)[:2]).transpose(2, 0, 1)
 
@@ -214,27 +216,27 @@ def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
 def sensitivities(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool = True
 ) -> FloatArray:
-    """Return the derivatives (m, 2, 8) of the pixels at `time` (m,), see `sensitivities_and_velocity`."""
+    """Return the derivatives (m, 2, 8) of pixels at `time` (m,), see `sensitivities_and_velocity`."""
     return sensitivities_and_velocity(pinhole, motion, stars, time, growing)[0]
 
 
 def sensitivities_and_velocity(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool = True
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (m, 2, 8) of the pixels at `time` (m,), and velocities (m, 2) px per exposure.
+    """Return derivatives (m, 2, 8) of pixels at `time` (m,), and velocities (m, 2), px per exposure.
 
-    The parameters are rate (3), acceleration (3) and the star's pixel at mid-exposure (2). The derivatives
-    are exact for rate and star, of second order in the rotation angle for the acceleration, and zero for the
-    acceleration unless `growing`.
+    The parameters are the rate (3), the acceleration (3) and the star's pixel at mid-exposure (2). The
+    derivatives with respect to rate and star are exact. Those with respect to the acceleration have an error
+    of second order in the rotation angle, and are zero unless `growing`.
     """
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(pinhole, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
-    # A change of the rate rotates the camera by a small vector psi, which moves the star by v x psi.
-    # The vector psi is the integral over t' of the rotation from t' to t.
+    # A change of the rate rotates the camera by a small vector psi, which moves the direction v by v x psi.
+    # The vector psi is the time integral, over t', of the rotation from t' to t.
     flow = _flow(pinhole, there)
-    # The rotation is evaluated with the mean rate since mid-exposure, whose error is of higher order.
+    # The rotation is approximated by the mean rate since mid-exposure, with an error of higher order.
     mean = motion.rate[:, None] + 0.5 * time * motion.acceleration[:, None]
     if motion.higher_terms.any():
         mean += motion.higher(time) / np.where(np.abs(time) < _TINY, 1.0, time)
@@ -256,17 +258,17 @@ def sensitivities_and_velocity(
     if isinstance(pinhole, DistortedPinhole):
         jacobian = pinhole.jacobian(_pixels(pinhole, there))
         change, pace = jacobian @ change, (jacobian @ pace[..., None])[..., 0]
-        # The star's pixel at mid-exposure is distorted, so that its derivative needs the inverse Jacobian.
+        # Pixels at mid-exposure are distorted, so that their derivatives need the inverse Jacobian.
         change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.jacobian(pinhole.undistorted(stars)))
     return change, pace
 
 
-# In the functions below, vector arrays are (..., 3, m), so that each component is contiguous in memory.
-# The functions above return transposed views of such arrays.
+# The functions below use vector arrays (..., 3, m), so that each component is contiguous in memory.
+# The functions above this line return transposed views of (..., 3, m) arrays.
 
 
 def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the image flow (2, 3, m), px per rad, at image coordinates `there` (2, m): x/z and y/z."""
+    """Return the image flow (2, 3, m), px/rad, at normalised image coordinates `there` (2, m)."""
     x, y = there
     xy = x * y
     out = np.empty((2, 3, len(x)))
@@ -277,7 +279,7 @@ def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
 
 
 def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
-    """Return the directions (3, m) of pixels (m, 2), scaled to z = 1."""
+    """Return the directions (3, m) of pixels `stars` (m, 2), scaled to z = 1."""
     if isinstance(pinhole, DistortedPinhole):
         stars = pinhole.undistorted(stars)
     out = np.ones((3, len(stars)))
@@ -288,21 +290,21 @@ def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
 
 
 def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
-    """Return the ideal pixels (m, 2) of normalised image coordinates `there` (2, m): x/z and y/z."""
+    """Return the ideal pixels (m, 2) of normalised image coordinates `there` (2, m), x/z and y/z."""
     pixel = pinhole.focal_length * there
     pixel += np.array(pinhole.centre)[:, None]
     return pixel.T
 
 
 def _rate(motion: CameraMotion, time: FloatArray) -> FloatArray:
-    """Return the rate at `time` (m,): (3, m), or (3, 1) if it is constant."""
+    """Return the rate (3, m) at `time` (m,), or an array (3, 1) if the rate is constant."""
     if motion.constant:
         return motion.rate[:, None]
     return motion.rate[:, None] + motion.acceleration[:, None] * time + motion.higher(time, 1)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b of vectors a (..., 3, m) with b (3, m), or with one vector b (3, 1)."""
+    """Return the cross products of vectors `a` (..., 3, m) with `b` (3, m), or with one vector `b` (3, 1)."""
     if b.shape[1] == 1:
         x, y, z = b[:, 0]
         return np.asarray(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ a)
@@ -311,9 +313,9 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _rotation_until(motion: CameraMotion, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the axis of the rotation from mid-exposure to `time` (m,), and sine and cosine of its angle.
+    """Return axis (3, m), sine (m,) and cosine (m,) of the rotation from mid-exposure to `time` (m,).
 
-    The axis is (3, m), or (3, 1) if the rate is constant.
+    The axis has the shape (3, 1) if the rate is constant.
     """
     if motion.constant:
         angle = float(np.linalg.norm(motion.rate))
@@ -341,45 +343,45 @@ def _rotated(rotation: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray)
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """The time at which each row of the detector is exposed.
+    """Exposure times of the rows of a detector with a rolling or global shutter.
 
     Attributes:
-        delay_per_row: delay of each row to the one above it, in exposures; 0 for a global shutter.
-        middle: row whose mid-exposure is at time zero.
+        delay_per_row: delay from one row to the next, in exposures. It is 0 for a global shutter.
+        middle: row that is at mid-exposure at time zero.
     """
 
     delay_per_row: float = 0.0
     middle: float = 0.0
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
-        """Return the delay of `rows` to the middle row, in exposures."""
-        # Scalars of the type of `rows` keep float32 arrays in float32.
+        """Return the exposure delay of `rows` relative to the middle row, in exposures."""
+        # Scalars of the same type as `rows` preserve float32.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
 
-# Number of polynomial coefficients that describe the rate over an exposure.
+# Number of polynomial coefficients that represent the rate over an exposure.
 _COURSE_TERMS = 7
-# Largest departure (px) of a star's motion from a constant rate that is neglected.
+# Largest departure (px) of a star's motion from uniform motion that is neglected.
 _UNEVEN = 0.05
-# Number of instants of the exposure at which the departure from a constant rate is evaluated.
+# Number of instants at which the departure from uniform motion is evaluated.
 _INSTANTS = 65
-# Largest uncertainty (px over the exposure) of a motion from navigation that the fit uses.
+# Largest uncertainty (px per exposure) of the navigation filter's motion that the fit accepts.
 _MOST_VAGUE = 3.0
-# Error of the mean rate due to an error of the motion from navigation, relative to its uncertainty.
+# Error of the mean rate per error of the navigation filter's rate, as a ratio.
 _COURSE_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """The rotation of the camera over the exposure as estimated from gyro and commanded torque.
+    """Rotation of the camera over the exposure as a polynomial in time, from gyro and commanded torque.
 
-    The pixels determine the rate and its linear change. Higher terms, for instance of a step of the rate
-    within the exposure, are better known from navigation and are held fixed in the fit.
+    The pixels of the frame determine the rate and its linear change. Higher-order terms, for example of a
+    step of the rate, are better known from the navigation filter and are held fixed in the fit.
 
     Attributes:
-        terms: (k, 3) rad, coefficients of t, t^2, ... of the rotation vector since mid-exposure, in camera
-            axes.
-        sigma: rad, standard deviation of the rate times the exposure.
+        terms: (k, 3) coefficients of t, t^2, ... in the rotation vector since mid-exposure, in camera axes,
+            rad.
+        sigma: standard deviation of the rate times the exposure, rad.
     """
 
     terms: FloatArray
@@ -387,9 +389,9 @@ class Course:
 
     @classmethod
     def of_rates(cls, rates: FloatArray, exposure: float, sigma: float) -> Course:
-        """Return the course of `rates` (n, 3) rad/s at n equidistant times from start to end of the exposure.
+        """Return the course for `rates` (n, 3), rad/s, at n equidistant times over the exposure.
 
-        The exposure is in s; `sigma` is the standard deviation of the rates in rad/s.
+        The exposure is in s; `sigma` is the standard deviation of the rates, rad/s.
         """
         times = np.linspace(-0.5, 0.5, len(rates))[:, None]
         powers = np.arange(_COURSE_TERMS)
@@ -398,29 +400,29 @@ class Course:
         return cls(fitted * exposure / (powers[:, None] + 1.0), exposure * float(np.hypot(sigma, missed)))
 
     def motion(self, focal_length: float) -> CameraMotion | None:
-        """Return the motion for a camera of `focal_length` px, None if too uncertain or nearly constant."""
+        """Return the motion for a camera of `focal_length` px, or None if uncertain or nearly uniform."""
         motion = CameraMotion(self.terms[0], 2.0 * self.terms[1], self.terms[2:])
         time = np.linspace(-0.5, 0.5, _INSTANTS)
         uneven = (motion.progress(time) - time) * float(np.linalg.norm(motion.rotation)) * focal_length
         return motion if np.ptp(uneven) > _UNEVEN and self.sigma * focal_length < _MOST_VAGUE else None
 
     def covariance(self, exposure: float) -> FloatArray:
-        """Return the covariance (3, 3) rad^2/s^2 that an error of the course adds to the mean rate."""
+        """Return the covariance (3, 3), rad^2/s^2, of the mean rate from errors of the course."""
         return np.eye(3) * (_COURSE_SHARE * self.sigma / exposure) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakScene:
-    """The unknowns of the fit: motion, point spread and stars.
+    """Unknowns of the fit: motion, point spread and stars.
 
     Attributes:
-        motion: motion of the camera.
-        width: px, standard deviation of the point spread convolved with a pixel.
-        stars: (n, 2) px at mid-exposure.
-        light: (n,) counts over the exposure.
-        sky: (n,) counts per pixel around each star, relative to the frame's background.
-        trusted: (n,) whether a star contributes to the shared parameters; of untrusted stars only light,
-            position and sky are fitted.
+        motion: rotation of the camera over the exposure.
+        width: standard deviation of the point spread convolved with a pixel, px.
+        stars: (n, 2) positions of the stars at mid-exposure, px.
+        light: (n,) flux of each star over the exposure, counts.
+        sky: (n,) sky level around each star relative to the frame's background, counts per pixel.
+        trusted: (n,) whether each star contributes to the shared parameters. For untrusted stars, only flux,
+            position and sky level are fitted.
     """
 
     motion: CameraMotion
@@ -432,15 +434,15 @@ class StreakScene:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation (px) of the point spread without the pixel."""
+        """The standard deviation (px) of the point spread without pixel convolution."""
         return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> StreakScene:
-        """Return the scene with only the `chosen` stars, a mask or indices."""
+        """Return the scene reduced to the `chosen` stars, which are given as a mask or as indices."""
         return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> StreakScene:
-        """Return the scene with additional untrusted stars (m, 2) px of `light` (m,) counts."""
+        """Return the scene with more untrusted stars at `stars` (m, 2) px with flux `light` (m,) counts."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),
@@ -453,12 +455,12 @@ class StreakScene:
 def exposure_bounds(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, stars: FloatArray
 ) -> FloatArray:
-    """Return the times (n, 2) at which the exposure of each of `stars` (n, 2) px begins and ends."""
+    """Return the start and end times (n, 2) of the exposure of each of `stars` (n, 2), px."""
     times = np.tile([-0.5, 0.5], (len(stars), 1))
     if shutter.delay_per_row == 0.0:
         return times
-    # The row of each end of a path depends on the end's time, which is found by fixed-point iteration.
-    # It converges, because a star crosses few rows during the delay of one row.
+    # The row in which a path ends depends on the end time, which is found by fixed-point iteration.
+    # The iteration converges, because a star crosses few rows during the delay of one row.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
@@ -469,7 +471,7 @@ def exposure_bounds(
 def mid_exposure_positions(
     pinhole: Pinhole, motion: CameraMotion, shutter: Shutter, middles: FloatArray
 ) -> FloatArray:
-    """Return the positions (n, 2), px, at mid-exposure of stars with streaks centred at `middles` (n, 2)."""
+    """Return the positions (n, 2), px, at mid-exposure of streaks centred at `middles` (n, 2), px."""
     if not len(middles):
         return middles
     if not motion.constant:
@@ -481,7 +483,7 @@ def mid_exposure_positions(
 
 
 def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> FloatArray:
-    """Return the lengths (n,) px of the paths of `stars` (n, 2) px."""
+    """Return the path lengths (n,), px, of stars at pixels `stars` (n, 2)."""
     samples = 9
     time = np.tile(np.linspace(-0.5, 0.5, samples), len(stars))
     there = positions(pinhole, motion, np.repeat(stars, samples, axis=0), time).reshape(-1, samples, 2)
@@ -489,16 +491,16 @@ def path_lengths(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> F
     return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))
 
 
-# Largest distance (px) between the circles of two pieces of one streak.
+# Largest distance (px) across the streak between two segments of one streak.
 _CHAIN_ASIDE = 1.3
-# Range of the distance along the circle between two pieces, relative to the rotation angle.
+# Range of the distance along the streak between two segments, relative to the rotation angle.
 _CHAIN_APART = (0.55, 1.7)
-# Largest ratio of the light of two pieces of one streak.
+# Largest flux ratio of two segments of one streak.
 _CHAIN_RATIO = 2.5
 
 
 def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the angles (n,) rad of `stars` (n, 2) px from the axis of rotation, and their azimuths (n,)."""
+    """Return the angles (n,) of `stars` (n, 2) px from the rotation axis, and their azimuths (n,), rad."""
     axis = motion.rotation / max(float(np.linalg.norm(motion.rotation)), 1e-12)
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
@@ -507,18 +509,18 @@ def polar_angles(pinhole: Pinhole, motion: CameraMotion, stars: FloatArray) -> t
 
 
 def azimuth_differences(azimuth: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the absolute differences (n, m) rad, at most pi, of azimuths (n,) and (m,) rad."""
+    """Return the absolute differences (n, m), at most pi, between azimuths (n,) and (m,), all in rad."""
     return np.asarray(np.abs(np.remainder(azimuth[:, None] - other + np.pi, 2.0 * np.pi) - np.pi))
 
 
 def chained_stars(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, light: FloatArray, judged: int
 ) -> BoolArray:
-    """Return which of the first `judged` of `stars` (n, 2) px look like pieces of a longer streak.
+    """Return whether each of the first `judged` of `stars` (n, 2) px looks like a segment of a longer streak.
 
-    If the assumed rotation is too small, each star becomes a chain of streaks of equal `light` (n,), end to
-    end on one circle about the axis, and each piece fits as well as a whole streak. Different stars rarely
-    form such a chain by chance.
+    If the assumed rotation is too small, each streak is modelled as a chain of shorter streaks of equal flux
+    `light` (n,) on one circle about the rotation axis, and each segment fits as well as a complete streak.
+    Different stars rarely form such a chain of segments by chance.
     """
     polar, azimuth = polar_angles(pinhole, motion, stars)
     rotations = azimuth_differences(azimuth[:judged], azimuth)
@@ -532,7 +534,7 @@ def chained_stars(
 def near_streaks(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, others: FloatArray, distance: float
 ) -> BoolArray:
-    """Return which streaks of `stars` (n, 2) px come within `distance` px of a streak of `others` (m, 2)."""
+    """Return which streaks of `stars` (n, 2) px pass within `distance` px of a streak of `others` (m, 2)."""
     polar, azimuth = polar_angles(pinhole, motion, stars)
     other_polar, other_azimuth = polar_angles(pinhole, motion, others)
     beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance

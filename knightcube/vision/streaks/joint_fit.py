@@ -1,12 +1,12 @@
-"""The joint fit of the motion and the brightest stars, with all stars that share their pixels.
+"""Joint fit of the motion and the brightest stars, together with all stars on the same pixels.
 
-The fit iterates until the steps of the shared parameters are small. It covers only a few pixels beyond the
-ends of the streaks, so that a wrong rotation angle can be a local maximum. A rotation that is too small by a
-fifth can fit one end of every streak; `true_ends` detects that light continues beyond the other ends. A
-rotation that is too large extends the streaks over dark pixels; `unbroken` detects dark stretches. If an end
-lies more than a few widths of the point spread beyond the light, the pixels around it contain no light that
-could attract the end. `stretched` then searches a longer distance for the end of the light and corrects the
-length.
+The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
+the ends of the streaks, so that it can converge to a wrong rotation angle. With a rotation that is too small,
+the model may match only one end of every streak. The function `true_ends` detects flux beyond the other ends.
+With a rotation that is too large, the modelled streaks extend over dark pixels. The function `unbroken`
+detects such gaps. If a modelled end lies more than a few point-spread widths beyond the true end, the pixels
+around it contain no starlight and do not attract the end. The function `stretched` then searches a longer
+distance for the true ends and corrects the streak length.
 """
 
 from __future__ import annotations
@@ -51,23 +51,23 @@ from knightcube.vision.streaks.normal_equations import (
 )
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
-# Work (pixels) after which no other motion is tried.
-# A fit in progress is finished, so that a frame may take twice this work.
+# Work (pixels) after which no further motion is fitted.
+# A fit in progress is completed, so that a frame may take twice the work of this limit.
 _MOST_WORK = 1_600_000
-# Fixed work of one evaluation of the model, in equivalent pixels.
+# Fixed overhead of one model evaluation, in equivalent pixels.
 _EVALUATION = 15_000
-# Work of a pass over the frame per pixel of the frame, relative to a pixel of a model evaluation.
+# Work of a pass over the frame, relative to a model evaluation of the same number of pixels.
 _PASS = 0.15
 
 
 class WorkBudget:
-    """The work on one frame, in pixels instead of seconds, so that all machines give the same results."""
+    """Work spent on one frame, counted in pixels so that results do not depend on the machine's speed."""
 
     def __init__(self) -> None:
         self._spent = 0.0
 
     def evaluated(self, pixels: int) -> None:
-        """Add the work of one model evaluation on `pixels` pixels."""
+        """Add the work of one model evaluation of `pixels` pixels."""
         self._spent += pixels + _EVALUATION
 
     def passed(self, pixels: int) -> None:
@@ -76,37 +76,37 @@ class WorkBudget:
 
     @property
     def exhausted(self) -> bool:
-        """Whether the work exceeds the limit above which no further motion is tried."""
+        """Whether the work exceeds the limit after which no further motion is fitted."""
         return self._spent > _MOST_WORK
 
 
-# Largest displacement (px) of a streak's end in one step of the fit.
+# Largest displacement (px) of a streak end in one step of the fit.
 _LONGEST_STEP = 3.0
-# Displacement (px) of a streak's end after which the fitted windows are cut again.
+# Displacement (px) of a streak end after which the fit windows are selected again.
 _DRIFT = 2.0
-# Displacement (px) of an untrusted star's streak after which the first round cuts the windows again.
-# Later rounds ignore untrusted stars, because the light of some of them hardly determines their position.
+# Displacement (px) of an untrusted star in the first iteration after which fit windows are selected again.
+# Later iterations ignore untrusted stars, because the positions of some are poorly determined.
 _FAINT_DRIFT = 3.2
-# Change of the acceleration, relative to the rotation, after which the fitted windows are cut again.
+# Change of the acceleration, relative to the rotation, after which the fit windows are selected again.
 _GROWN = 0.1
-# Step of the shared parameters, in standard deviations, at which the fit stops.
-# The step is applied, so that the remaining error is of second order.
+# Step of the shared parameters (standard deviations) at which the fit is converged.
+# The final step is applied, so that the remaining error is of second order.
 SETTLED = 0.4
-# Largest ratio of consecutive steps with which the fit continues after its rounds of patience.
+# Largest ratio of consecutive steps that counts as progress of the fit.
 _LEAST_PROGRESS = 0.7
-# Number of rounds after which the selection of clipped pixels is final.
+# Number of iterations after which the selection of clipped pixels is final.
 _LOOKS = 1
-# Probability with which the score test rejects a constant rate by chance.
+# Probability of a false alarm of the score test for a changing rate.
 _BY_CHANCE = 1e-4
-# Ratio of the approximate test statistic to its limit below which the exact test is omitted.
+# Ratio of the approximate test statistic to its limit below which the exact statistic is not computed.
 _FAR_BELOW = 0.5
-# Number of parameters of the acceleration, the degrees of freedom of the score test.
+# Number of acceleration components, which are the degrees of freedom of the score test.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
-"""The free shared parameters of a changing rate."""
-# Largest width (px) of the point spread in a joint fit.
+"""Mask of the shared parameters that are free in a fit with a changing rate."""
+# Largest point-spread width (px) in a joint fit.
 _WIDEST = 6.0
-# Largest ratio of the fitted to the initial width of the point spread in a joint fit.
+# Largest ratio of the fitted to the initial point-spread width in a joint fit.
 _WIDER = 1.6
 
 
@@ -115,12 +115,12 @@ class IterationLimits:
     """Limits of the iteration.
 
     Attributes:
-        rounds: maximum number of rounds.
-        clipped: whether pixels far beyond the noise are excluded.
-        tolerance: px, step of an end or of the width at which the fit has settled.
-        settled: step of the shared parameters, in standard deviations, at which the fit has settled.
-        conjugate: maximum number of conjugate-gradient steps for shared pixels.
-        patience: number of rounds without a check of progress.
+        rounds: maximum number of iterations.
+        clipped: whether pixels with residuals far beyond the noise are excluded.
+        tolerance: largest step (px) of a streak end or of the width at which the fit is converged.
+        settled: largest step (standard deviations) of the shared parameters at which the fit is converged.
+        conjugate: maximum number of conjugate-gradient iterations for stars that share pixels.
+        patience: number of iterations before the first check of progress.
     """
 
     rounds: int
@@ -138,18 +138,18 @@ LAST = IterationLimits(7, clipped=True, tolerance=0.003, settled=SETTLED, conjug
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitProblem:
-    """A frame with all data and settings for its fit.
+    """A frame with the data and settings of its fit.
 
     Attributes:
         frame: the frame.
-        pinhole: geometry of the camera.
-        shutter: times of exposure of the rows.
+        pinhole: projection of the camera.
+        shutter: exposure times of the rows.
         settings: settings of the estimator.
-        sigma: px, initial width of the point spread.
-        growing: whether the acceleration is fitted.
+        sigma: initial standard deviation of the point spread, px.
+        growing: whether the angular acceleration is fitted.
         sense: (3,) direction along which the rotation must have a positive component; None for either sense.
-        course: motion known from navigation; None if unknown or nearly constant.
-        work: work spent on the frame.
+        course: motion from the navigation filter; None if it is unknown or nearly uniform.
+        work: work spent on this frame so far.
     """
 
     frame: ReducedFrame
@@ -164,20 +164,20 @@ class FitProblem:
 
     @property
     def free(self) -> BoolArray:
-        """Which shared parameters are fitted."""
+        """Mask of the shared parameters that are fitted."""
         return np.array([True] * 3 + [self.growing] * 3 + [True])
 
     @property
     def undecided(self) -> bool:
-        """Whether the choice between a constant and a changing rate is still open."""
+        """Whether the fit still has to choose between a constant and a changing rate."""
         return self.settings.rate_model == "auto" and not self.growing
 
     def windows(self, scene: StreakScene) -> FitWindows:
-        """Return the pixels near the streaks of `scene`."""
+        """Return the windows of pixels near the streaks of `scene`."""
         return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
 
     def evaluate(self, scene: StreakScene, windows: FitWindows, clip: float) -> Evaluation:
-        """Return the normal equations of `scene`, see `normal_equations.evaluate`."""
+        """Return the normal equations for `scene`, see `normal_equations.evaluate`."""
         self.work.evaluated(len(windows.slot))
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
@@ -185,16 +185,16 @@ class FitProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakFit:
-    """A fitted scene, with the normal equations of its last step.
+    """A fitted scene with the normal equations of the last step.
 
     Attributes:
         scene: the fitted scene.
         solution: last step.
-        evaluation: equations of the last step.
-        last_step: last step of the shared parameters, in standard deviations; 0 if the fit has settled.
+        evaluation: normal equations of the last step.
+        last_step: last step of the shared parameters in standard deviations. It is 0 if the fit is converged.
         windows: fitted pixels.
-        free: (SHARED,) which shared parameters were fitted.
-        hidden: stars on the fitted pixels that were subtracted and not fitted; None without any.
+        free: (SHARED,) mask of the shared parameters that were fitted.
+        hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
     """
 
     scene: StreakScene
@@ -208,9 +208,9 @@ class StreakFit:
     def grows(self) -> bool:
         """Return whether the rate changes significantly, by a score test of the constant rate.
 
-        The test accounts for the scatter of the stars' accelerations (Hotelling's T-squared).
+        The test accounts for the scatter of the accelerations of single stars (Hotelling's T-squared test).
         """
-        # The approximation that neglects shared pixels decides most cases.
+        # An approximation that neglects shared pixels is sufficient in most cases.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
@@ -232,14 +232,14 @@ def iterate(
     how: IterationLimits,
     windows: FitWindows | None = None,
 ) -> StreakFit | None:
-    """Return the fit of all stars and of the `free` (SHARED,) shared parameters, None if not determined."""
+    """Return the fit of all stars and of the shared parameters in the mask `free` (SHARED,), or None."""
     faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
     windows = whole = windows or camera.windows(scene)
     last_step, previous, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
-        evaluation = None  # frees tens of MB before the next evaluation
+        evaluation = None  # This frees tens of MB before the next evaluation.
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
@@ -254,7 +254,7 @@ def iterate(
         if last_step <= how.settled or wanted <= how.tolerance:
             last_step = 0.0
             break
-        # Consecutive steps in the same direction count as progress.
+        # Consecutive steps in the same direction also count as progress.
         onward = (
             float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
         )
@@ -262,11 +262,11 @@ def iterate(
             break
         previous, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
-            del windows, whole  # frees tens of MB before new windows are cut
+            del windows, whole  # This frees tens of MB before new windows are selected.
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
-            # A changing selection of clipped pixels would keep the fit from settling.
+            # The fit would not converge while the selection of clipped pixels changes.
             windows = whole.only(*evaluation.kept)
     if solution is None or evaluation is None:
         return None
@@ -274,9 +274,10 @@ def iterate(
 
 
 def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint: float) -> bool:
-    """Return whether windows must be cut again: an end has moved, or the acceleration has changed.
+    """Return whether the fit windows must be selected again, because ends moved or the acceleration changed.
 
-    `faint` is the displacement (px) of the ends of untrusted stars above which windows are cut again.
+    `faint` is the displacement (px) of an untrusted star's streak ends above which windows are selected
+    again.
     """
     grown = float(np.linalg.norm(after.motion.acceleration - before.motion.acceleration))
     if grown > _GROWN * float(np.linalg.norm(after.motion.rotation)):
@@ -290,48 +291,50 @@ def _drifted(camera: FitProblem, before: StreakScene, after: StreakScene, faint:
 
 
 def misfit(evaluation: Evaluation, stars: IntArray | slice = slice(None)) -> float:
-    """Return the median chi-square per degree of freedom of the chosen `stars`, NaN if there are none."""
+    """Return the median chi-square per degree of freedom of selected `stars`, or NaN if there are none."""
     freedom = np.maximum(evaluation.pixels[stars] - ALONE - 1.0, 1.0)
     return float(np.median(evaluation.chi2[stars] / freedom)) if len(freedom) else float("nan")
 
 
-# Length of the stretch that is compared at each end, as a fraction of the path.
+# Length of the segments compared at each streak end, as a fraction of the path length.
 _STRETCH = 0.1
-# Minimum length (px) of the stretch that is compared at each end.
+# Minimum length (px) of the segments compared at each streak end.
 _LEAST_STRETCH = 8.0
-# Distance (px) of the compared stretch from the end of the path.
+# Distance (px) between the streak end and the segments compared on both sides of it.
 _FROM_END = 4.0
-# Number of samples along the stretch at an end.
+# Number of samples along a segment at a streak end.
 _SAMPLES = 24
-# Number of stretches into which a path is divided to find dark ones.
+# Number of segments into which a path is divided to find gaps.
 _WITHIN = 10
-# Number of samples along each of these stretches of a path.
+# Number of samples in each segment of a path that is searched for gaps.
 _WITHIN_SAMPLES = 10
-# Offsets (px) of the samples across the path.
+# Offsets (px) of samples across the path of a star.
 _ASIDE = np.array([-1.0, 0.0, 1.0])
-# Mean brightness of the three central pixels across a streak, relative to its light per px of length.
+# Mean intensity of the three central pixels across a streak, relative to the flux per px of length.
 _MIDDLE = 0.287
-# Brightness, relative to the expected brightness, below which a stretch counts as dark.
+# Ratio of measured to expected intensity below which a segment counts as dark.
 _HALF = 0.5
-# Minimum fraction of usable pixels in a stretch whose brightness is measured.
+# Minimum fraction of usable pixels in a segment whose intensity is measured.
 _LEAST_VALID = 0.7
-# Minimum expected brightness of a stretch that is judged, in standard deviations.
+# Minimum expected intensity (standard deviations) of a segment that is tested.
 _LEAST_SIGNIFICANCE = 4.0
-# Number of instants at which the progress along a path is evaluated.
+# Number of instants at which the progress of the rotation is evaluated.
 _INSTANTS = 65
-# Minimum speed, relative to the mean, in the expected brightness.
-# The point spread smooths the brighter light of slower stretches.
+# Minimum relative speed of a star in the expected intensity of its streak.
+# The point spread limits the intensity of segments where the star is slow.
 _SLOW = 0.5
-# Minimum brightness beyond an end, relative to the streak's mean, that counts as a trail.
+# Minimum intensity beyond a streak end, relative to the mean of the streak, that counts as a trail.
 _TRAIL = 0.08
-# Largest fraction of dark stretches in an unbroken streak.
+# Largest fraction of dark segments in a streak without gaps.
 _DARK = 0.15
 
 
 def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return an array (n, 2) with 1 for the ends of streaks at which the light ends, and 0 for other ends.
+    """Return an array (n, 2) with 1 for confirmed streak ends and 0 for wrong streak ends.
 
-    Ends outside the detector and ends of streaks that are too short to judge are NaN.
+    A confirmed end has starlight only on the inner side.
+
+    Ends outside the detector and ends of very short streaks are NaN.
     """
     out = np.full((len(scene.stars), 2), np.nan)
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -340,12 +343,12 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
         return out
     scene, length = scene.select(long), length[long]
     instants = np.linspace(-0.5, 0.5, _INSTANTS)
-    # The small term in time keeps the progress strictly increasing while the camera is at rest.
+    # The small linear term makes the progress strictly increasing while the camera is at rest.
     progress = np.maximum.accumulate(scene.motion.progress(instants)) + 1e-9 * np.arange(_INSTANTS)
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
     for end, sign, steady, there, speed in _end_motions(camera, scene):
-        # The brightness of the stretch relative to the mean follows from the time that the star spends in it.
+        # The expected intensity of a segment is proportional to the time that the star spends in it.
         near, far = _FROM_END / speed, (_FROM_END + stretch) / speed
         last = progress[-1 if sign > 0.0 else 0]
         begin, stop = (np.interp(last - sign * distance, progress, instants) for distance in (near, far))
@@ -360,9 +363,9 @@ def true_ends(camera: FitProblem, scene: StreakScene) -> FloatArray:
 
 
 def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the fraction of the judged stars that have faint light, a trail, beyond an end.
+    """Return the fraction of the tested stars with faint flux, a trail, beyond a streak end.
 
-    An error of the fitted change of the rate causes such trails.
+    A wrong angular acceleration in the fit causes such trails.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     faint = _TRAIL * expected_brightness(scene.light, length)
@@ -379,9 +382,9 @@ def trailing_fraction(camera: FitProblem, scene: StreakScene) -> float:
 def _end_motions(
     camera: FitProblem, scene: StreakScene
 ) -> Iterator[tuple[int, float, CameraMotion, FloatArray, FloatArray]]:
-    """Yield for each end its number, outward sign, a steady motion, the ends (n, 2) px and speeds (n,).
+    """Yield index, outward sign, uniform motion, positions (n, 2) px and speeds (n,) for both streak ends.
 
-    The steady motion extends the paths beyond the ends, because the motion itself may be at rest at an end.
+    The uniform motion extrapolates the paths, because the motion itself may come to rest at a streak end.
     """
     times = exposure_bounds(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     steady = CameraMotion.steady(scene.motion.rotation)
@@ -392,9 +395,9 @@ def _end_motions(
 
 
 def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
-    """Return an array (k,) with 1 for stars that are bright along their entire paths, and 0 for others.
+    """Return an array (k,) with 1 for stars whose streaks have no gaps, and 0 for other stars.
 
-    Only the part of a path on the detector counts. Stars that are too short or too faint to judge are
+    Only the part of a path on the detector is tested. Stars with very short or very faint streaks are
     omitted.
     """
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
@@ -419,16 +422,17 @@ def unbroken(camera: FitProblem, scene: StreakScene) -> FloatArray:
 
 
 def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the expected `brightness` (n,) of streaks of `light` (n,) counts and `length` (n,) px."""
+    """Return the expected intensity (n,) of streaks of flux `light` (n,) counts and `length` (n,) px."""
     return np.asarray(_MIDDLE * light / length)
 
 
 def brightness(
     camera: FitProblem, motion: CameraMotion, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the mean counts (n,) of pixels along stretches of paths, and their standard deviations (n,).
+    """Return mean counts (n,) of pixels along path segments, and the standard errors (n,) of these means.
 
-    `time` (n, s) are the instants of each stretch. The mean is NaN if too few pixels are usable.
+    `time` (n, s) holds the sampling times of each path segment. The mean is NaN if a segment has too few
+    usable pixels.
     """
     frame, pinhole, samples = camera.frame, camera.pinhole, time.shape[1]
     there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
@@ -447,33 +451,32 @@ def brightness(
     return np.where(enough, total / count, np.nan), np.sqrt(variance) / count
 
 
-# Distance on either side of a path's end that is searched for the end of the light, relative to the path
-# length.
+# Half length of the search for a streak end around the modelled end, relative to the path length.
 _REACH = 0.08
-# Minimum and maximum distance (px) that is searched for the end of the light.
+# Minimum and maximum half length (px) of the search for a streak end.
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
-# Number of steps over the searched distance.
+# Number of samples in the search for a streak end.
 _STEPS = 41
-# Minimum significance (standard deviations) of the light near an end whose position is measured.
+# Minimum significance (standard deviations) of the intensity near a streak end that is measured.
 _EDGE_SIGNIFICANCE = 5.0
-# Largest brightness in the search, relative to the expected brightness, to limit the effect of other stars.
+# Upper limit of the intensity relative to the expected intensity, which limits the effect of other stars.
 _CAP = 2.0
-# Minimum number of streaks of wrong length for a correction of the length.
+# Minimum number of streaks with a wrong length for a correction of the rotation angle.
 _LEAST_STREAKS = 3
-# Minimum error (px) of a streak's length that counts as wrong.
+# Minimum error (px) of a streak length that counts as wrong.
 _LEAST_OFF = 4.0
-# Largest difference (px) between the length errors of streaks that agree.
+# Largest difference (px) between the length errors of streaks that agree with each other.
 _ALIKE = 3.0
-# Minimum ratio of the number of streaks of wrong length to that of streaks of correct length.
+# Minimum ratio of streaks with a wrong length to streaks with a correct length.
 _MORE = 2
-# Largest relative change of the rate at which the length is corrected.
+# Largest relative change of the rate at which the rotation angle is corrected.
 _MOST_STRETCHED_CHANGE = 0.5
 
 
 def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray, FloatArray]:
-    """Return distances (n, 2) px of the light beyond the ends of the paths, and the path lengths (n,) px.
+    """Return distances (n, 2) px from modelled to measured streak ends, and path lengths (n,) px.
 
-    Unknown distances are NaN.
+    A distance is positive outwards, and NaN if the streak end cannot be measured.
     """
     motion, stars = scene.motion, scene.stars
     length = path_lengths(camera.pinhole, motion, stars)
@@ -492,7 +495,7 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
         mean, deviation = brightness(camera, motion, repeated, time.reshape(-1, 1))
         mean, deviation = mean.reshape(-1, _STEPS), np.maximum(deviation.reshape(-1, _STEPS), 1e-6)
         seen = np.minimum(np.maximum(mean, -expected), _CAP * expected)
-        # The log-likelihood ratio of a lit and a dark path is accumulated outwards.
+        # The log-likelihood ratio between starlight and a dark background is accumulated outwards.
         explained = np.cumsum((seen - 0.5 * expected) * expected / deviation**2, axis=1)
         last = np.argmax(explained, axis=1)
         sure = np.sum((expected / deviation) ** 2, axis=1) > _EDGE_SIGNIFICANCE**2
@@ -503,11 +506,11 @@ def find_light_ends(camera: FitProblem, scene: StreakScene) -> tuple[FloatArray,
 
 
 def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
-    """Return `scene` with its rotation corrected so that streaks and light have the same ends.
+    """Return `scene` with the rotation corrected so that modelled and measured streak ends agree.
 
-    The result is None if no correction is needed, or if the rate changes so much that the brightness varies
-    along a streak. The stars are moved to the centre of their ends, or to the right distance from the only
-    end in the frame.
+    Returns None if no correction is needed, or if the rate changes so much that the intensity varies along a
+    streak. Each star is moved to the middle between its ends, or to half a streak length from its only end in
+    the frame.
     """
     if abs(scene.motion.relative_acceleration) > _MOST_STRETCHED_CHANGE:
         return None
@@ -526,7 +529,7 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     if stretch == 0.0:
         return None
     off = beyond / np.maximum(length, 1.0)[:, None]
-    # Each end gives the time of mid-exposure under the uncorrected motion.
+    # Each measured end gives the time of mid-exposure under the uncorrected motion.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
@@ -535,42 +538,42 @@ def stretched(camera: FitProblem, scene: StreakScene) -> StreakScene | None:
     return replace(scene, motion=motion, stars=moved)
 
 
-# Largest relative change of the rate over the exposure.
-# A motion that begins or ends at rest has a change of 2.
+# Largest change of the rate over the exposure, relative to the rate at mid-exposure.
+# The relative change is 2 for a motion that starts or ends at rest.
 _MOST_CHANGE = 2.2
-# Deviation of a star from the majority, in standard deviations, above which it is not trusted.
+# Deviation (standard deviations) of a star from the majority above which it is untrusted.
 _TRUST_SIGMAS = 3.5
-# Model error (px) of the ends of a streak, added to the noise in the test of the stars.
+# Model error (px) of a streak's ends in the consistency test of the stars.
 _END_FLOOR = 0.01
-# Model error (px) of the width of a streak, added to the noise in the test of the stars.
+# Model error (px) of a streak's width in the consistency test of the stars.
 _WIDTH_FLOOR = 0.002
-# Distance between two streaks, relative to the half width of a strip, below which they are fitted together.
+# Distance (half widths of a fit window) between two streaks below which they are fitted together.
 _NEAR = 1.4
-# Displacement (px) of the ends between first and last fit above which faint stars are searched again.
+# Displacement (px) of the streak ends during the fit above which faint stars are searched again.
 _FAR = 6.0
 # Maximum number of searches for faint stars.
 _MOST_REPEATS = 2
-# Relative error of the light that a subtracted star leaves on a pixel.
+# Relative error of the modelled flux of a subtracted star on a pixel.
 _SUBTRACTION_ERROR = 0.35
-# Maximum number of pixels in all windows, which bounds memory and time.
-# A shared pixel counts once for each of its stars.
+# Maximum number of pixels in all fit windows, which limits memory and time.
+# A pixel in several windows counts once for each window.
 _MOST_PIXELS = 60_000
-# Fraction of `_MOST_PIXELS` for the brightest streaks in a fit with all their neighbours.
+# Fraction of `_MOST_PIXELS` for the brightest streaks if all their neighbours are fitted.
 _BRIGHTEST_SHARE = 0.5
-# Minimum number of the brightest streaks in a fit with all their neighbours.
+# Minimum number of streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10
-# Minimum significance (standard deviations) of hidden stars on the pixels of bright streaks.
-# Hidden stars shift the ends of the bright streaks.
+# Minimum significance (standard deviations) of faint stars on the pixels of bright streaks.
+# Undetected faint stars would shift the ends of the bright streaks.
 _HIDDEN_SIGMAS = 4.5
-# Number of stars subtracted at a time, to limit the memory.
+# Number of stars subtracted at once, which limits the memory.
 _AT_ONCE = 16
 
 
 def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, FaintStars]:
     """Return the joint fit of the brightest stars, and the faint stars that were not fitted.
 
-    The faint stars are searched again along the new motion if it differs much from the motion of `first`, or
-    if the light and the streaks have different ends. A fit whose streaks have wrong ends twice is rejected.
+    Faint stars are searched again if the fit differs much from the motion of `first`, or if modelled and
+    measured streak ends disagree. A fit whose streaks have wrong ends after the second search is rejected.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -593,7 +596,7 @@ def final_fit(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _far(camera: FitProblem, before: StreakScene, after: StreakScene) -> bool:
-    """Return whether the ends of the streaks have moved so far that faint stars must be searched again."""
+    """Return whether streak ends moved so far that faint stars must be searched again."""
     changed = float(np.linalg.norm(after.motion.rotation - before.motion.rotation))
     turn = float(np.linalg.norm(after.motion.rotation))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
@@ -632,7 +635,7 @@ def _fit_from(camera: FitProblem, first: StreakFit) -> tuple[StreakFit | None, F
 
 
 def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
-    """Return the streaks along the motion of `first` that are not in its fit."""
+    """Return faint streaks along the motion of `first` that are not included in its fit."""
     settings, motion = camera.settings, first.scene.motion
     camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
@@ -648,11 +651,11 @@ def _find_along(camera: FitProblem, first: StreakFit) -> FaintStars:
 
 
 def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> StreakFit | None:
-    """Return the fit of `scene` with the motion on which its stars agree; None if the fit fails.
+    """Return the fit of `scene` with the motion on which the stars agree; None if the fit fails.
 
-    The pixels decide between a constant and a changing rate. The brightest untrusted stars are fitted, as far
-    as all windows have at most `room` times the usual number of pixels. The light of the other untrusted
-    stars is subtracted.
+    A score test on the pixels decides between a constant and a changing rate. The brightest untrusted stars
+    are fitted while all windows together have at most `room` times the usual number of pixels. The other
+    untrusted stars are subtracted from the frame.
     """
     fitted = _affordable(camera, scene, room)
     hidden = scene.select(~fitted)
@@ -664,7 +667,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # frees tens of MB; `pop` lets the iteration free the windows too
+    del done  # This frees tens of MB, and `pop` lets the iteration free the windows too.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
@@ -672,9 +675,9 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
 
 
 def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
-    """Return the joint fit repeated from the fit `last` with another `camera`, None if it fails.
+    """Return the joint fit repeated from `last` with another `camera`, or None if it does not succeed.
 
-    All bright stars are trusted at the start.
+    All bright stars are initially trusted.
     """
     scene = last.scene
     leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
@@ -686,9 +689,9 @@ def refit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
     """Return a fit of the brightest streaks of `last` with all stars on their pixels.
 
-    Stars hidden in a streak shift its ends. If the joint fit had no room for the hidden stars, a fit of fewer
-    streaks with all their hidden stars determines the motion better. The result is None if the joint fit had
-    room for all stars, or if the new fit fails or diverges.
+    Faint stars hidden in a bright streak shift the fitted streak ends. If the pixel limit excluded hidden
+    stars from the joint fit, a fit of fewer streaks with all their hidden stars is more accurate. Returns
+    None if the joint fit included all stars, or if the new fit does not succeed or diverges.
     """
     others, scene = last.hidden, last.scene
     if others is None or not len(others.light):
@@ -710,9 +713,9 @@ def brightest_fit(camera: FitProblem, last: StreakFit) -> StreakFit | None:
 
 
 def _excessive(motion: CameraMotion) -> bool:
-    """Return whether the rate changes more than the model allows.
+    """Return whether the angular acceleration exceeds the range of the model.
 
-    A motion known from navigation is never excessive.
+    A motion from the navigation filter is never excessive.
     """
     if motion.higher_terms.any():
         return False
@@ -720,7 +723,7 @@ def _excessive(motion: CameraMotion) -> bool:
 
 
 def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
-    """Return which trusted stars agree with the majority, all trusted stars if too few agree."""
+    """Return which trusted stars agree with the majority, or all trusted stars if too few agree."""
     estimates = star_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
     if estimates is None:
@@ -741,7 +744,7 @@ def _trusted(camera: FitProblem, rough: StreakFit) -> BoolArray:
 
 
 def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArray:
-    """Return which stars (n,) are fitted: trusted ones and, within the pixel limit, the brightest others."""
+    """Return a mask (n,) of stars to fit: trusted stars and the brightest others within the pixel limit."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
@@ -750,7 +753,7 @@ def _affordable(camera: FitProblem, scene: StreakScene, more: float) -> BoolArra
 
 
 def _subtracted(camera: FitProblem, others: StreakScene) -> FitProblem:
-    """Return the camera with the light of `others` subtracted and its uncertainty added to the noise."""
+    """Return `camera` with the stars `others` subtracted and the subtraction error added to the noise."""
     if not len(others.light):
         return camera
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()

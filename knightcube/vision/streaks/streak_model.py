@@ -68,7 +68,6 @@ _MOST_BENT = 0.5
 # Width (px) of the seam between two parts of a straight path.
 _SEAM = 0.003
 # Growth of the seam for a bent path, relative to the third power of the strip's width times the squared
-# curvature.
 _ARC = 0.3
 
 
@@ -422,7 +421,6 @@ _AT_ONCE = 256
 # Distance from the end of a streak, in widths of the point spread, beyond which the light is zero or full.
 _ENDS = 5.5
 # Largest distance, in widths along the path, between a pixel and the point at which the path crosses the
-# pixel's line.
 _OBLIQUE = 7.0
 # Time step of numerical differences, in exposures.
 _STEP = 1e-4

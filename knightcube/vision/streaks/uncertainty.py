@@ -498,7 +498,6 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 # Maximum number of conjugate-gradient steps for the covariance.
 _CONJUGATE = 12
 # Number of stars up to which their agreement does not test the motion, and the factor on the variance for so
-# few stars.
 _UNCHECKED = (2, 4.0)
 # Relative difference of variances up to which the fitted and the described point spread count as equal.
 _SAME_SPREAD = 0.05
@@ -517,7 +516,6 @@ _MOST_LENSES = 3
 # Largest calibration error (standard deviations) after which the correction of the lens stops.
 _SMALL_ERROR = 0.2
 # Relative uncertainty of the rotation due to the lens above which a correction is tried without a significant
-# error.
 _WORTHWHILE = 0.002
 # Ratio of the covariance to that of noise above which model errors must be its cause (three sigma).
 _BEYOND_NOISE = 9.0
