@@ -1,18 +1,19 @@
-"""The pixels that are fitted, and the normal equations of a scene: gradient and information (Fisher scoring).
+"""Selection of the fitted pixels, and the normal equations of a scene (Fisher scoring).
 
-Strips cover long streaks, patches cover spots. The light of a streak per px is inversely proportional to the
-star's speed. The model of the strips expands this light about each block and fails if the speed is near zero.
-If the rate increases from zero or decreases to zero, a patch therefore covers the slow part of each streak.
+Long streaks are fitted on strips of pixels, and spots on square patches. The flux per px of a streak is
+inversely proportional to the speed of the star. The strip model expands the flux per px to first order around
+each block, which does not hold if the speed is near zero. If the rate increases from zero or decreases to
+zero, a patch therefore covers the slow part of each streak.
 
-The weight of a pixel is the inverse of the variance that the model predicts, so that the iteration converges
-to the maximum likelihood for Poisson noise. The residual of a pixel is relative to the light of all stars, so
-that streaks may cross. The shared parameters (rate, acceleration, width) are solved for after the four
-parameters of each star are eliminated. Shared pixels couple the parameters of their stars; a few
-conjugate-gradient steps account for the coupling.
+The weight of a pixel is the inverse of the variance that the model predicts. The iteration therefore
+converges to the maximum likelihood for Poisson noise. The residual of a pixel is its value minus the modelled
+flux of all stars, so that streaks may cross. The four parameters of each star are eliminated from the
+equations, which leaves the shared parameters (rate, acceleration, width). Stars that share pixels are
+coupled, and a few conjugate-gradient iterations account for the coupling.
 
-Each star also gives its own estimate of the shared parameters. A blend of two stars is wider or longer than a
-single star, and light of another star shifts the ends of a streak. Such stars disagree with the majority and
-are no longer trusted.
+Each star also provides its own estimate of the shared parameters. A blend of two stars is wider or longer
+than a single star, and flux of a neighbouring star shifts the ends of a streak. Stars that disagree with the
+majority for this reason are no longer trusted.
 """
 
 from __future__ import annotations
@@ -37,39 +38,39 @@ from knightcube.vision.streaks.geometry import (
 )
 from knightcube.vision.streaks.streak_model import STEEPEST, Patches, Strips, cut_patches, cut_strips
 
-# Length of a path, in widths of the point spread, below which a star counts as a spot.
+# Path length, in point-spread widths, below which a star is fitted as a spot.
 _SPOT_WIDTHS = 8.0
-# Distance of the predicted light from saturation, in standard deviations, below which a pixel is excluded.
-# The prediction decides, because a selection by the measured light would be biased by its noise.
+# Margin below saturation, in standard deviations of the modelled value, within which a pixel is excluded.
+# The modelled value is used, because a selection by the measured value would be biased by its noise.
 _MARGIN = 3.0
-# Number of instants at which the position of a star is evaluated.
+# Number of instants at which the position of a star on its path is evaluated.
 _INSTANTS = 9
-# Residual, relative to the model, that is never clipped.
+# Residual, relative to the modelled value, up to which a pixel is never clipped.
 _UNRESOLVED = 0.1
-# Largest relative change of a star's speed over one width of the point spread within a strip.
+# Largest relative change of a star's speed over one point-spread width within a strip.
 _STEADY = 0.05
-# Minimum length of the fast part of a path, in widths; a patch covers a path with a shorter fast part.
+# Minimum length of the fast part of a path, in point-spread widths, that is fitted on a strip.
 _LEAST_FAST = 4.0
-# Minimum speed (px per exposure) in divisions by the speed.
+# Lower limit (px per exposure) of speeds by which the code divides.
 _SLOWEST = 1e-3
-# Number of instants at which the rate is evaluated to find the slow part.
+# Number of instants at which the rate is evaluated to find the slow part of a path.
 _SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockPixels:
-    """The data of the frame on b blocks of pixels. Arrays have the shape (b, ...) unless stated otherwise.
+    """Frame data on b blocks of pixels. Arrays have the shape (b, ...) unless stated otherwise.
 
     Attributes:
-        slot: index of the pixel among all fitted pixels, the same for all stars that share the pixel. For a
-            pixel outside the frame it is the number of fitted pixels.
-        inside: whether the pixel is fitted.
-        signal: counts above the background.
-        floor: counts^2, variance of the pixel without a star.
-        ceiling: counts above the background at which the pixel saturates.
-        gain: electrons per count.
-        crowded: (e,) flat positions of the pixels that other stars share.
-        common: (e,) indices of the pixels `crowded` among all shared pixels.
+        slot: index of each pixel among all fitted pixels. Stars that share a pixel share its slot. A pixel
+            outside the frame has the number of fitted pixels as its slot.
+        inside: mask of the pixels that are fitted.
+        signal: counts of each pixel above the background.
+        floor: noise variance of each pixel without a star, counts^2.
+        ceiling: counts above the background from which each pixel is saturated.
+        gain: gain of the camera, electrons per count.
+        crowded: (e,) flat indices, in the blocks, of the pixels that several stars share.
+        common: (e,) indices of the pixels `crowded` in the list of all shared pixels.
     """
 
     slot: IntArray
@@ -82,10 +83,10 @@ class BlockPixels:
     common: IntArray
 
     def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
-        """Return weights and residuals of the pixels for the modelled light `total`, indexed by slot.
+        """Return weights and residuals of the pixels for the modelled counts `total`, indexed by slot.
 
-        The weight is 1/variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip` standard
-        deviations plus a tenth of the model are excluded; `clip` 0 excludes none.
+        The weight is the inverse variance, or 0 for an excluded pixel. Pixels whose residuals exceed `clip`
+        standard deviations plus a tenth of the modelled value are excluded; `clip` 0 excludes none.
         """
         model = total.take(self.slot)
         variance = np.maximum(model, np.float32(0.0))
@@ -105,18 +106,18 @@ class BlockPixels:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitWindows:
-    """The pixels that are fitted: strips along long streaks, patches around spots.
+    """The fitted pixels: strips along long streaks and patches around spots.
 
     Attributes:
-        long: (a,) indices of the stars with a strip; a streak with a slow part also has a patch.
+        long: (a,) indices of the stars with a strip. A streak with a slow part also has a patch.
         spot: (b,) indices of the stars with a patch.
-        strips: pixels of the strips; star i of the strips is `long[i]`.
-        patches: pixels of the patches; patch i is of star `spot[i]`.
-        pixels: (m,) flat indices of the fitted pixels, by slot.
-        slot: slots of the pixels of all blocks, flat.
-        on_strips: the frame on the strips.
-        on_patches: the frame on the patches.
-        shared: number of pixels of more than one star.
+        strips: pixels of the strips. Star i of `strips` is the star with the index `long[i]`.
+        patches: pixels of the patches. Patch i belongs to the star with the index `spot[i]`.
+        pixels: (m,) flat indices of the fitted pixels in the frame, ordered by slot.
+        slot: slots of the pixels of all blocks, as a flat array.
+        on_strips: frame data on the strips.
+        on_patches: frame data on the patches.
+        shared: number of pixels that belong to more than one star.
     """
 
     long: IntArray
@@ -130,15 +131,15 @@ class FitWindows:
     shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the light (m + 1,) of all stars by slot, from the light of each star on its own pixels.
+        """Return the summed counts (m + 1,) of all stars by slot, from the counts of each star's own pixels.
 
-        The last element collects the light on pixels outside the frame.
+        The last element sums the counts on pixels outside the frame.
         """
         light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
         return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> FitWindows:
-        """Return the windows restricted to the pixels of the masks `on_strips` and `on_patches`."""
+        """Return the windows reduced to the pixels in the masks `on_strips` and `on_patches`."""
         return replace(
             self,
             on_strips=replace(self.on_strips, inside=on_strips),
@@ -147,9 +148,9 @@ class FitWindows:
 
 
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
-    """Return the approximate number of pixels (n,) of each star's window, `reach` widths around its path.
+    """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 
-    All lines of all strips have the length of the line that a path crosses most obliquely.
+    All lines of all strips are as long as the line that a path crosses most obliquely.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:
@@ -167,12 +168,12 @@ def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArr
 def cut_windows(
     frame: ReducedFrame, pinhole: Pinhole, shutter: Shutter, scene: StreakScene, reach: float
 ) -> FitWindows:
-    """Return the windows with the pixels of `frame` within `reach` widths of the paths of the stars."""
+    """Return windows with the pixels of `frame` within `reach` point-spread widths of the stars' paths."""
     long, spot, strips, patches = _strips_and_patches(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Each pixel gets the number of its last occurrence, so that only memory of fitted pixels is touched.
+    # Each pixel gets the index of its last occurrence, so that only memory of fitted pixels is written.
     order = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
     number[named] = order
@@ -206,7 +207,7 @@ def _strips_and_patches(
 ) -> tuple[IntArray, IntArray, Strips, Patches]:
     """Return the stars with strips (a,), the stars with patches (b,), the strips and the patches.
 
-    They cover the pixels within `room` px of the paths.
+    Strips and patches cover the pixels within `room` px of the paths.
     """
     times = exposure_bounds(pinhole, scene.motion, shutter, scene.stars)
     fast, slow = _divided(pinhole, scene, times)
@@ -214,7 +215,7 @@ def _strips_and_patches(
     long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
     spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # A patch covers the slow part of a streak, or the entire path of a spot.
+    # A patch covers the slow part of a streak, or the complete path of a spot.
     part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
     sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
     stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
@@ -227,9 +228,9 @@ def _strips_and_patches(
 
 
 def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return start and end times (n, 2) of each star's fast part, for a strip, and of its slow part.
+    """Return start and end times (n, 2) of the fast part of each path, for a strip, and of its slow part.
 
-    The slow part is at the end towards which the rate decreases. A missing part has zero duration.
+    The slow part is at the end at which the rate is smaller. A part that does not exist has zero duration.
     """
     motion = scene.motion
     if motion.constant or not motion.rotation.any():
@@ -239,7 +240,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
     steady = CameraMotion.steady(motion.rotation)
     velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    # A star is slow at times at which its speed may change too much over one width of the point spread.
+    # A star counts as slow while its speed may change too much over one point-spread width.
     slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
     fast, rest = times.copy(), times.copy()
     if pace[0] < pace[-1]:
@@ -254,7 +255,7 @@ def _divided(pinhole: Pinhole, scene: StreakScene, times: FloatArray) -> tuple[F
 
 
 def _without_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
-    """Return the strips without the pixels that belong to a patch of the same star."""
+    """Return the strips without the pixels that also belong to a patch of the same star."""
     both = np.isin(long, spot)
     if not both.any():
         return strips
@@ -278,14 +279,14 @@ def _block_pixels(
     crowded: IntArray,
     common: IntArray,
 ) -> BlockPixels:
-    """Return the data of the frame on the blocks of pixels with the flat indices `index`."""
+    """Return frame data on the blocks of pixels with the flat indices `index`."""
     signal = frame.signal.take(index)
     return BlockPixels(
         slot.reshape(index.shape),
         inside & ~frame.bad.take(index),
         signal,
         frame.floor.take(index),
-        # The saturation level is relative to the background, which is the raw counts minus the signal.
+        # The background is the raw counts minus the signal, and is subtracted from the saturation level.
         np.float32(frame.top) - frame.counts.take(index) + signal,
         frame.gain,
         crowded,
@@ -294,18 +295,18 @@ def _block_pixels(
 
 
 SHARED = 7
-"""Number of shared parameters: rate (3), acceleration (3), width of the point spread."""
+"""Number of shared parameters: rate (3), acceleration (3) and point-spread width (1)."""
 ALONE = 4
-"""Number of parameters of each star: x, y, light, sky."""
+"""Number of parameters of each star: x, y, flux and sky level."""
 
-# Number of blocks multiplied at a time, so that they fit into the processor's cache.
+# Number of blocks multiplied at once, small enough for the processor's cache.
 _AT_ONCE = 128
-# Prior standard deviation (px) of a star's position; a streak with both ends outside does not determine it.
+# Prior standard deviation (px) of a star's position, for streaks with both ends outside the frame.
 _LOOSE = 30.0
-# Prior standard deviation (counts) of the sky around a star relative to the background.
+# Prior standard deviation (counts) of the sky level around a star, relative to the background.
 _SKY = 3.0
 PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
-"""Prior information (ALONE,) on the parameters of a star."""
+"""Prior information (ALONE,) on the parameters of a star, as inverse variances."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,13 +314,13 @@ class Evaluation:
     """The normal equations of a scene.
 
     Attributes:
-        information: (n, SHARED + ALONE, SHARED + ALONE) Fisher information of each star's pixels.
-        gradient: (n, SHARED + ALONE) gradient of the log-likelihood of each star's pixels.
+        information: (n, SHARED + ALONE, SHARED + ALONE) Fisher information from the pixels of each star.
+        gradient: (n, SHARED + ALONE) gradient of the log-likelihood of the pixels of each star.
         chi2: (n,) chi-square of the pixels of each star.
         pixels: (n,) number of pixels of each star.
-        crowds: derivatives of the light on shared pixels.
-        shared: number of shared pixels.
-        kept: masks of the pixels of the strips and of the patches that were not excluded.
+        crowds: derivatives of the modelled counts on shared pixels.
+        shared: number of pixels that several stars share.
+        kept: masks of the pixels of strips and patches that were not excluded.
     """
 
     information: FloatArray
@@ -333,16 +334,16 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedPixels:
-    """Derivatives of the light on e pixels that other stars share, sorted by their b blocks.
+    """Derivatives of the modelled counts on e shared pixels, in the order of their b blocks.
 
     Attributes:
-        star: (b,) star of each block.
-        matrix: (b, i, SHARED + ALONE) coefficients with which the i images form the derivatives.
-        block: (e,) block of each pixel.
-        first: (b,) first pixel of each block.
-        slot: (e,) number of each pixel among all shared pixels.
-        weight: (e,) weight of each pixel.
-        images: (i, e) values of the images on the pixels.
+        star: (b,) index of the star of each block.
+        matrix: (b, i, SHARED + ALONE) coefficients of i basis images in the derivatives.
+        block: (e,) index of the block of each pixel.
+        first: (b,) index of the first pixel of each block.
+        slot: (e,) index of each pixel in the list of all shared pixels.
+        weight: (e,) inverse variance of each pixel.
+        images: (i, e) values of the basis images on the pixels.
     """
 
     star: IntArray
@@ -357,9 +358,10 @@ class SharedPixels:
 def evaluate(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, clip: float, growing: bool
 ) -> Evaluation:
-    """Return the normal equations of `scene` on its windows.
+    """Return the normal equations of `scene` on its fit windows.
 
-    For `clip` see `BlockPixels.residual`. `growing` states whether the acceleration is fitted.
+    `clip` is the clipping limit described in `BlockPixels.residual`. `growing` states whether the angular
+    acceleration is fitted.
     """
     strips = windows.strips
     images, spots, change = model_images(pinhole, shutter, scene, windows)
@@ -396,7 +398,7 @@ def evaluate(
 
 
 def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows) -> Float32Array:
-    """Return the light (m,) of all stars of `scene` on the fitted pixels of its windows, without the sky."""
+    """Return the counts (m,) of all stars of `scene` on the pixels of its windows, without the sky level."""
     images, spots, _ = model_images(pinhole, shutter, scene, windows)
     streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
     return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
@@ -405,9 +407,9 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: Fi
 def model_images(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the images of the strips, the light of the spots and its derivatives, for stars of unit light.
+    """Return basis images of strips, images of spots, and derivatives of the spot images, for unit flux.
 
-    The last image of the strips is uninitialised and later holds the residual.
+    The last basis image of the strips is uninitialised and later holds the residual.
     """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
     images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
@@ -420,7 +422,7 @@ def model_images(
 def _block_coefficients(
     pinhole: Pinhole, shutter: Shutter, scene: StreakScene, windows: FitWindows, growing: bool
 ) -> FloatArray:
-    """Return the coefficients (b, IMAGES, SHARED + ALONE) with which the images form the derivatives."""
+    """Return the coefficients (b, IMAGES, SHARED + ALONE) of the basis images in the derivatives."""
     strips = windows.strips
     light = scene.light[windows.long[strips.star]]
     geometry = streak_model.coefficients(
@@ -443,10 +445,10 @@ def _add(
     images: Float32Array,
     matrix: FloatArray,
 ) -> None:
-    """Add blocks of pixels, in order of their stars, to the normal equations.
+    """Add blocks of pixels, in the order of their stars, to the normal equations.
 
-    The last image is the residual. The products of the residual with the other images give the gradient, and
-    its square gives the chi-square.
+    The last image of each block is the residual. Products of the residual with the other images give the
+    gradient, and the squared residual gives chi-square.
     """
     blocks, count = images.shape[:2]
     flat = images.reshape(blocks, count, -1)
@@ -469,7 +471,7 @@ def _add(
 def _shared_pixels(
     star: IntArray, view: BlockPixels, weight: Float32Array, images: Float32Array, matrix: FloatArray
 ) -> SharedPixels:
-    """Return the derivatives of the light on the pixels that other stars share."""
+    """Return the derivatives of the modelled counts on pixels that several stars share."""
     block, place = np.divmod(view.crowded, images.shape[2])
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
@@ -493,14 +495,14 @@ def _shared_pixels(
 def _spot_images(
     scene: StreakScene, windows: FitWindows, spots: FloatArray, change: FloatArray
 ) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the light of spots.
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of spot images.
 
-    The last element along the second axis is uninitialised.
+    The last element along the second axis is uninitialised and later holds the residual.
     """
     light = scene.light[windows.spot, None, None, None]
     images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
-    # The width contains the variance of the pixel, so that d sigma / d width = width / sigma.
+    # The squared width is sigma^2 plus the pixel's variance, so that d sigma / d width = width / sigma.
     images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
     images[:, 7:9] = change[:, 6:8] * light
     images[:, 9] = spots
@@ -513,8 +515,8 @@ def apply_information(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the product of the information matrix of all stars with the vector (`shared`, `alone`).
 
-    `shared` (SHARED,) has the shared parameters and `alone` (n, ALONE) the parameters of each star. The
-    coupling of stars that share pixels is included.
+    `shared` (SHARED,) holds the shared parameters, and `alone` (n, ALONE) the parameters of each star. The
+    coupling of stars by shared pixels is included.
     """
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
@@ -532,7 +534,7 @@ def apply_information(
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone
 
 
-# Squared norm of the residual, relative to that of the first step, at which conjugate gradients stop.
+# Squared residual norm, relative to the squared norm of the first step, at which conjugate gradients stop.
 _CONVERGED = 1e-2
 
 
@@ -543,7 +545,7 @@ class Solution:
     Attributes:
         shared: (SHARED,) step of the shared parameters.
         alone: (n, ALONE) step of the parameters of each star.
-        eliminated: normal equations without the coupling of stars.
+        eliminated: normal equations after elimination of the star parameters, without coupling of stars.
     """
 
     shared: FloatArray
@@ -560,7 +562,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of shared and own parameters of each star."""
+        """The joint covariance (n, SHARED + ALONE, SHARED + ALONE) of shared and each star's parameters."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -573,12 +575,12 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EliminatedEquations:
-    """The normal equations after elimination of the parameters of each star, without coupling of stars.
+    """Normal equations after elimination of each star's parameters, without coupling of stars.
 
     Attributes:
         kept: (k,) indices of the fitted shared parameters.
-        own: (n, ALONE, ALONE) inverse of each star's block.
-        gain: (n, k, ALONE) product of the coupling block and `own`.
+        own: (n, ALONE, ALONE) inverse of each star's diagonal block.
+        gain: (n, k, ALONE) product of each star's off-diagonal block and `own`.
         inner: (k, k) covariance of the fitted shared parameters.
     """
 
@@ -596,14 +598,14 @@ class EliminatedEquations:
 
 
 def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | None:
-    """Return the eliminated equations, None if they do not determine the shared parameters.
+    """Return the eliminated equations, or None if they do not determine the shared parameters.
 
-    The mask `free` (SHARED,) selects the fitted shared parameters.
+    The mask `free` (SHARED,) selects the shared parameters that are fitted.
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
     diagonal += PRIOR
-    # A star outside the frame gives no information on its light; a diagonal of 1 keeps its block regular.
+    # A star outside the frame does not determine its flux, and a diagonal of 1 keeps its block invertible.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     root = np.sqrt(np.einsum("nii->ni", alone))
     outer = root[:, :, None] * root[:, None, :]
@@ -625,14 +627,15 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 
 
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
-    """Return the step to the maximum likelihood, None if the shared parameters are not determined.
+    """Return the step towards maximum likelihood, or None if the shared parameters are undetermined.
 
-    At most `rounds` conjugate-gradient steps account for shared pixels; with 0 rounds they are neglected.
+    At most `rounds` conjugate-gradient iterations account for shared pixels. With 0 iterations, sharing is
+    neglected.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    # The prior mean of the sky is zero; the prior mean of the position is the current position.
+    # The prior mean of the sky level is zero, and the prior mean of the position is the current position.
     offset = np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
     alone = evaluation.gradient[:, SHARED:] - PRIOR * offset
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
@@ -641,14 +644,14 @@ def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: i
 
 
 def rate_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (3, 3) of the rate, including the effect of shared pixels, None if singular."""
+    """Return the covariance (3, 3) of the rate with the effect of shared pixels, or None if singular."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
     alone = np.zeros((len(evaluation.chi2), ALONE))
     out = np.empty((3, 3))
     for k in range(3):
-        # The right-hand side is scaled for a solution of order one, so that one tolerance suits all.
+        # The right-hand side is scaled so that the solution is of order one and one tolerance fits all cases.
         unit = np.zeros(SHARED)
         unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
         solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
@@ -665,8 +668,7 @@ def _conjugate(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the solution of the coupled normal equations for the right-hand side `right`.
 
-    The equations without coupling are the preconditioner of the conjugate gradients, so that a few steps
-    suffice.
+    The uncoupled equations precondition the conjugate gradients, so that few iterations suffice.
     """
     x = eliminated.solve(*right)
     if rounds == 0:
@@ -700,9 +702,9 @@ def _conjugate(
 def stepped(
     scene: StreakScene, solution: Solution, pinhole: Pinhole, longest: float
 ) -> tuple[StreakScene, float]:
-    """Return the scene after a step that is limited to `longest` px at the ends of the streaks.
+    """Return the scene after a step that is limited to `longest` px at the streak ends.
 
-    The second value is the largest displacement (px) of an end, or change of the width, of the full step.
+    The second value is the largest displacement of a streak end or change of the width by the full step, px.
     """
     n = len(scene.stars)
     growing = bool(solution.shared[3:6].any())
@@ -728,18 +730,18 @@ def stepped(
     return after, max(ends, abs(float(solution.shared[6])))
 
 
-# Information of a star, relative to the star with most information, below which the star is ignored.
+# Information of a star, relative to the most informative star, below which the star is ignored.
 _NOTHING = 1e-9
-# Information of a star along an eigenvector, relative to its largest eigenvalue, below which it is ignored.
+# Smallest eigenvalue of a star's information, relative to its largest eigenvalue, that is used.
 _KNOWN = 1e-4
 # Minimum effective number of stars for an estimate of their scatter.
-# Unequal weights reduce the effective number.
+# The effective number of stars is smaller than their number if the weights are unequal.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEstimates:
-    """The n stars' estimates of shared parameters along k directions: changes and deviations, (n, k)."""
+    """Estimates of the shared parameters by n single stars in k directions: changes and deviations (n, k)."""
 
     change: FloatArray
     deviation: FloatArray
@@ -747,12 +749,12 @@ class StarEstimates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarEquations:
-    """Each star's normal equations for the free shared parameters, with its own parameters eliminated.
+    """Normal equations of each star for the free shared parameters, without the star's own parameters.
 
     Attributes:
         kept: (k,) indices of the free shared parameters.
-        information: (n, k, k) information of each star.
-        score: (n, k) gradient of each star.
+        information: (n, k, k) information matrix of each star.
+        score: (n, k) gradient of each star's log-likelihood.
     """
 
     kept: IntArray
@@ -761,13 +763,13 @@ class StarEquations:
 
 
 def star_estimates(evaluation: Evaluation, scene: StreakScene, free: BoolArray) -> StarEstimates | None:
-    """Return each star's estimate of rate and width, None if the shared parameters are not determined."""
+    """Return each star's estimate of rate and width, or None if the shared parameters are undetermined."""
     alone = star_equations(evaluation, free)
     return None if alone is None else estimates_of(alone, scene)
 
 
 def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
-    """Return each star's estimates of the rate, along its axis and two normal directions, and of the width.
+    """Return each star's estimate of the rate, along the rotation axis and two normals, and of the width.
 
     The estimates are changes relative to the scene, in rad per exposure for the rate and in px for the width.
     """
@@ -785,10 +787,10 @@ def estimates_of(alone: StarEquations, scene: StreakScene) -> StarEstimates:
 
 
 def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
-    """Return the squared significance of `step` (SHARED,) of the shared parameters, and the number of stars.
+    """Return the squared significance of a `step` (SHARED,) of the shared parameters, and the star count.
 
-    If the scatter of the stars exceeds their noise, the significance is relative to the scatter, so that one
-    blended star does not make a step significant.
+    If the stars scatter more than their noise, the scatter is used in the significance. A single blended star
+    then does not make a step significant.
     """
     alone = star_equations(evaluation, step != 0.0)
     if alone is None:
@@ -802,7 +804,7 @@ def step_significance(evaluation: Evaluation, step: FloatArray) -> tuple[float, 
 
 
 def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | None:
-    """Return the equations of each star for the `free` shared parameters, None if not determined."""
+    """Return the equations of each star for the `free` shared parameters, or None if undetermined."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
@@ -816,7 +818,7 @@ def star_equations(evaluation: Evaluation, free: BoolArray) -> StarEquations | N
 def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
     """Return which stars (n,) lie within `sigmas` of the weighted median in all k directions.
 
-    `floors` (k,) are added to the deviations, for errors of the model.
+    `floors` (k,) are model errors that are added in quadrature to the deviations.
     """
     agree = np.ones(len(estimates.change), dtype=np.bool_)
     for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):
@@ -824,30 +826,30 @@ def consistent_stars(estimates: StarEstimates, floors: FloatArray, sigmas: float
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        # The uncertainty of the median keeps a star with a smaller error than all others.
+        # With the uncertainty of the median, a star that is more accurate than all others is not rejected.
         error = MEDIAN_ERROR * np.sqrt(len(spread)) / np.sum(1.0 / spread)
         agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 
 
 def disagreement(estimates: StarEstimates, which: BoolArray) -> float:
-    """Return the chi-square per degree of freedom between the estimates of stars `which` (n,)."""
+    """Return the chi-square per degree of freedom between the estimates of the stars `which` (n,)."""
     change, weight = estimates.change[which], estimates.deviation[which] ** -2
     if len(change) < 3:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # The weights are squared, so that many faint stars do not hide the scatter of a few bright stars.
+    # Squared weights prevent many faint stars from hiding the scatter of a few bright stars.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
-    # The largest of several values is expected to exceed one by about a standard deviation.
+    # The largest of several values exceeds one by about a standard deviation even without excess scatter.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
 
 
 def contradiction(alone: StarEquations) -> float:
     """Return the chi-square per degree of freedom of all stars' equations about their common solution.
 
-    In contrast to `disagreement`, all directions that a star determines contribute, with the noise of each
+    Unlike `disagreement`, this test uses all directions that a star determines, each with the noise of that
     star.
     """
     total = alone.information.sum(axis=0)

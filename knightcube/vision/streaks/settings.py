@@ -1,4 +1,4 @@
-"""Settings of the maximum-likelihood estimator. The defaults are for the camera of the demonstration."""
+"""Settings of the maximum-likelihood estimator. The default values fit the camera of the demonstration."""
 
 from __future__ import annotations
 
@@ -15,38 +15,40 @@ RateModel = Literal["auto", "constant", "accelerating"]
 
 @dataclass(frozen=True, slots=True)
 class LikelihoodSettings:
-    """Settings of the estimate of the motion from one frame.
+    """Settings of the motion estimate from one frame.
 
     Attributes:
-        gain: electrons per count.
-        saturation: counts at which a pixel saturates. If None, it is the highest count of the frame if
-            several pixels have it, otherwise the maximum of the integer type.
-        saturated_fraction: minimum fraction of saturated pixels at which a frame is rejected.
-        psf_sigma: px, initial standard deviation of the point spread. If it is 2 px or more, pixels are
-            summed.
-        rate_model: `constant` for a constant rate, `accelerating` for a linear change of the rate, or `auto`
-            for a choice by a test on the pixels.
-        line_time: s, delay of each row's exposure relative to the row above (rolling shutter), 0 for a global
-            shutter. If None, it is unknown, and the fit uses 0 with a large uncertainty.
-        threshold_sigmas: threshold of the 3 x 3 sums for the first guess, in standard deviations.
-        most_stars: maximum number of the brightest stars, which determine the motion.
-        most_neighbours: maximum number of fitted fainter stars that overlap the bright stars.
+        gain: gain of the camera, electrons per count.
+        saturation: count from which a pixel is saturated. If `saturation` is None, it is the highest count of
+            the frame if several pixels have that count, otherwise the maximum of the integer type.
+        saturated_fraction: fraction of saturated pixels from which a frame is rejected.
+        psf_sigma: initial standard deviation of the point spread, px. From 2 px on, the frame is binned.
+        rate_model: `constant` for a constant rate, `accelerating` for a linearly changing rate, or `auto` to
+            let a score test decide.
+        line_time: delay between the exposures of successive rows, s. It is positive for a rolling shutter and
+            0 for a global shutter. If the line time is None, it is unknown, and the fit assumes 0 with a
+            large uncertainty.
+        threshold_sigmas: threshold of the 3 x 3 sums for bright regions, in standard deviations.
+        most_stars: maximum number of bright stars that determine the motion.
+        most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.
         most_faint: maximum number of faint stars that are detected and subtracted without a fit.
-        faint_sigmas: minimum significance of a detected streak.
-        reach: half width of the fitted strip along a path, in widths of the point spread.
-        clip: residual, in standard deviations, above which a pixel is excluded.
-        least_stars: minimum number of stars. Two stars determine a rate, but their agreement does not test
-            it.
-        least_length: px, minimum median path length.
+        faint_sigmas: minimum significance of a detected streak, in standard deviations.
+        reach: half width of the fitted strip along a path, in point-spread widths.
+        clip: residual above which a pixel is excluded, in standard deviations.
+        least_stars: minimum number of stars for a rate. Two stars determine a rate, but do not allow a check
+            of their agreement.
+        least_length: minimum median path length for a rate, px.
         least_significance: minimum ratio of the rate to its standard deviation.
-        worst_misfit: chi-square per degree of freedom above which a motion is rejected, if the residuals also
+        worst_misfit: chi-square per degree of freedom above which a motion is rejected if the residuals also
             exceed `worst_displacement`.
-        worst_displacement: px, largest displacement across the streaks that is equivalent to the residuals.
-        worst_shaking: largest displacement (px), or relative change of brightness, common to all streaks.
-        worst_uncertainty: largest relative uncertainty (one standard deviation) of the rate due to errors of
-            the model.
-        sign_sigmas: minimum ratio of the prior rate's projection on the axis to its standard deviation, for a
-            decision about the direction of time.
+        worst_displacement: displacement across the streaks, equivalent to the residuals, above which a motion
+            with a large misfit is rejected, px.
+        worst_shaking: largest accepted motion common to all streaks: displacement across them (px), or
+            relative change of brightness.
+        worst_uncertainty: largest accepted relative uncertainty (one standard deviation) of the rate from
+            model errors.
+        sign_sigmas: minimum significance (standard deviations) of the prior rate along the rotation axis, for
+            a decision on the sign of the rotation.
         knowledge: accuracy of the camera's calibration.
     """
 
@@ -75,12 +77,12 @@ class LikelihoodSettings:
 
     @property
     def delay_per_row(self) -> float:
-        """The line time (s) assumed in the fit."""
+        """The line time (s) that the fit assumes."""
         return 0.0 if self.line_time is None else self.line_time
 
     @property
     def line_time_sigma(self) -> float:
-        """The standard deviation (s) of the assumed line time."""
+        """The standard deviation (s) of the line time that the fit assumes."""
         if self.knowledge.line_time is not None:
             return self.knowledge.line_time
         return UNSTATED if self.line_time is None else 0.0
@@ -92,10 +94,10 @@ class LikelihoodSettings:
 
 
 def knowledge_of_pinhole(knowledge: CameraKnowledge, lens: Lens) -> CameraKnowledge:
-    """Return the accuracy of the pinhole that replaces a calibrated `lens` in the fit of streaks.
+    """Return the accuracy of the pinhole that represents a calibrated `lens` in the fit of streaks.
 
-    The fit does not model the distortion, so that the difference between lens and pinhole counts as an
-    uncertainty.
+    The fit does not model the lens distortion. The difference between lens and pinhole therefore counts as an
+    uncertainty of the pinhole.
     """
     middle = 0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)
     square = math.hypot(*middle) ** 2 / lens.focal_length**2

@@ -1,28 +1,30 @@
-"""The light of streaks and spots on the pixels, and its derivatives with respect to all parameters.
+"""Model of the counts of streaks and spots on the pixels, with derivatives with respect to all parameters.
 
-A long streak is fitted on strips: lines of pixels across its path, columns if the path runs more along rows
-than across them, rows otherwise. Ten lines form a block, over which the derivatives with respect to the
-motion are linear. Long paths are divided into parts in time, and also at points at which their major axis
-changes. Each part has the pixels that are nearest to it. The pixels stay fixed while the fit proceeds; only
-their distances from the path are updated.
+A long streak is fitted on strips of parallel lines of pixels across its path. The lines are columns of pixels
+if the path runs mainly along rows, otherwise rows of pixels. Ten lines form a block, over which the
+derivatives with respect to the motion are linear. Long paths are divided into parts in time, and also where
+their major axis changes between rows and columns. Each pixel is assigned to the nearest part of a path. The
+selection of pixels stays fixed during the fit, and only their distances from the path are updated.
 
-Near a pixel the path is an arc with the coordinates s along it and n across it and the speed v. The light of
-a star of unit light is
+Near a pixel, the path is an arc with the speed v and the coordinates s along the arc and n across the arc. A
+star of unit flux gives each pixel the counts
 
     m = (1/v) g(n) [Phi((s - s0)/w) - Phi((s - s1)/w)] / sqrt(1 - k n),
 
-where g is a Gaussian of width w, k the curvature of the arc, and s0 and s1 the ends of the exposure, which
-depend on the pixel's row for a rolling shutter. The square pixel is included in w, w^2 = sigma^2 + 1/12, and
-its fourth cumulant, -1/120 along each axis, in a correction of the profile across the path. If a parameter
-moves the path by c(t), the light changes by
+where g is a Gaussian of standard deviation w, k the curvature of the arc, and s0 and s1 the path coordinates
+at the start and end of the exposure. With a rolling shutter, s0 and s1 depend on the pixel's row. The
+integration over the square pixel is included in w^2 = sigma^2 + 1/12. The fourth cumulant of the pixel,
+-1/120 along each axis, is included in a correction of the profile across the path. If a parameter displaces
+the path by c(t), the counts change by
 
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
-where e0 and e1 are the light per px of path at the two ends. Seven images serve all parameters, with
-coefficients for each block; the first moment of m accounts for the change of c_n along a block.
+where e0 and e1 are the counts per px of path at the two ends. All derivatives are combinations of seven basis
+images, with coefficients for each block. The first moment of m accounts for the change of c_n along a block.
 
-A spot, a short streak, or the slow part of a longer streak is a sum of Gaussians at instants of the exposure
-(Gauss-Legendre quadrature), each integrated over every pixel. The sum is also exact for a star at rest.
+A spot is a short streak or the slow part of a longer streak. Its model is a sum of Gaussians at instants of
+the exposure (Gauss-Legendre quadrature), each integrated over every pixel. This sum is also exact for a star
+at rest.
 """
 
 from __future__ import annotations
@@ -47,41 +49,41 @@ from knightcube.vision.streaks.geometry import (
 )
 
 LINES = 10
-"""Number of lines in a block."""
+"""Number of lines of pixels in a block."""
 
 STEEPEST = 0.68
-"""Minimum cosine between a path and the normal of its lines, slightly below that of the diagonals."""
+"""Minimum cosine between a path and the normal of its lines, slightly below the cosine at a diagonal."""
 
-# Largest rotation (rad) of one part of a path, so that the part is monotonic along its major axis.
+# Largest rotation (rad) within one part of a path, for which the part is monotonic along its major axis.
 _LONGEST_ROTATION = 1.1
 # Number of instants at which a part of a path is evaluated to find its crossings with the lines.
 _SAMPLES = 17
-# Ratio of the velocities along rows and columns at which a path is divided.
-# At a ratio of 1, the seam between the parts could follow a diagonal of pixels and lose all of them.
+# Ratio of the speeds along rows and columns at which a path is divided.
+# At a ratio of 1, the seam between two parts could follow a diagonal of pixels and lose all of them.
 _DIAGONAL = 1.03
 # Number of instants at which the direction of a part of a path is evaluated.
 _INSTANTS = 7
-# Minimum speed (px per exposure) in divisions by the speed.
+# Lower limit (px per exposure) of speeds by which the code divides.
 _SLOWEST = 1e-3
-# Minimum cosine between a path and the normal of a line that lies beyond the end of the path's part.
+# Minimum cosine between a path and the normal of a line beyond the end of the path's part.
 _MOST_BENT = 0.5
 # Width (px) of the seam between two parts of a straight path.
 _SEAM = 0.003
-# Growth of the seam for a bent path, relative to the third power of the strip's width times the squared
+# Increase of the seam width (px) of a curved path, per cubed strip width times squared curvature.
 _ARC = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strips:
-    """The pixels near the paths of stars: b blocks of `LINES` lines of k pixels.
+    """Pixels near the paths of stars, as b blocks of `LINES` lines of k pixels.
 
     Attributes:
-        star: (b,) star of each block, ascending.
-        time: (b, LINES) time, in exposures, at which the path crosses the line.
+        star: (b,) index of the star of each block, in ascending order.
+        time: (b, LINES) time at which the path crosses each line, in exposures.
         corner: (b, LINES, 2) column and row of the first pixel of each line.
-        step: (b, 2) step from pixel to pixel.
-        index: (b, LINES, k) index into the flat frame, 0 if not `inside`.
-        inside: (b, LINES, k) whether the pixel is in the frame and nearest to this part of the path.
+        step: (b, 2) step in column and row from one pixel of a line to the next.
+        index: (b, LINES, k) flat index of each pixel in the frame, or 0 if the pixel is not `inside`.
+        inside: (b, LINES, k) whether each pixel is in the frame and nearest to this part of the path.
     """
 
     star: IntArray
@@ -92,7 +94,7 @@ class Strips:
     inside: BoolArray
 
     def rows(self, of: IntArray | slice) -> Float32Array:
-        """Return the rows (.., LINES, k) of the pixels of the blocks `of`."""
+        """Return the row numbers (.., LINES, k) of the pixels of the blocks `of`."""
         along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
         return (self.corner[of, :, 1, None] + along).astype(np.float32)
 
@@ -105,15 +107,15 @@ def cut_strips(
     width: float,
     ending: BoolArray | None = None,
 ) -> Strips:
-    """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures.
+    """Return the pixels within `width` px of the paths of `stars` (n, 2) px in the intervals `times` (n, 2).
 
-    The mask `ending` (n, 2) states which times are ends of a path; pixels beyond these ends are included.
-    None stands for all times.
+    The mask `ending` (n, 2) states which of the times are ends of a path. Pixels beyond these ends are
+    included. If `ending` is None, all times are ends of a path.
     """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
         outer &= ending[part]
-    # Positions from a distance before the start of each part to the same distance beyond its end.
+    # The positions extend by the same distance beyond both ends of each part.
     chosen, reach = stars[part], 1.45 * width + 1.0
     begin = low - reach / _speed(paths(pinhole, motion, chosen, low))
     end = high + reach / _speed(paths(pinhole, motion, chosen, high))
@@ -145,7 +147,7 @@ def cut_strips(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
-    """Lines of pixels (b, LINES): star and part (b,) of each block, and the time of each crossing."""
+    """Lines of pixels (b, LINES): star and part (b,) of each block, and crossing time of each line."""
 
     star: IntArray
     part: IntArray
@@ -158,13 +160,13 @@ class _Lines:
 def _parts(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return star, start and end times of each part, and a mask (.., 2) of the times that end a path."""
+    """Return star, start and end time of each part, and a mask (.., 2) of times that are ends of a path."""
     turned = float(np.linalg.norm(motion.rotation)) + float(np.linalg.norm(motion.acceleration))
     pieces = max(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # exactly, for the comparison below
+    edges[:, -1] = times[:, 1]  # This keeps the end exact for the comparison below.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -180,9 +182,9 @@ def _parts(
 def _diagonals(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return the parts to divide, and the times at which their major axis changes.
+    """Return the parts to divide, and the times at which the major axis of their paths changes.
 
-    `stars` (n, 2) px and the times `low` to `high` (n,) describe the parts.
+    The parts are given by `stars` (n, 2), px, and times from `low` to `high` (n,).
     """
     instants = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _INSTANTS)
     path = paths(pinhole, motion, np.repeat(stars, _INSTANTS, axis=0), instants.reshape(-1))
@@ -199,7 +201,7 @@ def _diagonals(
 
 
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
-    """Return approximate times at which the paths cross `line` (b, LINES); the model corrects them."""
+    """Return approximate times at which the paths cross `line` (b, LINES), which the model corrects."""
     time = np.empty(line.shape)
     bounds = np.searchsorted(owner, np.arange(len(major) + 1))
     for part in range(len(major)):
@@ -216,7 +218,7 @@ def _pixels(
     width: float,
     parts: tuple[FloatArray, FloatArray, BoolArray],
 ) -> Strips:
-    """Return the strips of `lines`, whose paths (b * LINES) are at `path`."""
+    """Return the strips of `lines`, which cross the paths at the points `path` (b * LINES)."""
     low, high, outer = parts
     shape = lines.line.shape
     along = lines.along_rows[:, None]
@@ -265,11 +267,11 @@ def _pixels(
 def path_distances(
     corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Return the distances (count, b, l) px of each line's pixels across the path and along it.
+    """Return the distances (count, b, l) of the pixels of each line across the path and along it, px.
 
-    `corner` and `step` are those of `Strips`; `position` and `tangent` (b, l, 2) are those of the path where
-    it crosses the line. The pixels of a line are the first axis, so that operations run along long contiguous
-    arrays.
+    `corner` and `step` are attributes of `Strips`; `position` and `tangent` (b, l, 2) describe the path where
+    it crosses each line. The pixels of a line are the first array axis, so that operations run along
+    contiguous memory.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
@@ -286,14 +288,14 @@ def _speed(path: StarPaths) -> FloatArray:
     return np.maximum(np.hypot(path.velocity[:, 0], path.velocity[:, 1]), _SLOWEST)
 
 
-# Gauss-Legendre nodes and weights of one piece of a path.
-# About one node per width of the point spread is exact to 1e-4.
+# Gauss-Legendre nodes and weights for one segment of a path.
+# One node per point-spread width gives a relative accuracy of 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
-# Length of a piece of a path, in widths of the point spread.
+# Length of a segment of a path, in point-spread widths.
 _PIECE_WIDTHS = 8.0
-# Distance from a patch, in widths of the point spread, up to which light reaches its pixels.
+# Distance from a patch, in point-spread widths, up to which starlight reaches the pixels of the patch.
 _BEYOND = 5.5
-# Number of instants at which a path with a changing rate is evaluated to divide it.
+# Number of instants at which a path with a changing rate is evaluated to divide it into segments.
 _SPOT_SAMPLES = 33
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -303,10 +305,10 @@ class Patches:
     """Square patches of pixels around spots.
 
     Attributes:
-        column: (n, p) columns of the pixels.
-        row: (n, p) rows of the pixels.
-        index: (n, p, p) index into the flat frame, 0 if not `inside`.
-        inside: (n, p, p) whether the pixel is in the frame.
+        column: (n, p) column numbers of the pixels of each patch.
+        row: (n, p) row numbers of the pixels of each patch.
+        index: (n, p, p) flat index of each pixel in the frame, or 0 if the pixel is not `inside`.
+        inside: (n, p, p) whether each pixel is in the frame.
     """
 
     column: IntArray
@@ -316,7 +318,7 @@ class Patches:
 
 
 def cut_patches(pinhole: Pinhole, middles: FloatArray, half: int) -> Patches:
-    """Return the pixels within `half` px of `middles` (n, 2) px in each direction."""
+    """Return square patches of pixels within `half` px of `middles` (n, 2), px, along each axis."""
     corner = np.rint(middles).astype(np.int64)[:, :, None] + np.arange(-half, half + 1)
     column, row = corner[:, 0], corner[:, 1]
     inside = ((row >= 0) & (row < pinhole.rows))[:, :, None] & ((column >= 0) & (column < pinhole.columns))[
@@ -334,9 +336,9 @@ def spot_derivatives(
     sigma: float,
     patches: Patches,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the light (n, p, p) of stars (n, 2) px of unit light, and its derivatives (n, 9, p, p).
+    """Return images (n, p, p) of stars (n, 2) px of unit flux, and their derivatives (n, 9, p, p).
 
-    The parameters are rate (3), acceleration (3), x, y, and the width `sigma` (px) of the point spread.
+    The parameters are rate (3), acceleration (3), x, y, and the point-spread width `sigma` (px).
     """
     count = len(stars)
     if not count:
@@ -372,7 +374,7 @@ def _pieces(
     sigma: float,
     patches: Patches,
 ) -> FloatArray:
-    """Return times (n, p + 1) that divide the paths near the patches into pieces of equal length."""
+    """Return times (n, p + 1) that divide the paths near the patches into segments of equal length."""
     n = len(stars)
     sampled = times[:, :1] + np.diff(times) * np.linspace(0.0, 1.0, _SPOT_SAMPLES)
     there = positions(pinhole, motion, np.repeat(stars, _SPOT_SAMPLES, axis=0), sampled.reshape(-1))
@@ -381,8 +383,8 @@ def _pieces(
     low = np.stack([patches.column[:, 0], patches.row[:, 0]], axis=-1)[:, None] - room
     high = np.stack([patches.column[:, -1], patches.row[:, -1]], axis=-1)[:, None] + room
     near = np.all((there >= low) & (there <= high), axis=2)
-    # The near part is extended by one sample on either side.
-    # A path that is never near is kept entirely.
+    # The part of the path near the patch is extended by one sample at both ends.
+    # A path that is never near its patch is kept completely.
     near |= np.pad(near, ((0, 0), (1, 0)))[:, :-1] | np.pad(near, ((0, 0), (0, 1)))[:, 1:]
     near |= ~near.any(axis=1, keepdims=True)
     step = np.hypot(*np.moveaxis(np.diff(there, axis=1), 2, 0)) * (near[:, 1:] & near[:, :-1])
@@ -393,17 +395,17 @@ def _pieces(
     out = np.empty((n, count + 1))
     for star in range(n):
         part = slice(first[star], last[star] + 1)
-        # The small term in time keeps the path length strictly increasing for a star at rest.
+        # The small linear term keeps the path length strictly increasing for a star at rest.
         run = way[star, part] + 1e-6 * np.arange(last[star] + 1 - first[star])
         out[star] = np.interp(run[0] + share * (run[-1] - run[0]), run, sampled[star, part])
     return out
 
 
 def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the fractions (n, m, p) of light on `pixels` (n, p), and two derivatives.
+    """Return the fractions (n, m, p) of a star's flux on `pixels` (n, p), and two derivatives.
 
-    The light is a Gaussian of width `sigma` at `place` (n, m). The derivatives are with respect to `place`
-    and `sigma`.
+    The flux has a Gaussian distribution of standard deviation `sigma` (px) around `place` (n, m). The
+    derivatives are with respect to `place` and `sigma`.
     """
     right = (pixels[:, None, :] + 0.5 - place[..., None]) / sigma
     left = right - 1.0 / sigma
@@ -414,15 +416,15 @@ def _profile(pixels: IntArray, place: FloatArray, sigma: float) -> tuple[FloatAr
 
 
 IMAGES = 7
-"""Number of images: m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, and 1."""
+"""Number of basis images: m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, and 1."""
 
-# Number of blocks computed at a time, so that their pixels fit into the processor's cache.
+# Number of blocks computed at once, small enough for their pixels to fit into the processor's cache.
 _AT_ONCE = 256
-# Distance from the end of a streak, in widths of the point spread, beyond which the light is zero or full.
+# Distance from a streak end, in point-spread widths, beyond which the intensity is zero or full.
 _ENDS = 5.5
-# Largest distance, in widths along the path, between a pixel and the point at which the path crosses the
+# Largest distance along the path, in point-spread widths, of a pixel from the crossing of its line.
 _OBLIQUE = 7.0
-# Time step of numerical differences, in exposures.
+# Time step of numerical derivatives, in exposures.
 _STEP = 1e-4
 # Fourth cumulant (px^4) of a uniform distribution over a pixel.
 _KURTOSIS = -1.0 / 120.0
@@ -437,9 +439,9 @@ def images(
     strips: Strips,
     more: int = 0,
 ) -> Float32Array:
-    """Return the images (b, IMAGES + more, LINES, k) of stars (n, 2) px of unit light on their strips.
+    """Return the basis images (b, IMAGES + more, LINES, k) of stars (n, 2) px of unit flux on their strips.
 
-    `width` is w in px; `more` additional images are left uninitialised.
+    `width` is w in px; `more` is the number of additional images, which are left uninitialised.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
@@ -462,9 +464,9 @@ def _draw(
     shutter: Shutter,
     width: float,
 ) -> None:
-    """Compute the images of the blocks `part`, with position, tangent, speed and acceleration in `path`."""
+    """Compute the basis images of the blocks `part` from position, tangent, speed and acceleration."""
     speed, time = path[2], strips.time[part]
-    # Acceleration along the path, px per exposure^2.
+    # `gained` is the acceleration along the path, px per exposure^2.
     gained = np.sum(path[3] * path[1], axis=-1)
     light, aside, s = _endless(strips, part, (*path, gained), out.shape[3], width)
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
@@ -480,7 +482,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # This image is the first moment along the path of the light between the ends of the exposure.
+    # This image is the first moment along the path of the counts between start and end of the exposure.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]
@@ -491,9 +493,9 @@ def _draw(
 def _endless(
     strips: Strips, part: slice, path: tuple[FloatArray, ...], count: int, width: float
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return the light of a path without ends, and the pixels' distances (px) across it and along it.
+    """Return counts of a path without ends, and distances (px) of the pixels across and along the path.
 
-    All are (count, b, LINES) for `count` pixels per line.
+    All arrays have the shape (count, b, LINES) for `count` pixels per line.
     """
     position, tangent, speed, acceleration, gained = path
     tx, ty = tangent[..., 0], tangent[..., 1]
@@ -509,7 +511,7 @@ def _endless(
     u *= np.float32(1.0 / width**2)
     light = np.multiply(u, np.float32(-0.5), out=ahead)
     np.exp(light, out=light)
-    # The light is inversely proportional to the speed, and larger on the inside of a bend.
+    # The intensity is inversely proportional to the speed, and larger on the inner side of a curved path.
     light *= np.float32(1.0) + squeeze * (np.float32(0.5) + np.float32(0.375) * squeeze)
     light *= np.float32(1.0) - s * (gained / speed**2).astype(np.float32)
     scale = _BELL / (width * speed)
@@ -531,10 +533,11 @@ def _ends(
     part: slice,
     width: float,
 ) -> None:
-    """Limit the light in `out[:, 0]` to the path between both ends, and compute the images of the ends.
+    """Limit the counts in `out[:, 0]` to the path between both ends, and compute the images of the ends.
 
-    `along` (b, LINES, k) px is the distance along the path from the centre of each block. `lines` has the
-    times at which the path crosses each line (b, LINES) and the centre (b, 1), and speed and acceleration.
+    `along` (b, LINES, k) is the distance of each pixel along the path from the centre of its block, px.
+    `lines` holds the times at which the path crosses each line (b, LINES) and the block centre (b, 1), and
+    the speed and acceleration of the star.
     """
     out[:, 3:6] = 0.0
     crossing, centre, speed, gained = lines
@@ -561,7 +564,7 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
-        # If the speed changes along the path, the light per px at the end differs from that of the block.
+        # If the speed changes along the path, the intensity at the end differs from the block's intensity.
         thinning = gained[near] / speed[near] ** 2
         out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
@@ -569,7 +572,7 @@ def _ends(
 
 
 def _wide(line: FloatArray) -> Float32Array:
-    """Return values of lines (b, l) with an axis for their pixels, as float32."""
+    """Return values of lines (b, l) as float32 with an additional axis for the pixels of each line."""
     return line[..., None].astype(np.float32)
 
 
@@ -581,14 +584,14 @@ def coefficients(
     strips: Strips,
     growing: bool = True,
 ) -> FloatArray:
-    """Return coefficients (b, IMAGES, 8) with which the images form the derivatives of a star of unit light.
+    """Return the coefficients (b, IMAGES, 8) of the basis images in the derivatives of a star of unit flux.
 
     The parameters are rate (3), acceleration (3), x and y. The columns of the acceleration are zero unless
     `growing`.
     """
     centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
     of_block = stars[strips.star]
-    # Each star has two ends; with a rolling shutter, each block has its own two ends.
+    # With a rolling shutter, the streak ends depend on the block as well as on the star.
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:
@@ -614,7 +617,7 @@ def coefficients(
 def _displacements(
     pinhole: Pinhole, motion: CameraMotion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return displacements by each parameter along the path (exposures) and across it (px), and the speed."""
+    """Return displacements per parameter along the path (exposures) and across it (px), and the speeds."""
     change, velocity = sensitivities_and_velocity(pinhole, motion, stars, time, growing)
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]

@@ -1,7 +1,8 @@
-"""The result of an estimate from streaks, and checks of its arguments that all estimators share.
+"""Results of an estimate from star streaks, and checks of the arguments that all estimators share.
 
-The control process reads results that workers compute, so that this module imports no estimator. One frame
-does not distinguish the rate omega from -omega; a prior, from a gyro or the last estimate, decides.
+The control process reads results that worker processes compute. This module therefore imports no estimator. A
+single frame does not distinguish the rate omega from -omega. A prior rate, from a gyro or the previous
+estimate, determines the sign.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ from knightcube.vision.streaks.settings import RateModel
 
 
 class StreakStatus(Enum):
-    """Outcome of a frame: a rate, or why there is none.
+    """Outcome of a frame: a rate, or the reason why no rate is reported.
 
-    The values are those of the `streak` telemetry packet.
+    The values are also used in the telemetry packet `streak`.
     """
 
     RATE = "rate"
@@ -48,30 +49,31 @@ REASONS = {
     StreakStatus.SATURATED: "the frame is overexposed",
     StreakStatus.FROZEN: "the frame is the same as the previous one",
 }
-"""Reasons why a frame has no rate, in one line, for results without a more detailed reason."""
+"""One-line reasons for a missing rate, for results without a more detailed reason."""
 
 
 def no_rows(*shape: int) -> Callable[[], FloatArray]:
-    """Return a default factory for a field: an empty array (0, *shape)."""
+    """Return a default factory for a dataclass field that creates an empty array (0, *shape)."""
     return partial(np.empty, (0, *shape))
 
 
 @dataclass(frozen=True, slots=True)
 class FrameMotion:
-    """The motion in one frame and its streaks.
+    """The motion of the camera in one frame, and the star streaks.
 
     Attributes:
-        status: `rate`: the rate is known; `ambiguous`: the rate is known up to its sign; others: no rate.
+        status: outcome of the frame. With `rate`, the rate is known; with `ambiguous`, the rate is known
+            except for its sign; otherwise there is no rate.
         checksum: checksum of the pixels, which differs between any two exposures of a working sensor.
         exposure: exposure time, s.
-        length: px, median length of the used streaks, otherwise of all found streaks or regions; NaN if none
+        length: median length of the used streaks, otherwise of all streaks or regions found, px; NaN if none
             is found.
-        endpoints: (found, 2, 2) px. If the frame has a rate, all first ends are simultaneous. With status
-            `rate` they are earlier than the second ends.
-        used: (found,) which streaks determine the rate.
-        rate: (3,) rad/s, camera axes, of the camera with respect to the stars; None if unknown.
-        covariance: (3, 3) rad^2/s^2 of `rate`; None if unknown.
-        residual: rad, rms error of an endpoint; NaN if unknown.
+        endpoints: (found, 2, 2) streak ends, px. If the frame has a rate, the first ends of all streaks are
+            simultaneous. With status `rate`, the first ends are earlier than the second ends.
+        used: (found,) whether each streak contributes to the rate.
+        rate: (3,) rate of the camera relative to the stars, in camera axes, rad/s; None if unknown.
+        covariance: (3, 3) covariance of `rate`, rad^2/s^2; None if unknown.
+        residual: rms error of a streak end, rad; NaN if unknown.
         hot_pixels: number of hot pixels, which are repaired or excluded.
     """
 
@@ -88,7 +90,7 @@ class FrameMotion:
 
     @property
     def found(self) -> int:
-        """The number of streaks with two endpoints."""
+        """The number of streaks with two ends."""
         return len(self.endpoints)
 
     @property
@@ -97,35 +99,37 @@ class FrameMotion:
         return int(np.count_nonzero(self.used))
 
     def reversed(self) -> Self:
-        """Return the motion with the opposite direction of time."""
+        """Return the time-reversed motion, with the opposite rate and exchanged streak ends."""
         assert self.rate is not None
         return replace(self, rate=-self.rate, endpoints=self.endpoints[:, ::-1])
 
 
 @dataclass(frozen=True, slots=True)
 class MotionResult(FrameMotion):
-    """The maximum-likelihood motion of one exposure and its stars; `rate` is the mean over the exposure.
+    """The maximum-likelihood motion over one exposure, and the stars of the frame.
 
-    The `used` stars determine the motion. `length` and `residual`, here the expected error, refer to these
-    stars.
+    The attribute `rate` is the mean rate over the exposure. The stars in the mask `used` determine the
+    motion. The attributes `length` and `residual`, here the expected error, refer to the used stars.
 
     Attributes:
-        stars: (n, 2) px at mid-exposure.
-        star_covariance: (n, 2, 2) px^2 of `stars`.
-        endpoint_covariance: (n, 2, 2, 2) px^2, star, end.
-        directions: (n, 3, 3) unit vectors at start, middle and end, camera axes.
-        flux: (n,) counts over the exposure.
-        significance: (n,) flux over its standard deviation.
-        faint_endpoints: (m, 2, 2) px, accurate to about 1 px, of streaks that were detected but not fitted.
+        stars: (n, 2) positions of the stars at mid-exposure, px.
+        star_covariance: (n, 2, 2) covariance of each star position, px^2.
+        endpoint_covariance: (n, 2, 2, 2) covariance of each end of each streak, px^2.
+        directions: (n, 3, 3) unit vectors at the start, middle and end of each streak, in camera axes.
+        flux: (n,) counts of each star over the exposure.
+        significance: (n,) flux of each star over its standard deviation.
+        faint_endpoints: (m, 2, 2) ends of streaks that were detected but not fitted, accurate to about 1 px,
+            px.
         faint_flux: (m,) counts.
-        faint_significance: (m,) flux over its standard deviation.
-        psf_sigma: px, fitted standard deviation of the point spread.
+        faint_significance: (m,) flux of each faint star over its standard deviation.
+        psf_sigma: fitted standard deviation of the point spread, px.
         misfit: median chi-square per degree of freedom of the bright stars.
-        rate_model: the fitted model, `constant` or `accelerating`.
-        acceleration: (3,) rad/s^2 if fitted, else None.
-        reason: reason for a missing rate, in one line; empty if there is a rate.
-        course: rotation from navigation whose higher terms the fit used; None if it used none.
-        line_time_sigma: s, standard deviation of the shutter's line time.
+        rate_model: fitted model of the rate, `constant` or `accelerating`.
+        acceleration: (3,) fitted angular acceleration, rad/s^2, or None if it was not fitted.
+        reason: one-line reason for a missing rate. It is empty if there is a rate.
+        course: rotation from the navigation filter whose higher-order terms the fit used; None if it used
+            none.
+        line_time_sigma: standard deviation of the shutter's line time, s.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -149,15 +153,15 @@ class MotionResult(FrameMotion):
     def start_to_end(self) -> FloatArray | None:
         """The quaternion (4,) of the rotation over the exposure, A(q) v_start = v_end; None without a rate.
 
-        It follows from the mean rate and is exact for a fixed axis of rotation.
+        The quaternion follows from the mean rate and is exact for a fixed rotation axis.
         """
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
 
     def line_time_displacement(self, chosen: IntArray, middle_row: float) -> FloatArray:
-        """Return displacements (m, 2) px of `chosen` (m,) stars by one standard deviation of the line time.
+        """Return displacements (m, 2), px, of stars `chosen` (m,) by one standard deviation of the line time.
 
-        The delay is proportional to the distance of a star's row from `middle_row`. The array is empty (0, 2)
-        if the line time is exact.
+        The delay of a star is proportional to the distance of its row from `middle_row`. The result is an
+        empty array (0, 2) if the line time is exactly known.
         """
         if not self.line_time_sigma:
             return np.empty((0, 2))
@@ -166,7 +170,7 @@ class MotionResult(FrameMotion):
         return np.asarray((end - start) * delay)
 
     def reversed(self) -> Self:
-        """Return the motion with the opposite direction of time and the same acceleration."""
+        """Return the time-reversed motion, with the opposite rate and the same acceleration."""
         return replace(
             FrameMotion.reversed(self),
             endpoint_covariance=self.endpoint_covariance[:, ::-1],
@@ -182,7 +186,7 @@ Result = TypeVar("Result", bound=FrameMotion)
 def validate(
     pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
 ) -> None:
-    """Raise FlightError for an invalid frame, exposure (s) or prior (rad/s)."""
+    """Raise FlightError if the frame, exposure (s), prior rate (rad/s) or prior deviation is invalid."""
     expected = (pinhole.rows, pinhole.columns)
     if pixels.shape != expected:
         raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
@@ -199,9 +203,10 @@ def validate(
 def admit(
     pixels: Image, previous_checksum: int | None, saturation: float, saturated_fraction: float
 ) -> tuple[int, StreakStatus | None]:
-    """Return the checksum of `pixels`, and the status of an unusable frame: black, saturated or frozen.
+    """Return the checksum of `pixels`, and the status of an unusable frame or None.
 
-    A frame equal to the previous one indicates a frozen camera, because two exposures differ in their noise.
+    A frame equal to the previous frame indicates a frozen camera, because noise makes any two exposures
+    differ.
     """
     checksum = zlib.crc32(pixels.tobytes())
     state = frame_state(pixels, saturation, saturated_fraction)
@@ -211,7 +216,7 @@ def admit(
 
 
 def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float) -> Result:
-    """Return `result` in the direction of time of the prior, unchanged if the prior is too uncertain."""
+    """Return `result` with the sign of the prior rate, or unchanged if the prior rate is too uncertain."""
     if result.rate is None or prior_rate is None:
         return result
     sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)
@@ -221,9 +226,10 @@ def in_time(result: Result, prior_rate: FloatArray | None, prior_sigma: float, s
 
 
 def direction_of_time(rate: FloatArray, prior_rate: FloatArray, prior_sigma: float, sigmas: float) -> int:
-    """Return the sign (+1, -1) by which a prior orients `rate` (3,), 0 if the prior is too uncertain.
+    """Return the sign (+1, -1) that gives `rate` (3,) the sense of the prior rate, or 0 if undetermined.
 
-    The prior's projection on the axis must exceed `sigmas` times its standard deviation `prior_sigma`.
+    The component of the prior rate along `rate` must exceed `sigmas` times its standard deviation
+    `prior_sigma`.
     """
     projection = float(rate @ prior_rate / np.linalg.norm(rate))
     if abs(projection) <= sigmas * prior_sigma:

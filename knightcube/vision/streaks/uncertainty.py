@@ -1,9 +1,10 @@
-"""The covariance of the fitted rotation, including errors that the model does not describe.
+"""Covariance of the fitted rotation, including errors that the model does not describe.
 
-Photon noise gives the smallest covariance. The covariance is increased by the scatter of the stars beyond
-their noise, and by errors of the camera's calibration that the stars do not determine. Two errors are common
-to all stars and cause no scatter: a point spread of another width or shape, which moves the ends of all
-streaks, and vibration of the body. The residuals at the ends and along the streaks bound these two errors.
+Photon noise gives a lower limit of the covariance. The covariance is increased by the scatter of the stars
+beyond their noise, and by calibration errors of the camera that the stars do not determine. Two errors affect
+all stars equally and cause no scatter: a point spread with an unexpected width or shape, which moves the ends
+of all streaks, and vibration of the body. The residuals at the ends and along the streaks give upper limits
+for these two errors.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ from knightcube.vision.streaks.normal_equations import (
 from knightcube.vision.streaks.streak_model import LINES
 from knightcube.vision.streaks.streak_result import MotionResult
 
-# Residual of a pixel, in standard deviations, above which the pixel contains light of another star.
+# Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Part of that residual limit proportional to the light, as a fraction of the brightest pixel of the line.
+# Increase of this residual limit, as a fraction of the brightest modelled pixel of the line.
 _FOREIGN_SHARE = 0.6
 # Minimum sensitivity of a pixel to a displacement, relative to the most sensitive pixel of its block.
 _LEAST_SENSITIVITY = 0.02
@@ -49,14 +50,14 @@ _LEAST_SENSITIVITY = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreakResiduals:
-    """The residuals of the trusted streaks on their blocks of pixels.
+    """Residuals of the trusted streaks on their blocks of pixels.
 
     Attributes:
-        star: (b,) index of the star in the scene.
-        time: (b, LINES) time at which the path crosses the line.
-        images: (b, IMAGES, LINES, k) images of the model.
-        weight: (b, LINES, k) inverse variance, 0 for excluded pixels.
-        residual: (b, LINES, k) counts.
+        star: (b,) index of the star of each block in the scene.
+        time: (b, LINES) time at which the path crosses each line, in exposures.
+        images: (b, IMAGES, LINES, k) basis images of the streak model.
+        weight: (b, LINES, k) inverse variance of each pixel, 0 for excluded pixels.
+        residual: (b, LINES, k) measured minus modelled counts of each pixel.
     """
 
     star: IntArray
@@ -87,11 +88,11 @@ def residuals_of_fit(camera: FitProblem, fit: StreakFit) -> StreakResiduals:
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
-    """The rms displacement (px) that would explain residuals.
+    """RMS displacement (px) that would explain the residuals.
 
     Attributes:
-        shown: displacement beyond the expectation from noise.
-        chance: upper bound, with the statistical uncertainty added.
+        shown: significant displacement, after subtraction of two standard deviations of the noise.
+        chance: upper limit of the displacement, one standard deviation above the measured value.
     """
 
     shown: float
@@ -99,7 +100,7 @@ class Displacement:
 
 
 def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement of the ends along the paths that explains the residuals, None without ends."""
+    """Return the displacement of streak ends that explains the residuals, or None without ends."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = light * (left.images[:, 3] + left.images[:, 4])
     near = _sensitive(left, change)
@@ -110,7 +111,7 @@ def end_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement 
 
 
 def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement | None:
-    """Return the displacement across the paths that explains the residuals, None without streaks."""
+    """Return the displacement across the paths that explains the residuals, or None without streaks."""
     light = scene.light[left.star, None, None].astype(np.float32)
     change = np.abs(light * left.images[:, 1])
     along = _sensitive(left, change) & ~_sensitive(left, light * (left.images[:, 3] + left.images[:, 4]))
@@ -118,7 +119,7 @@ def side_displacement(left: StreakResiduals, scene: StreakScene) -> Displacement
 
 
 def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
-    """Return which fitted pixels are sensitive to a `change` of the light."""
+    """Return which fitted pixels are sensitive to a `change` of the modelled counts."""
     most = change.max(axis=(1, 2), keepdims=True, initial=0.0)
     return np.asarray((left.weight > 0.0) & (change > _LEAST_SENSITIVITY * most))
 
@@ -126,9 +127,9 @@ def _sensitive(left: StreakResiduals, change: Float32Array) -> BoolArray:
 def _displacement(
     left: StreakResiduals, squares: Float32Array, change: Float32Array, on: BoolArray, usual: float
 ) -> Displacement | None:
-    """Return the displacement that would explain the squared residuals `squares` on pixels `on`.
+    """Return the displacement that would explain the squared residuals `squares` on the pixels `on`.
 
-    `change` is the change of the light per px of displacement, `usual` the mean square due to noise.
+    `change` is the change of the counts per px of displacement, and `usual` is the mean square from noise.
     """
     count = int(np.count_nonzero(on))
     information = float(np.sum((left.weight * change * change)[on], dtype=np.float64))
@@ -142,26 +143,26 @@ def _displacement(
     )
 
 
-# Instants at which a path is compared with the same path displaced by a calibration error.
+# Instants (exposures) at which a path is compared with the path displaced by a calibration error.
 _INSTANTS = np.linspace(-0.5, 0.5, 9)
-# Minimum speed (px per exposure) in divisions by the speed.
+# Lower limit (px per exposure) of speeds by which the code divides.
 _SLOWEST = 1e-3
 # Indices of rate and star position among the parameters of the sensitivities.
 _RATE_AND_POSITION = np.array([0, 1, 2, 6, 7])
-# Probability with which a calibration error is corrected by chance.
+# Probability of correcting a calibration error that does not exist.
 _BY_CHANCE = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationCorrection:
-    """The effect of errors of the camera's calibration on the shared parameters.
+    """Effect of camera calibration errors on the shared parameters of the fit.
 
     Attributes:
-        step: (k,) correction of the shared parameters; 0 if the errors are not significant.
-        added: (k, k) covariance added to that of an exact camera.
-        described: (k, k) part of `added` due to errors of described size.
-        score: (n, k) gradient of each star after correction.
-        error: (m,) likeliest errors, in standard deviations.
+        step: (k,) correction of the shared parameters. It is 0 if the errors are not significant.
+        added: (k, k) covariance that calibration errors add to the covariance for an exact camera.
+        described: (k, k) part of `added` from errors whose size is specified.
+        score: (n, k) gradient of each star after the correction.
+        error: (m,) most likely calibration errors, in standard deviations.
     """
 
     step: FloatArray
@@ -179,16 +180,16 @@ def correct(
     described: int,
     counted: FloatArray | None = None,
 ) -> CalibrationCorrection | None:
-    """Return the joint solution for the shared parameters and the camera's errors, None if singular.
+    """Return the joint solution for shared parameters and calibration errors, or None if it is singular.
 
     Args:
-        information: (n, k, k) information of each star, its own parameters eliminated.
-        score: (n, k) gradient of each star.
-        apparent: (n, k, m) apparent change of the shared parameters by m errors of one standard deviation;
-            the first errors are of described size.
-        spread: variance of the stars' scatter, relative to the noise.
-        described: number of errors of described size.
-        counted: (m,) errors already corrected in the fit, to which the result is relative.
+        information: (n, k, k) information of each star after elimination of the star's own parameters.
+        score: (n, k) gradient of each star's log-likelihood.
+        apparent: (n, k, m) apparent change of the shared parameters by each of m calibration errors of one
+            standard deviation. Errors of specified size come first.
+        spread: variance of the scatter of the stars, relative to their noise.
+        described: number of calibration errors whose size is specified.
+        counted: (m,) errors already corrected in the fit. The result is relative to these errors.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -216,9 +217,9 @@ def correct(
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
-    """Return the covariance (k, k) due to calibration errors with the information matrix `left` (m, m).
+    """Return the covariance (k, k) from calibration errors with the information matrix `left` (m, m).
 
-    Each correction is assumed to be uncertain by its own size, because a large displacement of streaks is
+    Each correction is assumed to be uncertain by its own size, because large displacements of streaks are
     underestimated.
     """
     change = leading @ error
@@ -226,11 +227,11 @@ def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArr
 
 
 def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> FloatArray:
-    """Return apparent rate changes (n, 3, m) of each star due to each error of one standard deviation.
+    """Return apparent rate changes (n, 3, m) of each star by calibration errors of one standard deviation.
 
-    They are in rad per exposure. Exactly known quantities are omitted, and the error of the shutter is the
-    last one. A streak determines the position of its path in the direction across it and, by its ends, its
-    length.
+    The apparent rate changes are in rad per exposure. Exactly known calibration parameters are omitted, and
+    the line time of the shutter is last. A streak determines the position of its path across the path, and
+    its ends determine its length.
     """
     errors = _error_sizes(camera)
     n = len(scene.stars)
@@ -257,7 +258,7 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
 
 
 def _error_sizes(camera: FitProblem) -> dict[str, float]:
-    """Return the standard deviations of the uncertain quantities, the line time last."""
+    """Return the standard deviations of the uncertain calibration parameters, with the line time last."""
     known = camera.settings.knowledge
     sizes = {
         "focal length": known.focal_length,
@@ -272,7 +273,7 @@ def _error_sizes(camera: FitProblem) -> dict[str, float]:
 def _error_displacements(
     pinhole: Pinhole, errors: dict[str, float], place: FloatArray, velocity: FloatArray
 ) -> FloatArray:
-    """Return displacements (p, 2, m) px by each error, of stars at `place` (p, 2) px and `velocity` px/s."""
+    """Return displacements (p, 2, m) px by each error, of stars at `place` (p, 2) px with `velocity` px/s."""
     away = place - np.array(pinhole.centre)
     corner = np.hypot(*pinhole.centre)
     moves = {
@@ -288,8 +289,8 @@ def _error_displacements(
 
 
 def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
-    """Return the camera with a lens of these errors (m,), in standard deviations, as in `apparent_rates`."""
-    # The line time, the last error, does not belong to the lens.
+    """Return `camera` with a lens that has the calibration errors `error` (m,), in standard deviations."""
+    # The line time, the last of the errors, is not a property of the lens.
     sizes = zip(_error_sizes(camera).items(), error, strict=False)
     found = {name: sigma * float(by) for (name, sigma), by in sizes}
     scale, x, y, cubic = (
@@ -300,19 +301,19 @@ def distorted_camera(camera: FitProblem, error: FloatArray) -> FitProblem:
     return replace(camera, pinhole=lens)
 
 
-# Number of time bins over the exposure for the common motion of the streaks.
+# Number of time bins over the exposure for the estimate of the motion common to all streaks.
 _BINS = 48
-# Minimum significance of a common motion, in standard deviations.
+# Minimum significance (standard deviations) of a motion common to all streaks.
 _SIGNIFICANT = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class CommonMotion:
-    """The rms motion common to all streaks beyond the smooth model; 0 if not significant.
+    """RMS motion common to all streaks beyond the smooth model, or 0 if it is not significant.
 
     Attributes:
-        across: px, displacement across the paths.
-        along: relative change of brightness along them.
+        across: displacement across the paths, px.
+        along: relative change of brightness along the paths.
     """
 
     across: float = 0.0
@@ -320,11 +321,12 @@ class CommonMotion:
 
 
 def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResiduals) -> CommonMotion:
-    """Return the motion common to the trusted streaks, zero without long streaks.
+    """Return the motion common to the trusted streaks, which is zero if there are no long streaks.
 
-    At each time, vibration displaces all streaks equally across their paths. Along the paths it changes their
-    speed and thereby their brightness. The residuals are averaged over the stars by time. Only products of
-    different stars are summed, so that light of a star's neighbour has no effect.
+    At each time, vibration displaces all streaks equally across their paths. Along the paths, vibration
+    changes the speed of the stars and thereby their intensity. The residuals of all stars are averaged in
+    bins of time. Only products between different stars are summed, so that flux of a star's neighbour has no
+    effect.
     """
     if not len(left.star):
         return CommonMotion()
@@ -347,10 +349,10 @@ def find_common_motion(camera: FitProblem, scene: StreakScene, left: StreakResid
 
 
 def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
-    """Return the rms displacement common to all stars, 0 if not significant.
+    """Return the rms displacement common to all stars, or 0 if it is not significant.
 
-    `score` (m, 2) and `information` (m,) of m lines are summed in cells of star and time bin with the index
-    `cell` (m,).
+    `score` (m, 2) and `information` (m,) of m lines are summed in cells of star and time bin, whose indices
+    are `cell` (m,).
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
@@ -358,7 +360,7 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
     own = own.reshape(-1, _BINS, 2)
     known = np.bincount(cell, information, size).reshape(-1, _BINS)
-    # The weight of a star is limited by its own scatter, which includes errors of the model.
+    # The weight of a star is limited by the star's own scatter, which includes model errors.
     scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
     trust = 1.0 / np.maximum(scatter, 1.0)
     own, known = own * trust[:, None, None], known * trust[:, None]
@@ -371,38 +373,38 @@ def _common_rms(cell: IntArray, score: FloatArray, information: FloatArray) -> f
     return float(np.sqrt(common / weight))
 
 
-# Minimum relative change of the rate of a motion that begins or ends near rest.
+# Minimum relative change of the rate of a motion that starts or ends near rest.
 _NEAR_REST = 1.5
-# Maximum number of bright streaks that are tested for a reversed rotation.
+# Maximum number of bright streaks that are tested for a reversal of the rotation.
 _MOST_STARS = 10
-# Step (px) of the light along a path.
+# Sampling step (px) of the intensity along a path.
 _STEP = 0.5
-# Margin (px) before the point at which a star is at rest.
+# Margin (px) before the point at which the star is at rest.
 _BEFORE = 5.0
 # Length of the examined path, relative to the fitted path.
 _BEYOND = 1.9
-# Half width (px) of the band of pixels around a path.
+# Half width (px) of the band of pixels around a path that is examined.
 _ASIDE = 3
-# Trial ratios of the durations of the shorter and the longer part of a reversing motion.
+# Trial ratios of the shorter to the longer of the two durations before and after the reversal.
 _SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
-# Trial ratios of the path length of a reversing motion to the fitted length.
+# Trial ratios of the path length of a reversing motion to the fitted path length.
 _LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
-# Relative error of the model's profile across a path.
+# Relative error of the modelled profile across a path.
 _PROFILE_ERROR = 0.05
-# Largest improvement of chi-square that one star contributes.
+# Upper limit of the chi-square improvement by a single star.
 _MOST_IMPROVEMENT = 100.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PathLight:
-    """Sums over the pixels of a streak from which chi-square follows for any light along its path.
+    """Sums over the pixels of a streak that give chi-square for any intensity along its path.
 
-    The data d have weights w, and g is the point spread across the path.
+    Here d are the pixel values, w their weights, and g is the point-spread profile across the path.
 
     Attributes:
-        places: (k,) px, distances along the path from the rest.
+        places: (k,) distances along the path from the point of rest, px.
         square: (k,) sums of w g^2 over the pixels nearest to each place.
-        cross: (k,) sums of w g d.
+        cross: (k,) sums of w g d over the pixels nearest to each place.
         plain: (k,) sums of w g.
         moments: sums of w, w d and w d^2 over all pixels.
         pixels: number of pixels.
@@ -417,13 +419,14 @@ class _PathLight:
 
 
 def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
-    """Return the improvement of chi-square of bright streaks by a rotation that reverses in the exposure.
+    """Return the chi-square improvement of bright streaks if the rotation reverses during the exposure.
 
-    The improvement is 0 if no such rotation is better, or if the rate is far from zero or known from
-    navigation. For a linear rate, the light along a path is 1/sqrt(s) at s px from the rest. A rotation that
-    reverses covers the first part of the path twice, which doubles the light there. If both parts are equally
-    long, the light is the same as that of a motion from rest, and the pixels do not distinguish the two
-    motions.
+    The improvement is 0 if no reversing rotation fits better, if the rate is far from zero, or if the motion
+    is from the navigation filter. For a rate that changes linearly, the intensity along a path is
+    proportional to 1/sqrt(s) at a distance of s px from the point of rest. A rotation that reverses covers
+    the first part of the path twice, which doubles the intensity of this part. If the durations before and
+    after the reversal are equal, the intensity equals that of a motion from rest, and the pixels do not
+    distinguish the two motions.
     """
     motion, change = scene.motion, scene.motion.relative_acceleration
     if abs(change) < _NEAR_REST or motion.higher_terms.any():
@@ -447,7 +450,7 @@ def reversal_improvement(camera: FitProblem, scene: StreakScene) -> float:
 def _path_light(
     camera: FitProblem, onward: CameraMotion, rest: FloatArray, length: float, width: float
 ) -> _PathLight:
-    """Return the light along the path of a star at rest at pixel `rest` (2,) that then moves `onward`."""
+    """Return sums along the path of a star that rests at the pixel `rest` (2,) and then moves `onward`."""
     frame, pinhole = camera.frame, camera.pinhole
     places = np.arange(-_BEFORE, _BEYOND * length + _BEFORE, _STEP)
     path = positions(pinhole, onward, np.repeat(rest[None], len(places), axis=0), places / length)
@@ -461,7 +464,7 @@ def _path_light(
     apart = np.sum((points[:, None] - path) ** 2, axis=2)
     nearest = np.argmin(apart, axis=1)
     apart = apart[np.arange(len(index)), nearest]
-    # Pixels nearest to the first or the last place may lie beyond the path.
+    # Pixels that are nearest to the first or the last place may lie beyond the path.
     kept = (apart < _ASIDE**2) & (nearest > 0) & (nearest < len(places) - 1)
     index, apart, nearest = index[kept], apart[kept], nearest[kept]
     data = frame.signal[index].astype(float)
@@ -477,13 +480,14 @@ def _path_light(
 
 
 def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, width: float) -> FloatArray:
-    """Return chi-square (s, l) of reversing motions with `shares` (s,) and path lengths `lengths` (l,) px.
+    """Return chi-square (s, l) of reversing motions for ratios `shares` (s,) and `lengths` (l,) px.
 
-    `shares` are ratios of the durations of the two parts. Light and sky of the star are fitted.
+    `shares` are ratios of the durations before and after the reversal. The flux of the star and the sky level
+    are fitted.
     """
     edges = np.append(one.places, one.places[-1] + _STEP) - 0.5 * _STEP
-    # The light before each edge of the cells.
-    # A negative share stands for a motion that begins after the rest.
+    # `before` is the flux before each edge of the cells along the path.
+    # A negative ratio stands for a motion that starts after the point of rest.
     share, root = shares[:, None, None], np.sqrt(np.clip(edges / lengths[:, None], 0.0, 1.0))
     before = np.maximum(root, -share) + np.minimum(root, np.maximum(share, 0.0)) + np.minimum(share, 0.0)
     light = np.diff(before / (1.0 + share), axis=-1)
@@ -495,29 +499,29 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
     return np.asarray(second - explained)
 
 
-# Maximum number of conjugate-gradient steps for the covariance.
+# Maximum number of conjugate-gradient iterations for the covariance.
 _CONJUGATE = 12
-# Number of stars up to which their agreement does not test the motion, and the factor on the variance for so
+# Number of stars too small for a consistency test, and the factor on the variance for such a fit.
 _UNCHECKED = (2, 4.0)
-# Relative difference of variances up to which the fitted and the described point spread count as equal.
+# Relative difference between fitted and configured point-spread variance that counts as zero.
 _SAME_SPREAD = 0.05
-# Uncertainty of the ends, relative to the root of the difference between fitted and described variance.
+# Uncertainty of the ends, relative to the root of the difference between fitted and configured variance.
 _END_SHARE = 0.6
-# Minimum uncertainty (px) of the ends if their residuals indicate a displacement.
+# Minimum uncertainty (px) of streak ends whose residuals indicate a displacement.
 _END_FLOOR = 0.12
-# Uncertainty of the ends, relative to the displacement that explains their residuals.
+# Uncertainty of the streak ends, relative to the displacement that explains their residuals.
 _END_SHOWN = 1.5
-# Uncertainty of the ends, relative to the upper bound of the displacement that explains their residuals.
+# Uncertainty of the streak ends, relative to the upper limit of the displacement from their residuals.
 _END_CHANCE = 0.5
-# Uncertainty of the ends (px) per unit of common motion, in px across or relative brightness along the paths.
+# Uncertainty of the streak ends (px) per motion common to all streaks (px across, or relative brightness).
 _END_COMMON = 25.0
-# Maximum number of corrections of the lens.
+# Maximum number of iterations of the lens correction.
 _MOST_LENSES = 3
-# Largest calibration error (standard deviations) after which the correction of the lens stops.
+# Largest calibration error (standard deviations) at which the lens correction is converged.
 _SMALL_ERROR = 0.2
-# Relative uncertainty of the rotation due to the lens above which a correction is tried without a significant
+# Relative uncertainty of the rotation from the lens above which the lens correction is always tried.
 _WORTHWHILE = 0.002
-# Ratio of the covariance to that of noise above which model errors must be its cause (three sigma).
+# Ratio of the covariance to the noise covariance above which model errors are the cause (three sigma).
 _BEYOND_NOISE = 9.0
 
 
@@ -526,12 +530,12 @@ class RotationUncertainty:
     """The rotation over the exposure and its uncertainty.
 
     Attributes:
-        rotation: (3,) rad, corrected for errors of the calibration that the stars show.
+        rotation: (3,) rotation vector, corrected for significant calibration errors, rad.
         covariance: (3, 3) rad^2.
-        model_error: uncertainty due to errors of the model, relative to the rotation. The uncertainty of an
-            undescribed shutter is only in the covariance.
-        common_motion: motion common to all streaks.
-        aside: px, displacement across the streaks that would explain the residuals.
+        model_error: uncertainty from model errors, relative to the rotation. The uncertainty of an
+            unspecified shutter is included only in the covariance.
+        common_motion: motion common to all streaks, such as vibration.
+        aside: displacement across the streaks that would explain the residuals, px.
     """
 
     rotation: FloatArray
@@ -542,9 +546,10 @@ class RotationUncertainty:
 
 
 def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: StreakFit) -> RotationUncertainty:
-    """Return the rotation of the `whole` fit with its uncertainty; `result` has the stars of the fit.
+    """Return the rotation of the fit `whole` with its uncertainty.
 
-    If stars are hidden in the streaks, the rotation is that of the brightest streaks with all hidden stars.
+    The stars of the fit are given in `result`. If faint stars are hidden in the streaks, the rotation is
+    taken from a fit of the brightest streaks with all their hidden stars.
     """
     camera, whole, lens = _corrected_lens(camera, whole, result.exposure)
     brightest = brightest_fit(camera, whole)
@@ -555,7 +560,7 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
     if brightest is not None:
         lens = _lens_effect(camera, brightest, result.exposure, lens.counted)
     rotation = scene.motion.rotation + lens.step
-    # The cause of the rejected stars may also affect the accepted stars, to a smaller degree.
+    # The cause of the rejected stars may also affect the accepted stars to a smaller degree.
     agreed = int(np.count_nonzero(scene.trusted))
     judged = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
     spread = max(result.misfit, lens.spread, 1.0) * max(judged / max(agreed, 1), 1.0)
@@ -568,10 +573,10 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
         _END_COMMON * max(common_motion.across, common_motion.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
-    # A fit that did not settle is uncertain by its last step.
+    # The uncertainty of a fit that did not converge includes its last step.
     covariance = noise * spread * (1.0 + last.last_step**2)
     # An error common to all streak ends changes the rotation angle.
-    # The axis gets the same uncertainty as the angle.
+    # The uncertainty of the rotation axis is assumed to equal that of the angle.
     longer = ends**2 * float(rotation @ rotation)
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
@@ -588,16 +593,16 @@ def rotation_uncertainty(result: MotionResult, camera: FitProblem, whole: Streak
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LensEffect:
-    """The effect of calibration errors on the rotation; see `CalibrationCorrection`.
+    """Effect of calibration errors on the rotation, as in `CalibrationCorrection`.
 
     Attributes:
-        step: (3,) rad, correction of the rotation.
-        added: (3, 3) rad^2, covariance added.
-        described: (3, 3) rad^2, part of `added` due to errors of described size.
-        spread: variance of the stars' scatter, relative to the noise.
-        error: (m,) errors relative to `counted`, in standard deviations.
+        step: (3,) correction of the rotation, rad.
+        added: (3, 3) covariance that calibration errors add, rad^2.
+        described: (3, 3) part of `added` from errors whose size is specified, rad^2.
+        spread: variance of the scatter of the stars, relative to their noise.
+        error: (m,) calibration errors relative to `counted`, in standard deviations.
         counted: (m,) errors already corrected in the fit; None without any.
-        seen: whether the errors are significant.
+        seen: whether the calibration errors are significant.
     """
 
     step: FloatArray
@@ -612,11 +617,11 @@ class _LensEffect:
 def _corrected_lens(
     camera: FitProblem, whole: StreakFit, exposure: float
 ) -> tuple[FitProblem, StreakFit, _LensEffect]:
-    """Return camera and fit after correction of the likeliest lens errors, and their remaining effect.
+    """Return camera and fit after correction of the most likely lens errors, and the remaining effect.
 
-    Large displacements of streaks are underestimated, so that the fit is repeated with the corrected lens
-    until the correction is small. This is done if the stars show an error, or if the lens contributes most of
-    the uncertainty.
+    Large displacements of streaks are underestimated. The fit is therefore repeated with the corrected lens
+    until the correction is small. The lens is corrected if the stars show an error, or if the lens
+    contributes most of the uncertainty.
     """
     first = lens = _lens_effect(camera, whole, exposure, None)
     if not lens.seen and np.trace(lens.described) < _WORTHWHILE**2 * np.sum(whole.scene.motion.rotation**2):
@@ -638,7 +643,7 @@ def _corrected_lens(
 def _lens_effect(
     camera: FitProblem, last: StreakFit, exposure: float, counted: FloatArray | None
 ) -> _LensEffect:
-    """Return the effect of calibration errors on the rotation beyond the errors `counted` (m,)."""
+    """Return the effect on the rotation of calibration errors beyond the errors `counted` (m,)."""
     nothing = np.zeros((3, 3))
     equations = star_equations(last.evaluation, last.free)
     if equations is None:
@@ -671,17 +676,17 @@ def _lens_effect(
 
 
 def _scatter(equations: StarEquations, scene: StreakScene) -> float:
-    """Return the variance of the stars' scatter, relative to their noise."""
+    """Return the variance of the scatter of the stars, relative to their noise."""
     everyone: BoolArray = np.ones(len(scene.light), dtype=np.bool_)
     return max(disagreement(estimates_of(equations, scene), everyone), contradiction(equations))
 
 
 def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, misfit: float) -> float:
-    """Return the uncertainty (px) of the ends due to a point spread of another width than `sigma` px.
+    """Return the uncertainty (px) of streak ends from a point-spread width that differs from `sigma` (px).
 
-    If the ends have no significant residuals, the point spread has the shape of the model and the same width
-    along and across the streaks. Residuals indicate another shape, or a vibration too fast to be resolved,
-    which shifts the apparent ends.
+    If the residuals at the ends are not significant, the point spread has the modelled shape and the same
+    width along and across the streaks. Residuals indicate another shape, or a vibration too fast to be
+    resolved, which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
