@@ -1,1 +1,1 @@
-"""How devices are talked to: buses know Linux, drivers know a part's registers."""
+"""Hardware abstraction layer: buses on Linux, device drivers, and the interfaces that the flight uses."""

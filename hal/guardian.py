@@ -1,19 +1,22 @@
-"""The guardian: a small process that zeroes the coils when the control loop's heartbeats stop.
+"""The guardian: a small process that sets the coils to zero when the control loop's heartbeats stop.
 
-The guardian zeroes the coils through a bus of its own, from its start until the first heartbeat, and 0.3 s
-after the last one. Without heartbeats zero is repeated every 0.1 s, to override a late write of the flight
-process or the effect of a brown-out. The guardian stops writing zero as soon as heartbeats return. It ignores
-SIGTERM and SIGINT, because they end the flight process, whose goodbye or death ends the guardian. Neither
-this module nor its imports use numpy, so the guardian starts in a few hundredths of a second and stays small.
+The guardian has its own connection to the I2C bus. It sets the coils to zero from its start until the first
+heartbeat, and 0.3 s after the last heartbeat. While heartbeats are missing, zero is written again every 0.1
+s, to override a late write of the flight process or the effect of a brown-out. When heartbeats return, the
+guardian stops writing. The guardian ignores SIGTERM and SIGINT, and ends only when the flight process says
+goodbye or dies. Neither this module nor its imports use numpy, so that the guardian starts within a few
+hundredths of a second and needs little memory.
 
-`GuardianLine` is the flight process's end: it starts the guardian before the coils can be energised, sends
-heartbeats, and replaces a guardian that dies or stops reading. Nothing waits once the flight has begun: a
-heartbeat is one byte that is written or dropped.
+`GuardianLine` runs in the flight process. It starts the guardian before the coils can be energised, sends the
+heartbeats, and replaces a guardian that dies or stops reading. Sending a heartbeat never blocks: a heartbeat
+is one byte, which is dropped if it cannot be written at once.
+
+The flight process starts the guardian by the following command:
 
     python -S -E -m hal.guardian DESCRIPTOR OPENER WHERE ADDRESS
 
-starts the process with the descriptor of the socket, the function that opens the bus (`module:function`) with
-its argument, and the address of the PWM chip.
+DESCRIPTOR is the descriptor of the socket to the flight process. OPENER is the function (`module:function`)
+that opens the bus, and WHERE is the function's argument. ADDRESS is the address of the PWM chip.
 """
 
 from __future__ import annotations
@@ -50,11 +53,11 @@ PATIENCE_NS = 5_000_000_000
 
 
 class Watch:
-    """Decides when to zero the coils; times are of a monotonic clock."""
+    """Decision when to set the coils to zero, from the times (monotonic clock, ns) of the heartbeats."""
 
     def __init__(self, now_ns: int) -> None:
         self.orphaned = False
-        """Whether the flight process died, so that no more heartbeats will arrive."""
+        """Whether the flight process has ended without a goodbye message."""
         self.outages = 0
         """Number of times that heartbeats stopped."""
         self._beating = False
@@ -64,27 +67,31 @@ class Watch:
 
     @property
     def due_ns(self) -> int:
-        """When zero is due unless a heartbeat arrives before."""
+        """Time (ns) at which the next write of zero is due, unless a heartbeat arrives earlier."""
         return self._due_ns
 
     def over(self, now_ns: int) -> bool:
-        """Return whether the guardian may end: the flight is dead, the coils at zero or out of reach."""
+        """Return whether the guardian may end.
+
+        The guardian may end if the flight process is dead, and the coils are at zero or have not answered for
+        a while.
+        """
         return self.orphaned and (self._zeroed >= FINAL_ZEROS or now_ns > self._last_ns)
 
     def beat(self, now_ns: int) -> None:
-        """Accept a heartbeat."""
+        """Record a heartbeat."""
         self._beating = True
         self._due_ns = now_ns + SILENCE_NS
 
     def orphan(self, now_ns: int) -> None:
-        """Note that the flight process ended without a goodbye: zero is due now."""
+        """Record that the flight process ended without a goodbye, and schedule a write of zero for now."""
         self.orphaned = True
         self._zeroed = 0
         self._due_ns = now_ns
         self._last_ns = now_ns + PATIENCE_NS
 
     def attempt(self, now_ns: int) -> bool:
-        """Return whether zero is due now; if so, schedule the next time."""
+        """Return whether a write of zero is due now, and if so, schedule the next write."""
         if now_ns < self._due_ns:
             return False
         if self._beating:
@@ -94,26 +101,26 @@ class Watch:
         return True
 
     def acknowledged(self) -> None:
-        """Note that zero was acknowledged."""
+        """Record that the PWM chip acknowledged a write of zero."""
         self._zeroed += 1
 
 
 PRIORITY = 60
-"""SCHED_FIFO priority, above the control loop: a loop that spins must not starve the guardian."""
+"""SCHED_FIFO priority of the guardian, above the priority of a control loop that may run endlessly."""
 
 
 class ByteWriter(Protocol):
-    """The part of an I2C bus that switching the coils off needs."""
+    """Interface of an I2C bus that is sufficient to switch the coils off."""
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte. Raises OSError."""
+        """Write one byte to a register of a device. Raises OSError."""
 
     def close(self) -> None:
         """Close the bus."""
 
 
 class CoilSwitch:
-    """Zeroes the coils over a bus that is reopened after each failure."""
+    """Switch that sets the coils to zero over an I2C bus, which is reopened after each failure."""
 
     def __init__(self, opener: Callable[[str], ByteWriter], where: str, address: int) -> None:
         self._opener = opener
@@ -122,11 +129,11 @@ class CoilSwitch:
         self._bus: ByteWriter | None = None
 
     def off(self) -> bool:
-        """Write zero once; return whether it was acknowledged."""
+        """Write zero once and return whether the PWM chip acknowledged the write."""
         try:
             if self._bus is None:
                 self._bus = self._opener(self._where)
-            # switch_off declares a whole bus, but it writes one byte.
+            # The function switch_off is typed for a complete bus, but needs only write_byte_data.
             switch_off(self._bus, self._address, tries=1)  # type: ignore[arg-type]
         except (OSError, NotResponding):
             self.close()
@@ -142,18 +149,18 @@ class CoilSwitch:
 
 
 class Guardian:
-    """Watches the heartbeat and zeroes the coils until the flight process says goodbye or dies."""
+    """Guardian loop, which monitors the heartbeats until the flight process says goodbye or dies."""
 
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
         self._flight = flight
         self._switch = switch
         self._now_ns = now_ns
         self._watch = Watch(now_ns())
-        self._reported = 0  # outages
+        self._reported = 0  # number of reported outages
         self._failing = False
 
     def serve(self) -> None:
-        """Guard."""
+        """Run the guardian until the flight process says goodbye or dies."""
         if self._switch.off():
             self._send(READY)
         while not self._watch.over(self._now_ns()):
@@ -164,7 +171,7 @@ class Guardian:
                 self._zero()
 
     def _listen(self) -> bool:
-        """Wait for a message until zero is due; return whether it was the goodbye."""
+        """Wait for a message until a write of zero is due, and return whether a goodbye arrived."""
         left = max(0, self._watch.due_ns - self._now_ns()) * 1e-9
         sockets = [] if self._watch.orphaned else [self._flight]
         if not select.select(sockets, [], [], left)[0]:
@@ -199,7 +206,7 @@ class Guardian:
 
 
 def main(arguments: list[str]) -> int:
-    """Guard with the arguments LINE OPENER WHERE ADDRESS. Started by `GuardianLine` only."""
+    """Run the guardian with the arguments DESCRIPTOR OPENER WHERE ADDRESS, as `GuardianLine` starts it."""
     descriptor, opener, where, address = arguments
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -217,7 +224,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _survive() -> None:
-    """Request to be scheduled first and killed last; go on where that is refused."""
+    """Request real-time priority, locked memory and protection from the OOM killer, ignoring refusals."""
     linux_process.prioritise(0, PRIORITY)
     linux_process.lock_memory()
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:
@@ -227,7 +234,7 @@ def _survive() -> None:
 
 DEVICE = "guardian"
 _ROOT = Path(__file__).resolve().parents[1]
-_QUEUE_BYTES = 16384  # about a second of heartbeats, each with the kernel's bookkeeping
+_QUEUE_BYTES = 16384  # about one second of heartbeats, including kernel overhead
 _RETRY_NS = 1_000_000_000
 _END_TIMEOUT_S = 0.5
 
@@ -240,10 +247,10 @@ _NEWS = {
 
 
 class GuardianLine:
-    """A running guardian. For one thread, the control loop's."""
+    """Connection of the flight process to a running guardian. Only the control loop's thread may use it."""
 
     def __init__(self, reach: CoilReach) -> None:
-        """Start the guardian; `wait_ready` waits until it guards."""
+        """Start the guardian without waiting until the guardian is ready."""
         self._reach = reach
         self._lost = False
         self._retry_ns = 0
@@ -252,14 +259,14 @@ class GuardianLine:
 
     @property
     def process_id(self) -> int:
-        """The process identifier of the guardian."""
+        """Process identifier of the guardian."""
         return self._process.pid
 
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
-        """Wait until the guardian has zeroed the coils.
+        """Wait until the guardian has set the coils to zero.
 
-        Raises NotResponding when that takes more than `patience` s, except where the flight is `patient` and
-        waits for its coils as well: the guardian then keeps trying and reports when it succeeds.
+        Raises NotResponding if this takes more than `patience` seconds. If `patient` is true, no error is
+        raised, and the guardian reports later that it has reached the coils.
         """
         received = b""
         if select.select([self._line], [], [], patience)[0]:
@@ -271,22 +278,22 @@ class GuardianLine:
             )
 
     def beat(self) -> None:
-        """Report that a control cycle succeeded. Never waits, never raises."""
+        """Send a heartbeat after a successful control cycle. Never blocks, never raises."""
         if self._lost:
             return
         try:
             self._line.send(BEAT, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-        except OSError:  # it died; or, BlockingIOError, it has not read for a second
+        except OSError:  # the guardian died, or has not read for a second (BlockingIOError)
             self._lost = True
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
-        """Replace a lost guardian; return what happened since the last call."""
+        """Replace a lost guardian and return the events since the last call."""
         news = self._receive()
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
             self._drop()
-            # A failed start is tried again later; the calling task must not fail.
+            # A failed start must not end the calling task, because the start is retried later.
             with contextlib.suppress(NotResponding):
                 self._process, self._line = self._start()
                 self._lost = False
@@ -294,7 +301,7 @@ class GuardianLine:
         return news
 
     def close(self) -> None:
-        """End the guardian, the coils being off; it zeroes them once more. Safe to call twice."""
+        """End the guardian, which sets the coils to zero once more. A second call has no effect."""
         try:
             self._line.send(BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
             self._process.wait(_END_TIMEOUT_S)
@@ -315,7 +322,7 @@ class GuardianLine:
         return [_NEWS[word] for value in words if (word := bytes([value])) in _NEWS]
 
     def _drop(self) -> None:
-        """Kill a lost guardian; it is reaped later, without waiting here."""
+        """Kill a lost guardian without waiting for its end."""
         self._process.kill()
         self._ended.append(self._process)
         self._line.close()
@@ -330,14 +337,14 @@ class GuardianLine:
         words = [str(theirs.fileno()), reach.opener, reach.where, str(reach.address)]
         try:
             process = subprocess.Popen(
-                # Without site-packages and the user's environment, for a fast and predictable start.
+                # The options -S and -E skip site-packages and environment variables, for a fast start.
                 [sys.executable, "-S", "-E", "-m", "hal.guardian", *words],
                 cwd=_ROOT,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                # Signals to the flight's process group must not reach the guardian. A group, not a session:
-                # one that is stopped when the flight dies is continued by the kernel (setpgid(2)), and acts.
+                # Signals to the process group of the flight must not reach the guardian.
+                # Unlike a session, a stopped group is continued by the kernel when the flight dies.
                 process_group=0,
             )
         except OSError as error:

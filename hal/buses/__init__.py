@@ -1,1 +1,1 @@
-"""Buses of a Linux board: serial port, I2C, video device, clock; each behind a Protocol of hal.interfaces."""
+"""Buses and system services of a Linux board: serial port, I2C, clock, process priority."""

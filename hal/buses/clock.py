@@ -1,4 +1,4 @@
-"""The real clock: absolute monotonic deadlines, and periodic jobs on threads of their own."""
+"""System clock: absolute monotonic deadlines, and periodic jobs that each run in a separate thread."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # at run time the Protocols would bring numpy in, which the guardian does without
+if TYPE_CHECKING:  # these Protocols import numpy, which the guardian must not load
     from hal.interfaces.wires import Ticker
 
 
 class ContainedJob:
-    """Runs a job; keeps an exception that escapes instead of raising it.
+    """Job whose exceptions are stored as text instead of being raised.
 
     Attributes:
         name: name of the job.
         error: exception of the last run as text, empty if the run completed.
-        served_ns: time at which a run last completed, initially the time of creation.
+        served_ns: time (ns) at which a run last succeeded, initially the time of creation.
     """
 
     def __init__(self, name: str, job: Callable[[], None], now_ns: Callable[[], int]) -> None:
@@ -39,7 +39,7 @@ class ContainedJob:
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC of the machine.
+    """Clock based on CLOCK_MONOTONIC of the operating system.
 
     Attributes:
         tickers: running tickers in the order of their creation.
@@ -49,31 +49,31 @@ class SystemClock:
         self.tickers: list[Ticker] = []
 
     def now_ns(self) -> int:
-        """Return the monotonic time."""
+        """Return the monotonic time, ns."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep to an absolute deadline.
+        """Sleep until an absolute deadline, ns.
 
-        CPython sleeps with clock_nanosleep and resumes after a signal, so one call is enough, but the
-        conversion to float seconds can end a few ns early: the loop closes that gap.
+        CPython resumes an interrupted sleep after a signal. The conversion to seconds (float) can end the
+        sleep a few ns early, so the sleep is repeated until the deadline has passed.
         """
         while (left := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
-        """Run `job` on a daemon thread every `period_ns`."""
+        """Run `job` every `period_ns` in a new daemon thread."""
         made = ThreadTicker(self, name, period_ns, job)
         self.tickers.append(made)
         return made
 
     def utc_ns(self) -> int:
-        """Return UTC as nanoseconds since 1970."""
+        """Return UTC in ns since 1970."""
         return time.time_ns()
 
 
 class ThreadTicker(ContainedJob):
-    """Runs a job on a daemon thread, every period and when kicked; a failure does not end the thread."""
+    """Daemon thread that runs a job once per period and at each call of `kick`, even after a failure."""
 
     def __init__(self, clock: SystemClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)
@@ -85,11 +85,11 @@ class ThreadTicker(ContainedJob):
         self._thread.start()
 
     def kick(self) -> None:
-        """Run the job now."""
+        """Run the job as soon as possible."""
         self._wake.set()
 
     def stop(self) -> None:
-        """Let the job finish and end the thread."""
+        """Wait until the current run has finished, and end the thread."""
         self._stopped = True
         self._wake.set()
         if self in self._clock.tickers:

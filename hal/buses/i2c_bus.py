@@ -1,11 +1,12 @@
-"""A Linux I2C bus through smbus2: one file descriptor, one lock, bounded waits.
+"""Linux I2C bus through smbus2, with a lock for several threads and bounded waiting times.
 
-A call waits for the previous transaction and then at most for the adapter's own timeout, which is set here
-(ioctl I2C_TIMEOUT). The adapter does not retry by itself (I2C_RETRIES 0), so that drivers count each
-failure.
+A call waits until the previous transaction has ended, and then at most for the timeout of the I2C adapter,
+which is configured by ioctl I2C_TIMEOUT. Retries by the adapter are disabled (I2C_RETRIES 0), so that the
+drivers count each failure.
 
-An advisory lock on the device file reserves the bus for one flight; the kernel releases it when the process
-ends. The guardian and `deploy/coils-off` take no lock, because they may switch the coils off at any time.
+An advisory lock on the device file reserves the bus for one flight process. The kernel releases the lock when
+the process ends. The guardian and `deploy/coils-off` ignore the lock, because they may switch the coils off
+at any time.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 
 
 def lock_bus(descriptor: int) -> None:
-    """Lock an open file until it is closed. Raises OSError (EUSERS) when another process holds the lock."""
+    """Lock an open file until it is closed. Raises OSError (EUSERS) if another process holds the lock."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -49,12 +50,12 @@ _MEANING = {
     errno.EBADF: "the bus has been closed",
     errno.EUSERS: "another flight drives the coils on this bus",
 }
-# After these the line is in order, and the descriptor is kept.
+# After these errors the bus still works, so that the file descriptor is kept.
 _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
 
 
 class LinuxI2cBus:
-    """One /dev/i2c-N, safe to share between drivers and threads; reopened after the line has failed."""
+    """Thread-safe I2C bus /dev/i2c-N, whose device file is reopened after a bus failure."""
 
     def __init__(
         self,
@@ -63,18 +64,23 @@ class LinuxI2cBus:
         patient: bool = False,
         exclusive: bool = False,
     ) -> None:
-        """Open bus number N, or the device file of a udev name.
+        """Open a bus.
 
-        The time-out is rounded up to the kernel's steps of 10 ms. Raises NotResponding when there is no such
-        bus, Refused without permission to open it or when it cannot do block transfers; a `patient` bus that
-        does not exist yet is opened by the first transaction that finds it. An `exclusive` bus is locked
-        before its first transaction: two flights never drive one set of coils.
+        Args:
+            device: number N of the bus /dev/i2c-N, or a device file, for example with a udev name.
+            timeout_ns: timeout of a transaction (ns), rounded up to the kernel's steps of 10 ms.
+            patient: whether a bus that does not exist yet is opened by a later transaction instead of raising
+                an error.
+            exclusive: whether the bus is locked, so that two flight processes cannot drive the same coils.
+
+        Raises NotResponding if there is no such bus. Raises Refused if the permission to open the bus is
+        missing or the adapter does not support block transfers.
         """
         if timeout_ns <= 0:
             raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
         self.name = device_file(device)
         self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
-        # A transaction has at most two messages, each of which may time out.
+        # A transaction has at most two messages, and each message may time out.
         self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
         self._exclusive = exclusive
         self._lock = threading.Lock()
@@ -96,19 +102,19 @@ class LinuxI2cBus:
             raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")
 
     def write_byte(self, address: int, value: int) -> None:
-        """Write one byte without a register."""
+        """Write one byte to a device without a register address."""
         self._transact(address, lambda bus: bus.write_byte(address, value))
 
     def read_byte_data(self, address: int, register: int) -> int:
-        """Read one byte."""
+        """Read one byte from a register of a device."""
         return self._transact(address, lambda bus: bus.read_byte_data(address, register))
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte."""
+        """Write one byte to a register of a device."""
         self._transact(address, lambda bus: bus.write_byte_data(address, register, value))
 
     def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
-        """Read `length` <= 32 bytes."""
+        """Read `length` bytes, at most 32, from consecutive registers of a device."""
         _check_length(length)
         answer = self._transact(address, lambda bus: bus.read_i2c_block_data(address, register, length))
         if len(answer) != length:
@@ -116,14 +122,14 @@ class LinuxI2cBus:
         return answer
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
-        """Write up to 32 bytes."""
+        """Write at most 32 bytes to consecutive registers of a device."""
         _check_length(len(values))
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def close(self) -> None:
-        """Close the bus. Safe to call twice."""
+        """Close the bus. A second call has no effect."""
         self._closed = True
-        # Closed even without the lock: a hung transaction must not keep the program from ending.
+        # The bus is closed even without the lock, because a hung transaction must not delay the exit.
         locked = self._lock.acquire(timeout=self._patience)
         self._drop()
         if locked:
@@ -168,12 +174,12 @@ class LinuxI2cBus:
 
 
 def device_file(bus: int | str) -> str:
-    """Return the device file of a bus given by its number or by a file, such as a udev name."""
+    """Return the device file of a bus that is given by its number or its device file."""
     return f"/dev/i2c-{bus}" if isinstance(bus, int) else bus
 
 
 def adapters(folder: Path = Path("/sys/bus/i2c/devices")) -> list[tuple[int, str]]:
-    """Return (number, name) of every I2C adapter of the kernel."""
+    """Return the number and name of each I2C adapter that the kernel knows."""
     found = []
     for entry in folder.glob("i2c-*"):
         number = entry.name.removeprefix("i2c-")

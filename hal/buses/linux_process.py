@@ -1,13 +1,14 @@
-"""Services that Linux and systemd offer to this process: real-time priority, locked memory, notifications.
+"""Services of Linux and systemd for the flight process: real-time priority, locked memory, notifications.
 
-Priority and locked memory are privileges (RLIMIT_RTPRIO, RLIMIT_MEMLOCK, capabilities) that a machine may
-refuse. A flight continues without them, with more jitter under load. `prioritise` and `lock_memory` raise
-nothing: they return the reason of a refusal, or "" on success.
+Real-time priority and locked memory are privileges (RLIMIT_RTPRIO, RLIMIT_MEMLOCK, capabilities) that the
+operating system may refuse. A flight without these privileges continues, with more jitter under load. The
+functions `prioritise` and `lock_memory` never raise; they return the reason of a refusal, or an empty text on
+success.
 
-`ServiceManager` notifies systemd over its socket (sd_notify(3)). Without NOTIFY_SOCKET in the environment,
-notifications are dropped, as are those that cannot be delivered: a notification must never delay or end a
-flight. Only READY is repeated until it is delivered, because without it the service manager ends the
-process.
+`ServiceManager` sends notifications to systemd over a socket (sd_notify(3)). Notifications are dropped if the
+environment variable NOTIFY_SOCKET is missing or the delivery fails, because a notification must never delay
+or end a flight. Only the notification READY is repeated until it is delivered, because systemd ends a process
+that does not report READY.
 """
 
 from __future__ import annotations
@@ -26,7 +27,11 @@ _MCL_ONFAULT = 4
 
 
 def prioritise(thread_id: int, priority: int) -> str:
-    """Run a thread (0: this one) under SCHED_FIFO; threads and processes started by it do not inherit it."""
+    """Give a thread real-time priority (SCHED_FIFO), which its child threads and processes do not inherit.
+
+    The thread identifier 0 stands for the calling thread. Returns the reason of a refusal, or an empty text
+    on success.
+    """
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     try:
         os.sched_setscheduler(thread_id, policy, os.sched_param(priority))
@@ -36,26 +41,28 @@ def prioritise(thread_id: int, priority: int) -> str:
 
 
 def relinquish() -> None:
-    """Return this thread to ordinary scheduling, which is always permitted."""
+    """Return the calling thread to ordinary scheduling, which is always permitted."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def worker_cores() -> frozenset[int]:
-    """Return the cores for worker processes: all but the last, which stays free for the control process.
+    """Return the processor cores for the worker processes: all available cores except the last core.
 
-    Empty where there is only one. The control process itself may use every core.
+    The last core stays free for the control process, which may use all cores. The result is empty if only one
+    core is available.
     """
     return frozenset(sorted(os.sched_getaffinity(0))[:-1])
 
 
 def lock_memory() -> str:
-    """Keep every page that this process touches in memory.
+    """Lock the memory pages of this process in RAM.
 
-    Pages are locked only when touched (MCL_ONFAULT), otherwise whole thread stacks and the workers' shared
-    memory would become resident. Under a limit only present mappings are locked: later ones would count
-    against the limit and might fail.
+    Returns the reason of a refusal, or an empty text on success. A page is locked when it is first accessed
+    (MCL_ONFAULT), because otherwise whole thread stacks and the shared memory of the workers would become
+    resident. If RLIMIT_MEMLOCK is limited, only existing mappings are locked, because later mappings would
+    count against the limit and might fail.
     """
-    import ctypes  # noqa: PLC0415 - the guardian requests its priority before this slow import
+    import ctypes  # noqa: PLC0415 - the slow import, done after the guardian has requested its priority
 
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     future = _MCL_FUTURE if unlimited or os.geteuid() == 0 else 0
@@ -67,7 +74,7 @@ def lock_memory() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Obtained:
-    """Obtained priority and locked memory, and the reasons of refusals."""
+    """Result of requesting privileges: real-time priority, locked memory, and reasons of refusals."""
 
     priority: int
     locked: bool
@@ -80,17 +87,20 @@ class Obtained:
 
 
 def obtain(thread_ids: list[int], priority: int) -> Obtained:
-    """Prioritise threads and lock the memory; return the result."""
+    """Request real-time priority for threads and lock the memory, and return the result."""
     refused = next(filter(None, [prioritise(thread_id, priority) for thread_id in thread_ids]), "")
     unlocked = lock_memory()
     return Obtained(0 if refused else priority, not unlocked, tuple(filter(None, (refused, unlocked))))
 
 
 class ServiceManager:
-    """The service manager that started this process, if one did."""
+    """Connection to the service manager (systemd) that started this process, if any."""
 
     def __init__(self, environment: Mapping[str, str], process_id: int) -> None:
-        """Read the socket and watchdog from `environment`; WATCHDOG_PID must be `process_id` if given."""
+        """Read the socket and the watchdog timeout from environment variables.
+
+        The watchdog is used only if WATCHDOG_PID is missing or equals `process_id`.
+        """
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         self._line: socket.socket | None = None
@@ -101,25 +111,25 @@ class ServiceManager:
         meant = environment.get("WATCHDOG_PID", str(process_id)) == str(process_id)
         period = environment.get("WATCHDOG_USEC", "")
         self.watchdog_ns = int(period) * 1000 if meant and period.isdecimal() else 0
-        """The watchdog's time-out; 0 without a watchdog."""
+        """Timeout of the watchdog (ns), 0 if there is no watchdog."""
 
     def ready(self, status: str) -> None:
-        """Report that the start is complete; repeated with the watchdog until it is delivered."""
+        """Report that the start is complete. The method `feed_watchdog` repeats the report until delivery."""
         self._undelivered_ready = f"READY=1\nSTATUS={status}"
         self._repeat_ready()
 
     def status(self, status: str) -> None:
-        """Report a status line for people."""
+        """Report a status text, which `systemctl status` shows."""
         self._notify(f"STATUS={status}")
 
     def feed_watchdog(self) -> None:
-        """Report that every task makes progress."""
+        """Report that all tasks make progress."""
         self._repeat_ready()
         if self.watchdog_ns:
             self._notify("WATCHDOG=1")
 
     def extend_start(self, seconds: float) -> None:
-        """Ask for more time before the start counts as failed."""
+        """Request more time (s) before the service manager considers the start as failed."""
         self._notify(f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
 
     def stopping(self) -> None:
@@ -128,7 +138,7 @@ class ServiceManager:
         self._notify("STOPPING=1")
 
     def close(self) -> None:
-        """Close the line. Safe to call twice."""
+        """Close the socket to the service manager. A second call has no effect."""
         line, self._line = self._line, None
         if line is not None:
             line.close()
@@ -138,7 +148,7 @@ class ServiceManager:
             self._undelivered_ready = ""
 
     def _notify(self, message: str) -> bool:
-        """Send a notification; return whether it was delivered."""
+        """Send a notification and return whether it was delivered."""
         if self._line is not None:
             with contextlib.suppress(OSError):
                 self._line.sendto(message.encode(), self._address)

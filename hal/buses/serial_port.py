@@ -1,7 +1,7 @@
-"""A Linux serial port through pyserial: a thread waits for bytes and stamps them on arrival.
+"""Linux serial port through pyserial, with a thread that receives data and records their arrival times.
 
-The same thread reopens the port after it was lost: an adapter that was unplugged and plugged in again gets
-the same name from udev.
+The same thread reopens a lost port. An adapter that was unplugged and plugged in again gets the same device
+name by a udev rule.
 """
 
 from __future__ import annotations
@@ -15,29 +15,31 @@ import serial
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 
-_READ_TIMEOUT_S = 0.1  # bounds how late the thread notices that the port is closing
+_READ_TIMEOUT_S = 0.1  # longest delay until the thread notices that the port closes
 _WRITE_TIMEOUT_S = 0.5
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
-# What pyserial raises besides its own exceptions (which are OSErrors): see its posix back end.
+# Exceptions of pyserial's POSIX implementation; pyserial's own exceptions are subclasses of OSError.
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
 
 
 class PySerialPort:
-    """An exclusive, raw 8N1 line without flow control; implements `hal.interfaces.wires.SerialPort`.
+    """Serial port in raw 8N1 mode without flow control, opened exclusively.
 
-    The modem lines are neither read nor set, so a pseudo-terminal works as well.
+    The class implements `hal.interfaces.wires.SerialPort`. The modem lines are neither read nor set, so that
+    a pseudo-terminal works as well.
 
     Attributes:
-        baud_rate: bits per second.
-        lost_bytes: bytes dropped, oldest first, because `receive` was not called for too long.
+        baud_rate: baud rate of the port, bits per second.
+        lost_bytes: number of received bytes that were dropped because `receive` was not called for too long.
     """
 
     def __init__(self, device: str, baud_rate: int, clock: Clock, patient: bool = False) -> None:
         """Open the port.
 
-        Raises NotResponding, with the cure, when that fails; a `patient` port counts as lost until it opens.
+        Raises NotResponding if the port cannot be opened. If `patient` is true, the port counts as lost
+        instead and is opened later.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
@@ -62,9 +64,9 @@ class PySerialPort:
         self._thread.start()
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return what arrived since the last call as (arrival_ns, bytes), oldest first.
+        """Return the data received since the last call as tuples (arrival_ns, bytes), oldest first.
 
-        Raises NotResponding when the port is lost, after everything that arrived before was returned.
+        Raises NotResponding if the port is lost and all data received before the loss have been returned.
         """
         with self._lock:
             chunks = list(self._pending)
@@ -75,7 +77,7 @@ class PySerialPort:
         return chunks
 
     def send(self, data: bytes) -> None:
-        """Write bytes. Raises NotResponding when the port is lost or its queue is full."""
+        """Write bytes. Raises NotResponding if the port is lost or the output queue is full."""
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
@@ -85,8 +87,8 @@ class PySerialPort:
             raise NotResponding(self._device, message) from error
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Change the line's speed. Raises NotResponding when the port rejects it."""
-        # Kept in any case: a lost port is reopened at this speed.
+        """Change the baud rate. Raises NotResponding if the port rejects the baud rate."""
+        # The value is stored even if the port is lost, because the port is reopened at this baud rate.
         self.baud_rate = baud_rate
         try:
             self._serial.baudrate = baud_rate
@@ -94,7 +96,7 @@ class PySerialPort:
             raise NotResponding(self._device, f"does not take {baud_rate} baud ({error})") from error
 
     def close(self) -> None:
-        """Stop the thread and close the port. Safe to call twice."""
+        """Stop the thread and close the port. A second call has no effect."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -118,7 +120,7 @@ class PySerialPort:
             self._open_again()
         while not self._closing.is_set():
             try:
-                # The first byte wakes the thread; the bytes that are ready behind it are read too.
+                # The thread waits for the first byte, and then reads all bytes that have arrived.
                 data = self._serial.read(1)
                 if data:
                     data += self._serial.read(self._serial.in_waiting)
@@ -131,7 +133,7 @@ class PySerialPort:
                 self._keep(self._clock.now_ns(), data)
 
     def _open_again(self) -> None:
-        """Try to open the port until that succeeds or the port is closed; runs on its own thread."""
+        """Try to reopen the port until this succeeds or `close` is called. Runs in the receiving thread."""
         self._serial.close()
         while not self._closing.wait(_REOPEN_S):
             try:

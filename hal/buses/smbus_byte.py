@@ -1,12 +1,12 @@
-"""Writes one byte to one register over a Linux I2C adapter with the standard library alone; also a command.
+"""Writing one byte to an I2C register on Linux, with the standard library only, as module and as command.
 
-The guardian switches the coils off through this module, and `deploy/coils-off` runs this file alone under any
-Python where i2cset is missing:
+The guardian switches the coils off through this module. If the program i2cset is not installed, the script
+`deploy/coils-off` runs this file as a command:
 
     python3 smbus_byte.py /dev/i2c-1 0x40 0xfd 0x10
 
-It uses the kernel's SMBus call (ioctl I2C_SMBUS, linux/i2c-dev.h) instead of write(2), so that adapters with
-SMBus only work too, and avoids ctypes, which is slow to load.
+The module uses the kernel's SMBus call (ioctl I2C_SMBUS, linux/i2c-dev.h) instead of write(2), so that
+SMBus-only adapters are supported. The module does not use ctypes, which is slow to load.
 """
 
 import fcntl
@@ -20,15 +20,15 @@ I2C_SLAVE = 0x0703
 I2C_SMBUS = 0x0720
 _SMBUS_WRITE = 0
 _SMBUS_BYTE_DATA = 2
-_DATA_BYTES = 34  # union i2c_smbus_data: a block, its length and a checksum
-_TIMEOUT_UNITS = 2  # of 10 ms
+_DATA_BYTES = 34  # size of union i2c_smbus_data: block, length and checksum
+_TIMEOUT_UNITS = 2  # timeout in units of 10 ms
 
 
 class ByteBus:
-    """An I2C adapter for writing; each failure is an OSError with the kernel's fault code."""
+    """I2C adapter for writing single bytes. Each failure raises OSError with the kernel's fault code."""
 
     def __init__(self, device: str) -> None:
-        """Open an adapter's device file. Raises OSError."""
+        """Open the device file of an I2C adapter. Raises OSError."""
         self._descriptor = os.open(device, os.O_RDWR | os.O_CLOEXEC)
         try:
             fcntl.ioctl(self._descriptor, I2C_TIMEOUT, _TIMEOUT_UNITS)
@@ -37,28 +37,28 @@ class ByteBus:
             raise
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte. Raises OSError."""
+        """Write one byte to a register of a device. Raises OSError."""
         data = array("B", bytes(_DATA_BYTES))
         data[0] = value
-        # struct i2c_smbus_ioctl_data: read_write, command, size, data
+        # struct i2c_smbus_ioctl_data has the fields read_write, command, size and data.
         call = struct.pack("@BBIP", _SMBUS_WRITE, register, _SMBUS_BYTE_DATA, data.buffer_info()[0])
         fcntl.ioctl(self._descriptor, I2C_SLAVE, address)
         fcntl.ioctl(self._descriptor, I2C_SMBUS, call)
 
     def close(self) -> None:
-        """Close the adapter. Safe to call twice."""
+        """Close the adapter. A second call has no effect."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
 
 def open_bus(where: str) -> ByteBus:
-    """Return the open adapter `where`; the guardian's opener."""
+    """Open the I2C adapter with the device file `where`. The guardian calls this function."""
     return ByteBus(where)
 
 
 def main(arguments: list[str]) -> int:
-    """Write the byte given by the arguments; return 0 done, 1 failed, 2 wrong use."""
+    """Write the byte given by the arguments. Return exit status 0 (done), 1 (failed) or 2 (wrong use)."""
     try:
         device, *numbers = arguments
         address, register, value = (int(number, 0) for number in numbers)

@@ -1,1 +1,1 @@
-"""Drivers: each knows one part's registers or packets, and speaks over a bus Protocol."""
+"""Device drivers, each for the registers or packets of one device."""

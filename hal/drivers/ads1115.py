@@ -1,8 +1,9 @@
-"""Currents of solar strings from ADS1115 converters (TI SBAS444), each with four inputs.
+"""Measurement of solar cell string currents by ADS1115 A/D converters (TI SBAS444) with four inputs each.
 
-A string's current runs through a shunt whose amplifier gives `volt_per_ampere`. A job of the clock reads the
-completed conversion and starts that of the next channel, on all converters at once. No call waits: a
-conversion takes 7.8 ms, a step of the job at least 10 ms.
+The current of a string flows through a shunt with an amplifier, whose output voltage per current is
+`volt_per_ampere`. A periodic job reads the completed conversion of one channel and starts the conversion of
+the next channel, on all converters at once. No call waits for a conversion, because a conversion takes 7.8 ms
+and the job runs at intervals of at least 10 ms.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from hal.interfaces.wires import Clock, I2cBus
 
 CONVERSION, CONFIG = 0x00, 0x01
 START = 0x8000
-"""Bit of Config that starts a conversion if written, and that no conversion is running if read."""
+"""Bit of the Config register. Writing 1 starts a conversion; reading 1 means that no conversion runs."""
 _SINGLE_ENDED, _MUX_BIT = 0b100, 12
 _RANGE_2_048 = 0b010 << 9
 _SINGLE_SHOT = 1 << 8
@@ -27,20 +28,29 @@ _RATE_128 = 0b100 << 5
 _NO_COMPARATOR = 0b11
 FULL_SCALE = 2.048
 STEP = FULL_SCALE / 32_768
-"""Voltage of one count, V."""
+"""Voltage (V) of one ADC count."""
 CHANNELS = 4
 _SHORTEST_NS = 10_000_000
 
 
 def config_for(channel: int) -> int:
-    """Return the Config word that starts a conversion against ground, +-2.048 V, 128 conversions per s."""
+    """Return the Config word that starts a conversion of one channel.
+
+    The input is measured against ground in the range +-2.048 V, at 128 conversions per second.
+    """
     mux = (_SINGLE_ENDED | channel) << _MUX_BIT
     return START | mux | _RANGE_2_048 | _SINGLE_SHOT | _RATE_128 | _NO_COMPARATOR
 
 
 @dataclass(frozen=True, slots=True)
 class StringWiring:
-    """The converter's address and channel of a string, and the gain of its amplifier (V/A)."""
+    """Connection of a solar cell string to an A/D converter.
+
+    Attributes:
+        address: I2C address of the converter.
+        channel: input channel of the converter, 0 to 3.
+        volt_per_ampere: output voltage of the current amplifier per current, V/A.
+    """
 
     address: int
     channel: int
@@ -48,12 +58,12 @@ class StringWiring:
 
 
 class AdsSolarStrings:
-    """The strings; implements `hal.interfaces.devices.SolarStrings`."""
+    """Monitor of the solar cell strings, which implements `hal.interfaces.devices.SolarStrings`."""
 
     def __init__(
         self, bus: I2cBus, clock: Clock, wirings: Sequence[StringWiring], period_ns: int = 500_000_000
     ) -> None:
-        """Read all strings once in `period_ns`. Raises OutOfRange for an impossible period or wiring."""
+        """Measure all strings once per `period_ns`. Raises OutOfRange for an invalid period or wiring."""
         self.name = "solar strings"
         self._bus = bus
         self._clock = clock
@@ -79,17 +89,17 @@ class AdsSolarStrings:
         self._ticker = clock.ticker("solar strings", step_ns, self._serve)
 
     def latest(self) -> StringReading | None:
-        """Return the newest reading, None before the first."""
+        """Return the newest reading, None before the first reading."""
         with self._lock:
             return self._latest
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings arrive."""
+        """Return the text of the current failure, or an empty text while readings arrive."""
         with self._lock:
             return self._error
 
     def close(self) -> None:
-        """Stop reading. Safe to call twice."""
+        """Stop reading. A second call has no effect."""
         self._ticker.stop()
 
     def _serve(self) -> None:
@@ -105,7 +115,7 @@ class AdsSolarStrings:
                 with answering(_name(address)):
                     self._bus.write_i2c_block_data(address, CONFIG, [word >> 8, word & 0xFF])
         except DeviceError as error:
-            # A reading contains all strings of one round, so the round begins again.
+            # A reading contains all strings, so a failed measurement begins again at the first channel.
             self._step = -1
             with self._lock:
                 self._error = str(error)

@@ -1,10 +1,11 @@
-"""A GenICam camera (USB3 Vision, GigE Vision) through Aravis, each exposure started by a software trigger.
+"""Driver of GenICam cameras (USB3 Vision, GigE Vision) through Aravis, with software-triggered exposures.
 
-Aravis (https://aravisproject.github.io/aravis) is a system library that Python calls by introspection; it is
-imported only when such a camera is opened.
+Aravis (https://aravisproject.github.io/aravis) is a system library that Python calls by GObject
+introspection. The library is imported only when such a camera is opened.
 
-An exposure is assumed to begin half-way between sending the trigger and its acknowledge, right to about a
-millisecond on USB. The camera's own clock is not used because its relation to the host's is not known.
+The exposure is assumed to begin half-way between sending the trigger and receiving its acknowledgement. On
+USB this is accurate to about one millisecond. The camera's own clock is not used, because its offset from the
+host clock is unknown.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ PIXEL_KINDS: dict[str, np.dtype[Any]] = {
     "Mono12": np.dtype("<u2"),
     "Mono16": np.dtype("<u2"),
 }
-"""Unpacked grey pixel formats (GenICam PFNC 2.4, table "Mono"): low bits of 8 or 16."""
+"""Unpacked monochrome pixel formats (GenICam PFNC 2.4, table "Mono"), stored in 8 or 16 bits per pixel."""
 
 CURE = (
     "needs Aravis: apt install gir1.2-aravis-0.8 python3-gi, the virtual environment made with "
     "--system-site-packages; or apt install libusb-1.0-0 and pip install 'knightcube-flight[genicam]'"
 )
 FAKE_PREFIX = "Fake"
-"""Aravis' simulated camera is called Fake_1."""
+"""Prefix of the names of cameras simulated by Aravis, such as Fake_1."""
 
-# GigE Vision numbers frames in 16 bits without 0; USB3 Vision in 64 bits.
+# GigE Vision numbers frames from 1 to 65,535 cyclically; USB3 Vision uses 64-bit numbers.
 _FRAME_IDS = (1 << 16) - 1
 _MICROSECOND_NS = 1_000
 
@@ -48,12 +49,12 @@ class AravisSettings:
     """Settings of an Aravis camera.
 
     Attributes:
-        name: as `arv-tool-0.8` lists it, such as "FLIR-1E10015B2E2F" or "Fake_1".
-        columns, rows: size of the region that is read, in the middle of the sensor.
-        pixel_format: a key of PIXEL_KINDS.
-        exposure_ns: the usual exposure.
-        gain: in the camera's own unit (usually dB), None to leave it unchanged.
-        buffers: how many frames Aravis may hold.
+        name: name of the camera in the list of `arv-tool-0.8`, such as "FLIR-1E10015B2E2F" or "Fake_1".
+        columns, rows: size of the image region at the centre of the sensor, pixels.
+        pixel_format: name of a pixel format in PIXEL_KINDS.
+        exposure_ns: usual exposure time, ns.
+        gain: gain in the camera's own unit (usually dB), None to leave the gain unchanged.
+        buffers: number of frame buffers that Aravis uses.
     """
 
     name: str
@@ -66,10 +67,10 @@ class AravisSettings:
 
 
 class AravisCamera:
-    """A `hal.drivers.camera.CameraDevice`."""
+    """Driver of a camera through Aravis, which implements `hal.drivers.camera.CameraDevice`."""
 
     def __init__(self, settings: AravisSettings, clock: Clock) -> None:
-        """Keep the settings; nothing is opened or imported yet."""
+        """Store the settings without opening the camera or importing Aravis."""
         self.name = settings.name
         self.counts = CameraCounts()
         self._settings = settings
@@ -82,12 +83,15 @@ class AravisCamera:
         self._success: Any = None
         self._bounds = 1, 1 << 62
         self._asked_ns = 0
-        self._exposure_ns = 0  # as the camera set it
+        self._exposure_ns = 0  # exposure time reported by the camera
         self._start_ns: int | None = None
         self._lost = False
 
     def open(self) -> None:
-        """Open the camera and arm it. Raises NotResponding, Refused or OutOfRange, with the cure."""
+        """Open and configure the camera.
+
+        Raises NotResponding, Refused or OutOfRange with advice for the user.
+        """
         self.close()
         aravis = library(self.name)
         if self.name.startswith(FAKE_PREFIX):
@@ -106,13 +110,13 @@ class AravisCamera:
             self._set_up(aravis, self._camera)
 
     def check(self, exposure_ns: int) -> None:
-        """Raise OutOfRange for an exposure that the camera cannot make."""
+        """Raise OutOfRange for an exposure time (ns) that the camera does not support."""
         low, high = self._bounds
         if not low <= exposure_ns <= high:
             raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, low * 1e-9, high * 1e-9, "s")
 
     def expose(self, exposure_ns: int, trigger_ns: int) -> None:
-        """Trigger the exposure; earlier frames are dropped. Raises DeviceError."""
+        """Trigger an exposure and discard earlier frames. Raises DeviceError."""
         camera, stream = self._opened()
         with self._during("triggering"):
             while (buffer := stream.try_pop_buffer()) is not None:
@@ -125,7 +129,7 @@ class AravisCamera:
             self._start_ns = (before_ns + self._clock.now_ns()) // 2
 
     def collect(self) -> Frame | None:
-        """Return the triggered frame once, None until it arrives. Raises NotResponding."""
+        """Return the triggered frame once, None until the frame arrives. Raises NotResponding."""
         _, stream = self._opened()
         if self._lost:
             raise NotResponding(self.name, "gone: was it unplugged?")
@@ -138,10 +142,10 @@ class AravisCamera:
         return None
 
     def close(self) -> None:
-        """Stop and release the camera. Safe to call when it is not open."""
+        """Stop and close the camera. Has no effect if the camera is not open."""
         camera, self._camera, self._stream, self._start_ns = self._camera, None, None, None
         if camera is not None:
-            with contextlib.suppress(_glib_error()):  # a lost camera has stopped
+            with contextlib.suppress(_glib_error()):  # a lost camera has already stopped
                 camera.stop_acquisition()
 
     def _opened(self) -> tuple[Any, Any]:
@@ -151,7 +155,7 @@ class AravisCamera:
 
     @contextlib.contextmanager
     def _during(self, doing: str) -> Iterator[None]:
-        """Convert Aravis' errors into a DeviceError that states the failed step."""
+        """Convert errors of Aravis into a DeviceError that states the failed step."""
         try:
             yield
         except _glib_error() as error:
@@ -198,7 +202,7 @@ class AravisCamera:
         self._lost = True
 
     def _set_region(self, camera: Any) -> None:
-        """Read the middle of the sensor, rounded down to the camera's steps."""
+        """Set the image region to the sensor centre, rounded down to the camera's offset increments."""
         columns, rows = self._settings.columns, self._settings.rows
         width, height = camera.get_sensor_size()
         if columns > width or rows > height:
@@ -240,13 +244,13 @@ class AravisCamera:
         return number
 
     def _judge(self, buffer: Any) -> Frame | None:
-        """Return the frame of a buffer if it is the triggered one."""
+        """Return the frame in a buffer if it is the triggered frame, otherwise None."""
         now_ns = self._clock.now_ns()
         number = self._number_of(buffer)
         if buffer.get_status() != self._success:
             self.counts.spoiled += 1
             return None
-        # A frame that arrives before the exposure can be over is from a camera that also runs free.
+        # A frame that arrives before the end of the exposure was not triggered.
         if self._start_ns is None or now_ns < self._start_ns + self._exposure_ns:
             return None
         rows, columns = self._settings.rows, self._settings.columns
@@ -260,10 +264,10 @@ class AravisCamera:
 
 
 def library(name: str) -> Any:
-    """Return Aravis. Raises Refused, with the cure, when it is not installed."""
+    """Return the Aravis library. Raises Refused with installation advice if Aravis is not installed."""
     try:
         if importlib.util.find_spec("aravis") is not None:
-            importlib.import_module("aravis")  # the package from PyPI registers its library for introspection
+            importlib.import_module("aravis")  # the PyPI package registers the library for introspection
         gi = importlib.import_module("gi")
         gi.require_version("Aravis", "0.8")
         importlib.import_module("gi.repository.GLib")

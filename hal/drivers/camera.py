@@ -1,8 +1,8 @@
-"""A `FrameSource` for a camera whose calls may take long, served in parallel to the control loop.
+"""Camera service that operates a slow camera in parallel to the control loop.
 
-Triggering, fetching, setting controls and reopening a camera may each take milliseconds to seconds (an
-unanswered USB control transfer: five). A job of the clock does all of it; `trigger` and `poll`, which the
-control loop calls, only exchange requests and frames with that job.
+Triggering, reading, configuring and reopening a camera can each take milliseconds to seconds. An unanswered
+USB control transfer takes five seconds. A periodic job executes all these operations. The methods `trigger`
+and `poll`, which the control loop calls, only exchange requests and frames with the job.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ _MOST_EXPOSURES = 6
 
 @dataclass(slots=True)
 class CameraCounts:
-    """Counts of frames by outcome since start; they only grow.
+    """Counts of camera frames by outcome since start, which never decrease.
 
     Attributes:
-        delivered: frames returned by `poll` or ready for it.
-        spoiled: frames that the device flagged as damaged.
-        short: frames with fewer than all their pixels.
-        contradictory: frames that followed the previous one sooner than their exposure allows.
-        missed: frames that never arrived, by the gaps in the sequence numbers.
-        openings: how often the camera was opened.
+        delivered: number of frames returned by `poll` or ready to be returned.
+        spoiled: number of frames that the device flagged as damaged.
+        short: number of incomplete frames.
+        contradictory: number of frames that followed the previous frame sooner than the exposure time allows.
+        missed: number of frames that never arrived, from gaps in the frame numbers.
+        openings: number of times the camera was opened.
     """
 
     delivered: int = 0
@@ -43,52 +43,58 @@ class CameraCounts:
 
 
 class CameraDevice(Protocol):
-    """A camera's driver; calls come from one thread at a time, except `check`.
+    """Interface of a camera driver.
 
-    `check` may be called at the same time as another method.
+    The method `check` may be called at any time; the other methods are called by one thread at a time.
     """
 
     name: str
     counts: CameraCounts
 
     def open(self) -> None:
-        """Open the camera and set it up. Raises DeviceError, with the cure."""
+        """Open and configure the camera. Raises DeviceError with advice for the user."""
 
     def check(self, exposure_ns: int) -> None:
-        """Raise OutOfRange for an exposure that the camera cannot make."""
+        """Raise OutOfRange for an exposure time (ns) that the camera does not support."""
 
     def expose(self, exposure_ns: int, trigger_ns: int) -> None:
-        """Start, or select, an exposure that begins at the trigger or later. Raises DeviceError."""
+        """Start an exposure, or select the first exposure after the trigger time. Raises DeviceError."""
 
     def collect(self) -> Frame | None:
-        """Return that exposure's frame once, None until it arrives. Never waits. Raises DeviceError."""
+        """Return the frame of the started exposure once, None until the frame arrives.
+
+        Never blocks. Raises DeviceError.
+        """
 
     def close(self) -> None:
-        """Release the camera. Safe to call when it is not open."""
+        """Close the camera. Has no effect if the camera is not open."""
 
 
 class ServedCamera:
-    """Implements `hal.interfaces.devices.FrameSource`; reopens a lost camera.
+    """Camera operated by a periodic job, which also reopens a lost camera.
+
+    The class implements `hal.interfaces.devices.FrameSource`.
 
     Attributes:
-        name: name of the device.
-        counts: counts of its frames by outcome.
+        name: name of the camera device.
+        counts: counts of the camera's frames by outcome.
     """
 
     def __init__(self, device: CameraDevice, clock: Clock, patient: bool = False) -> None:
-        """Open the camera and serve it.
+        """Open the camera and start the periodic job.
 
-        Raises DeviceError when it cannot be opened; a `patient` camera counts as lost until it opens.
+        Raises DeviceError if the camera cannot be opened. If `patient` is true, the camera counts as lost
+        instead and is opened later.
 
-        A camera that delivers nothing within `PATIENCE_NS` and six exposures after a trigger is reopened; a
-        free-running camera may be in an exposure, and may need several more to apply a new setting.
+        The camera is reopened if no frame arrives within `PATIENCE_NS` plus six exposure times after a
+        trigger. A free-running camera may need several exposures until a new exposure time is effective.
         """
         self.name = device.name
         self.counts = device.counts
         self._device = device
         self._clock = clock
         self._lock = threading.Lock()
-        self._asked: tuple[int, int] | None = None  # exposure, trigger: not yet passed to the device
+        self._asked: tuple[int, int] | None = None  # pending request: exposure and trigger time (ns)
         self._frame: Frame | None = None
         self._failure: DeviceError | None = None
         self._deadline_ns: int | None = None
@@ -104,9 +110,9 @@ class ServedCamera:
         self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now; an exposure that is under way is abandoned.
+        """Start one exposure now and abandon an exposure in progress.
 
-        Raises NotResponding while the camera is lost, OutOfRange for an exposure that it cannot make.
+        Raises NotResponding while the camera is lost, and OutOfRange for an unsupported exposure time.
         """
         self._device.check(exposure_ns)
         with self._lock:
@@ -115,9 +121,9 @@ class ServedCamera:
         self._ticker.kick()
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None without a new one. Never blocks.
+        """Return the newest finished frame once, None if there is no new frame. Never blocks.
 
-        Raises the DeviceError that prevents frames, while it lasts.
+        Raises DeviceError while the camera is lost.
         """
         with self._lock:
             frame, self._frame = self._frame, None
@@ -126,7 +132,7 @@ class ServedCamera:
             return frame
 
     def close(self) -> None:
-        """Release the camera. Safe to call twice."""
+        """Close the camera. A second call has no effect."""
         with self._lock:
             if self._closed:
                 return
@@ -137,11 +143,11 @@ class ServedCamera:
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
-            # A new exception each time: one that is raised repeatedly grows its traceback.
+            # A new exception is created, because the traceback grows each time an exception is raised again.
             raise type(self._failure)(self._failure.device, self._failure.message)
 
     def _serve(self) -> None:
-        """Exchange requests and frames with the device; the job of the ticker."""
+        """Exchange requests and frames with the device. This is the periodic job."""
         if not self._open and not self._reopened():
             return
         try:
@@ -152,7 +158,7 @@ class ServedCamera:
         if frame is not None:
             self._deadline_ns = None
             with self._lock:
-                if self._asked is None:  # otherwise abandoned while the device was busy
+                if self._asked is None:  # a newer request makes the frame obsolete
                     self._frame = frame
                     self.counts.delivered += 1
 
@@ -171,7 +177,7 @@ class ServedCamera:
         return frame
 
     def _reopened(self) -> bool:
-        """Try to open the camera when a retry is due; return whether it is open."""
+        """Try to open the camera if a retry is due, and return whether the camera was opened."""
         now_ns = self._clock.now_ns()
         if now_ns < self._retry_ns or self._closed:
             return False
@@ -195,7 +201,7 @@ class ServedCamera:
         self._open = True
 
     def _drop(self, error: DeviceError) -> None:
-        """Close a camera that fails and drop the pending request."""
+        """Close a failing camera and discard the pending request."""
         self._device.close()
         self._open = False
         self._deadline_ns = None
@@ -208,23 +214,23 @@ class ServedCamera:
 
 
 class FrameNumbers:
-    """Continues the camera's frame numbers where they wrap around or restart.
+    """Converter of a camera's frame numbers to numbers that continue after a wrap-around or restart.
 
-    Repeated numbers and small steps back are preserved, so that a frozen camera can be detected.
+    Repeated numbers and small backward steps are preserved, so that a frozen camera can be detected.
     """
 
     def __init__(self, modulus: int) -> None:
-        """Count modulo `modulus`, one more than the camera's highest number."""
+        """Assume frame numbers modulo `modulus`, which is one more than the camera's highest frame number."""
         self._modulus = modulus
         self._last = -1
         self._offset = 0
 
     def begin_again(self) -> None:
-        """Continue from the last number whatever the camera's next one is: it was reopened."""
+        """Continue from the last number, because the camera was reopened and counts from zero again."""
         self._offset = self._last + 1
 
     def number(self, count: int) -> int:
-        """Return the frame's number."""
+        """Return the continued frame number for the camera's frame number `count`."""
         number = count + self._offset
         if number < self._last - self._modulus // 2:
             self._offset += self._modulus

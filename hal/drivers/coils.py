@@ -1,18 +1,18 @@
-"""Three torque coils on a PCA9685 and SN754410 H-bridges; any failure leads to zero current.
+"""Driver of three torque coils on a PCA9685 and SN754410 H-bridges. Any failure leads to zero current.
 
-A coil is connected to two inputs of its bridge (Sease 2013, Table 5.2, eq. 5.33). The sign of a count gives
-the direction and its magnitude the duty: +n drives input A for n/4096 of the period with input B low, -n
-drives input B, and 0 keeps both inputs low. The coil's L/R of 0.1 ms is far below the PWM period of 20 ms,
-so the mean current over a period follows from the mean voltage: n/4096 V/R.
+Each coil is driven by an H-bridge with two inputs A and B (Sease 2013, Table 5.2, eq. 5.33). A signed count n
+from -4096 to 4096 gives the direction and the duty. For n > 0, input A is high for n/4096 of the PWM period
+and input B is low. For n < 0, the inputs are exchanged. For n = 0, both inputs are low. The time constant L/R
+of a coil (0.1 ms) is far shorter than the PWM period (20 ms), so that the mean current is n/4096 V/R.
 
-`command` puts the newest currents into a mailbox and wakes a job of the clock; only that job, and a request
-for zero, uses the bus. The job writes the newest command, replaces a stale command by zero, repeats zero at
-every period while zero is requested, reads set-up and outputs back twice a second, and sets the chip up
-again after a brown-out. It never ends on a failure without a last attempt to write zero.
+The method `command` stores the newest currents in a mailbox and wakes a periodic job. Only this job and a
+request for zero use the bus. The job writes the newest command and replaces a stale command by zero. While
+zero is requested, the job writes zero in each period. Twice a second the job reads configuration and outputs
+back, and after a brown-out it configures the chip again. After any failure the job tries to write zero.
 
-Zero current means that both inputs of a bridge are low: this is the only message that needs no set-up of the
-chip. With low inputs a leg that is stuck high would drive its coil, so a bridge with such a leg is braked
-(both inputs high) immediately afterwards.
+Zero current is written as low level at both inputs of all bridges, because only this message works without a
+configured chip. If a bridge leg is stuck high, low inputs would drive current through the coil, so such a
+bridge is braked (both inputs high) immediately afterwards.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ DEVICE = "coils"
 
 @dataclass(frozen=True, slots=True)
 class CoilWiring:
-    """Wiring of one coil to the PWM chip, as measured.
+    """Measured properties of the connection of one coil to the PWM chip.
 
     Attributes:
-        channel_a: PWM channel of bridge input A, high for a positive current.
-        channel_b: PWM channel of input B.
-        resistance: ohm, of the coil.
-        sign: +1, or -1 for a coil with its leads swapped.
+        channel_a: PWM channel of bridge input A, which is high for a positive current.
+        channel_b: PWM channel of bridge input B.
+        resistance: resistance of the coil, ohm.
+        sign: +1, or -1 for a coil whose leads are swapped.
     """
 
     channel_a: int
@@ -59,7 +59,7 @@ class CoilWiring:
 
     @property
     def channels(self) -> tuple[int, int]:
-        """The PWM channels of inputs A and B."""
+        """PWM channels of the bridge inputs A and B."""
         return self.channel_a, self.channel_b
 
 
@@ -69,7 +69,13 @@ Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
 def wirings(
     channels: Sequence[tuple[int, int]], resistance: Sequence[float], signs: Sequence[int]
 ) -> Wirings:
-    """Return the wiring of the three coils from three values of each kind. Raises OutOfRange."""
+    """Return the wiring of the three coils. Raises OutOfRange for an invalid resistance or sign.
+
+    Args:
+        channels: PWM channels of the bridge inputs A and B for each coil.
+        resistance: resistance of each coil, ohm.
+        signs: +1 for each coil, or -1 for a coil whose leads are swapped.
+    """
     x, y, z = (
         CoilWiring(a, b, ohm, sign) for (a, b), ohm, sign in zip(channels, resistance, signs, strict=True)
     )
@@ -78,16 +84,16 @@ def wirings(
 
 @dataclass(frozen=True, slots=True)
 class CoilSettings:
-    """Wiring and drive of the three coils.
+    """Settings of the coil driver.
 
     Attributes:
-        coils: wiring of the coils on body x, y, z.
-        supply_voltage: V across a coil that is fully on, after the losses of the bridge.
-        current_limit: A, of each coil; V/R is a limit too.
-        stale_after: s without a command until the coils go to zero; at most 0.4, so that they are at zero
-            within 0.5.
-        tries: attempts of one write before it counts as failed.
-        retry_wait: s between them.
+        coils: wiring of the coils on the body axes x, y and z.
+        supply_voltage: voltage across a coil at full duty, after the losses of the bridge, V.
+        current_limit: maximum current of each coil, A.
+        stale_after: maximum age of a command before the coils are set to zero, s; at most 0.4 s, so that the
+            coils are at zero within 0.5 s.
+        tries: number of attempts before a transaction counts as failed.
+        retry_wait: waiting time between two attempts, s.
     """
 
     coils: Wirings
@@ -106,7 +112,7 @@ class CoilSettings:
             ("tries", self.tries, 1, 5, ""),
             ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
         ):
-            # Written so that NaN is rejected too.
+            # This form of the condition also rejects NaN.
             if not low <= value <= high:
                 raise OutOfRange(DEVICE, quantity, value, low, high, unit)
         used = [channel for coil in self.coils for channel in coil.channels]
@@ -115,9 +121,10 @@ class CoilSettings:
                 raise OutOfRange(DEVICE, "PWM channel (each once)", channel, 0, CHANNELS - 1, "")
 
     def blocks(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
-        """Return the pins grouped into blocks of neighbouring channels: (first channel, pins).
+        """Return the bridge inputs grouped into blocks of consecutive PWM channels: (first channel, inputs).
 
-        Pins are numbered coil by coil, in the order of `CoilWiring.channels`; a block is one transaction.
+        Each block is written in one transaction. The bridge inputs are numbered 0 to 5 in the order xA, xB,
+        yA, yB, zA, zB.
         """
         channels = [channel for coil in self.coils for channel in coil.channels]
         blocks: list[tuple[int, tuple[int, ...]]] = []
@@ -131,20 +138,30 @@ class CoilSettings:
 
 
 def current_step(resistance: float, supply_voltage: float) -> float:
-    """Return the mean current in A of one count, V/R/4096, from ohm and volt."""
+    """Return the mean current (A) of one PWM count, V/R/4096, from resistance (ohm) and voltage (V)."""
     return supply_voltage / resistance / COUNTS
 
 
 def largest_counts(step: float, current_limit: float) -> int:
-    """Return the largest count whose current exceeds neither the limit in A nor V/R."""
-    # A limit that is a whole number of steps must not lose one to rounding.
+    """Return the largest PWM count whose current does not exceed the limit (A), at most 4096.
+
+    Args:
+        step: mean current of one count, A.
+        current_limit: current limit, A.
+    """
+    # Rounding must not reduce a limit that is an exact multiple of the step.
     return min(COUNTS, math.floor(current_limit / step * (1.0 + 1e-12)))
 
 
 def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
-    """Return the signed counts nearest to a mean current in A, and whether it was limited.
+    """Return the signed PWM count nearest to a mean current (A), and whether the current was limited.
 
-    Raises ValueError for NaN.
+    Raises ValueError if the current is NaN.
+
+    Args:
+        current: mean current, A.
+        step: mean current of one count, A.
+        largest: largest permitted count.
     """
     bound = largest * step
     if current > bound:
@@ -155,12 +172,12 @@ def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
 
 
 def mean_current(counts: int, step: float) -> float:
-    """Return the mean current in A of signed counts."""
+    """Return the mean current (A) of a signed PWM count from the current `step` (A) of one count."""
     return counts * step
 
 
 def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
-    """Return the PWM counts of inputs A and B; the idle one is low the whole period (Table 5.2)."""
+    """Return the PWM counts of bridge inputs A and B for a signed count (Sease 2013, Table 5.2)."""
     if counts > 0:
         return _pulse(counts), FULL_OFF
     if counts < 0:
@@ -169,9 +186,9 @@ def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
 
 
 def brake() -> tuple[PwmCounts, PwmCounts]:
-    """Return the PWM counts of both inputs that hold a coil at zero although a leg is stuck high.
+    """Return the PWM counts of both bridge inputs for braking, so that the coil current is zero.
 
-    Both ends of the coil are then at the upper rail, for either leg and for a sound bridge.
+    Both ends of the coil are then at the supply voltage, even if one leg of the bridge is stuck high.
     """
     return FULL_ON, FULL_ON
 
@@ -181,27 +198,27 @@ def _pulse(counts: int) -> PwmCounts:
 
 
 Counts = tuple[int, int, int]
-"""Signed PWM counts of the three coils."""
+"""Signed PWM counts of the three coils, from -4096 to 4096."""
 
 ZERO: Counts = (0, 0, 0)
 
 
 class CommandMailbox:
-    """Holds the newest command and brake request; replaces a command that is too old by zero.
+    """Mailbox with the newest command and brake request, which replaces a stale command by zero.
 
     Attributes:
-        lock: guards everything here; re-entrant, because a signal handler may request zero in the middle of
-            its own thread's call.
-        braked: the bridges to be braked.
-        number: of the newest command, withdrawal or brake.
-        command: A, as requested.
-        command_ns: host time of the newest command, -1 before the first.
-        saturated: whether any axis of the command was limited.
-        stale: the command was too old and was replaced by zero.
+        lock: lock of all attributes; re-entrant, because a signal handler may request zero while its own
+            thread holds the lock.
+        braked: flags of the bridges to be braked.
+        number: number of requests (commands, withdrawals and brakes) so far.
+        command: requested currents of the three coils, A.
+        command_ns: host time of the newest command, ns; -1 before the first command.
+        saturated: whether the current of any coil was limited.
+        stale: whether the command was too old and was replaced by zero.
     """
 
     def __init__(self, clock: Clock, stale_ns: int) -> None:
-        """Accept commands; one that is older than `stale_ns` becomes zero."""
+        """Accept commands, and replace a command that is older than `stale_ns` by zero."""
         self.lock = threading.RLock()
         self.braked = NO_AXES
         self.number = 0
@@ -211,10 +228,10 @@ class CommandMailbox:
         self.stale = False
         self._clock = clock
         self._stale_ns = stale_ns
-        self._wanted: Counts | None = None  # None: zero
+        self._wanted: Counts | None = None  # None requests zero
 
     def put(self, command: tuple[float, float, float], counts: Counts, saturated: bool) -> None:
-        """Replace the command, in A, by a new one and its signed counts."""
+        """Store a new command (A) with the corresponding signed PWM counts."""
         with self.lock:
             self.command = command
             self.command_ns = self._clock.now_ns()
@@ -224,13 +241,13 @@ class CommandMailbox:
             self.number += 1
 
     def brake(self, axes: Axes) -> None:
-        """Request that these bridges be braked from now on, whatever is commanded."""
+        """Request that the given bridges are braked from now on, whatever currents are commanded."""
         with self.lock:
             self.braked = axes
             self.number += 1
 
     def withdraw(self) -> None:
-        """Request zero."""
+        """Withdraw the command and request zero current."""
         with self.lock:
             self._wanted = None
             self.command = (0.0, 0.0, 0.0)
@@ -239,7 +256,7 @@ class CommandMailbox:
             self.number += 1
 
     def newest(self) -> tuple[Counts, Axes, int]:
-        """Return the signed counts and braked bridges that should be on the wire now, and their number."""
+        """Return the signed counts and brakes that should be written now, and the number of the request."""
         with self.lock:
             if self._wanted is not None and self._clock.now_ns() - self.command_ns > self._stale_ns:
                 self._wanted = None
@@ -258,19 +275,19 @@ _Answer = TypeVar("_Answer")
 
 
 class CoilOutputs:
-    """Writes signed counts to the PWM chip and records what the chip acknowledged.
+    """Writer of signed counts to the PWM chip, which records the last acknowledged outputs.
 
     Attributes:
-        written: signed counts of the coils that the chip acknowledged last.
-        braked: the bridges that are braked.
-        written_ns: host time since which these counts are written, -1 before the first write.
-        failing: the last exchange failed; the chip's state is not known.
-        faults: failed transactions since start.
-        error: the text of the last failure while it lasts.
+        written: signed PWM counts of the coils that the chip acknowledged last.
+        braked: flags of the braked bridges.
+        written_ns: host time since which these counts are written, ns; -1 before the first write.
+        failing: whether the last transaction failed, so that the state of the chip is unknown.
+        faults: number of failed transactions since start.
+        error: text of the current failure, empty if there is none.
     """
 
     def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings, lock: RLock) -> None:
-        """Drive the chip; `lock` guards `written`, `braked` and `written_ns`."""
+        """Use a PWM chip. The lock protects the attributes `written`, `braked` and `written_ns`."""
         self.written = ZERO
         self.braked = NO_AXES
         self.written_ns = -1
@@ -286,22 +303,22 @@ class CoilOutputs:
         self._check_ns = 0
 
     def set_up(self) -> None:
-        """Set the chip up with every output off, with retries. Raises DeviceError."""
+        """Configure the chip with all outputs off, with retries. Raises DeviceError."""
         self._retried(self.configure)
         self.failing, self.error = False, ""
 
     def configure(self) -> None:
-        """Set the chip up with every output off, once. Raises DeviceError."""
+        """Configure the chip with all outputs off, without retries. Raises DeviceError."""
         self._pca.configure()
         self._record(ZERO, NO_AXES)
         self._postpone_check()
 
     def check_is_due(self) -> bool:
-        """Return whether set-up and outputs should be read back now."""
+        """Return whether configuration and outputs should be read back now."""
         return self._clock.now_ns() >= self._check_ns
 
     def is_intact(self) -> bool:
-        """Return whether the chip holds its set-up and outputs, with retries. Raises NotResponding."""
+        """Return whether the chip still has its configuration and outputs. Retries; raises NotResponding."""
         held, kept = self._retried(self._read_back)
         if kept:
             self._postpone_check()
@@ -312,25 +329,25 @@ class CoilOutputs:
         return kept
 
     def keeps_written(self) -> bool:
-        """Return whether the outputs hold the last written counts. Raises NotResponding."""
+        """Return whether the outputs still have the last written counts. Raises NotResponding."""
         blocks = self._channel_blocks(self.written, self.braked)
         return all(self._pca.holds(first, block) for first, block in blocks)
 
     def not_kept(self) -> DeviceError:
-        """Return the error of a chip whose outputs differ from the written counts."""
+        """Return an error that states that the outputs differ from the written counts."""
         return Refused(self._pca.name, "does not keep what is written to its outputs")
 
     def write(self, counts: Counts, braked: Axes) -> None:
-        """Write signed counts and brakes, once. Raises DeviceError."""
+        """Write signed counts and brakes without retries. Raises DeviceError."""
         self._write(counts, braked)
         self._record(counts, braked)
 
     def zero(self, braked: Axes) -> bool:
-        """Write zero once, then brake the bridges of `braked`; return whether that was acknowledged."""
+        """Write zero, then brake the bridges of `braked`. Return whether the chip acknowledged the writes."""
         try:
             self._pca.all_off()
             self._record(ZERO, NO_AXES)
-            # A chip that may have lost its set-up would misread a block.
+            # A chip that has lost its configuration would misinterpret a block of counts.
             if any(braked) and not self.failing:
                 self.write(ZERO, braked)
         except NotResponding as error:
@@ -339,16 +356,16 @@ class CoilOutputs:
         return True
 
     def count(self, error: DeviceError) -> None:
-        """Count a failed transaction and keep its text."""
+        """Count a failed transaction and store the text of its error."""
         self.faults += 1
         self.error = str(error)
 
     def wait(self) -> None:
-        """Wait before the next try."""
+        """Wait until the next retry is due."""
         self._clock.sleep_until_ns(self._clock.now_ns() + self._retry_ns)
 
     def _retried(self, action: Callable[[], _Answer]) -> _Answer:
-        """Return what `action` returns, tried a few times; raises the last DeviceError."""
+        """Call `action` with retries and return its result. Raises the DeviceError of the last attempt."""
         for left in reversed(range(self._settings.tries)):
             try:
                 return action()
@@ -360,9 +377,9 @@ class CoilOutputs:
         raise AssertionError("tries is at least 1")
 
     def _read_back(self) -> tuple[bool, bool]:
-        """Return whether the chip holds its set-up, and whether its outputs as well."""
+        """Return whether the chip has its configuration, and whether it has configuration and outputs."""
         held = self._pca.is_configured()
-        # Zero is sent in more than one way, and again at each period, so it is not read back.
+        # Zero is not read back, because zero is written again in each period.
         driven = any(self.written) or any(self.braked)
         return held, held and (not driven or self.keeps_written())
 
@@ -374,14 +391,14 @@ class CoilOutputs:
             self._pca.write_channels(first, block)
 
     def _channel_blocks(self, counts: Counts, braked: Axes) -> list[tuple[int, list[PwmCounts]]]:
-        """Return (first channel, counts from there on) of each block for signed counts of the coils."""
+        """Return the first channel and the PWM counts of each block of consecutive channels."""
         pins: list[PwmCounts] = []
         for value, held in zip(counts, braked, strict=True):
             pins += brake() if held else inputs_for(value)
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
-        """Record what the chip acknowledged; a repetition keeps its first time."""
+        """Record acknowledged counts and brakes. A repeated write of the same values keeps the first time."""
         with self._lock:
             if self.written_ns < 0 or (counts, braked) != (self.written, self.braked):
                 self.written, self.braked = counts, braked
@@ -389,34 +406,34 @@ class CoilOutputs:
 
 
 SERVE_PERIOD_NS = 50_000_000
-_OFF_PATIENCE = 0.3  # s that `off` waits for a transaction of the job before it writes without the lock
+_OFF_PATIENCE = 0.3  # longest time (s) for which `off` waits for the lock
 _AXES = "xyz"
 
 
 class PwmTorqueCoils:
-    """The torque coils. Safe to call from several threads; zero can be requested at any time."""
+    """Driver of the torque coils. Thread-safe; zero can be requested at any time."""
 
     def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings) -> None:
         self._clock = clock
         self._settings = settings
         self._steps = tuple(current_step(coil.resistance, settings.supply_voltage) for coil in settings.coils)
         self._largest = tuple(largest_counts(step, settings.current_limit) for step in self._steps)
-        # Currents of one count; the sign is exact in either place.
+        # mean current (A) of one count, with the sign of the coil
         self._signed = tuple(coil.sign * step for coil, step in zip(settings.coils, self._steps, strict=True))
         self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9))
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
         self._running = False
         self._ticker: Ticker | None = None
-        # Re-entrant: a signal handler may request zero in the middle of its own thread's call.
+        # The lock is re-entrant, because a signal handler may request zero while its thread holds it.
         self._wire = threading.RLock()
         self._serving = False
-        self._served = -1  # the number of the command on the wire
+        self._served = -1  # number of the last written request
 
     def start(self, patient: bool = False) -> None:
-        """Set the PWM chip up with every output off.
+        """Configure the PWM chip with all outputs off.
 
-        Raises DeviceError when it is silent or refuses; a `patient` start reports that in `state` and keeps
-        trying.
+        Raises DeviceError if the chip does not answer or refuses a value. If `patient` is true, the failure
+        is reported by `state` instead, and the driver keeps trying.
         """
         with self._wire:
             try:
@@ -434,10 +451,10 @@ class PwmTorqueCoils:
                 self._ticker = self._clock.ticker(DEVICE, SERVE_PERIOD_NS, self._serve)
 
     def command(self, currents: FloatArray) -> None:
-        """Request currents (3,) in A; values beyond the limit are limited. Never waits for the bus.
+        """Request coil currents (3,), A. Never waits for the bus.
 
-        Raises OutOfRange, and brings the coils to zero, for a wrong shape or a value that is not finite;
-        Refused before `start` and after `close`.
+        Currents above the limit are limited. For a wrong shape or a value that is not finite, the coils are
+        set to zero and OutOfRange is raised. Raises Refused before `start` and after `close`.
         """
         values = np.asarray(currents, dtype=np.float64)
         problem = self._problem(values)
@@ -458,9 +475,9 @@ class PwmTorqueCoils:
         ticker.kick()
 
     def brake(self, axes: Axes) -> None:
-        """Hold both inputs of these bridges high from now on, whatever is commanded. Never waits for the bus.
+        """Brake the given bridges: hold both inputs high, whatever currents are commanded.
 
-        Refused before `start` and after `close`.
+        Never waits for the bus. Raises Refused before `start` and after `close`.
         """
         with self._mailbox.lock:
             ticker = self._ticker
@@ -470,9 +487,9 @@ class PwmTorqueCoils:
         ticker.kick()
 
     def off(self) -> None:
-        """Bring all coils to zero now, with retries; returns when written or given up. Never raises.
+        """Set all coils to zero now, and return after a successful write or after the last retry.
 
-        Any pending command is withdrawn, so that nothing energises the coils again until the next command.
+        Never raises. A pending command is withdrawn, so that the coils stay off until the next command.
         """
         self._mailbox.withdraw()
         held = self._wire.acquire(timeout=_OFF_PATIENCE)
@@ -490,7 +507,7 @@ class PwmTorqueCoils:
                 self._wire.release()
 
     def state(self) -> CoilState:
-        """Return the written state; after a failure, the last acknowledged state."""
+        """Return the newest command and the last acknowledged output."""
         mailbox, outputs = self._mailbox, self._outputs
         with mailbox.lock:
             return _state_of(
@@ -507,7 +524,7 @@ class PwmTorqueCoils:
             )
 
     def close(self) -> None:
-        """Stop the job and bring the coils to zero. Safe to call twice. The shared bus stays open."""
+        """Stop the job and set the coils to zero. A second call has no effect. The shared bus stays open."""
         with self._mailbox.lock:
             was_running, self._running = self._running, False
             ticker, self._ticker = self._ticker, None
@@ -534,9 +551,9 @@ class PwmTorqueCoils:
         return self._outputs.zero(self._mailbox.braked)
 
     def _serve(self) -> None:
-        """Bring the wire up to date; the job of the clock."""
+        """Write the newest request to the chip. This is the periodic job of the driver."""
         with self._wire:
-            # Re-entered while waiting: simulated time runs then, and signals arrive.
+            # The job can be re-entered while it waits, by a signal handler or by simulated time.
             if self._serving or not self._running:
                 return
             self._serving = True
@@ -551,7 +568,7 @@ class PwmTorqueCoils:
         due = outputs.check_is_due()
         if number == self._served and any(counts) and not due and not outputs.failing:
             return
-        # A failing chip first gets the one message that is right in every state: off.
+        # The message `off` works in any state of the chip, so a failing chip receives it first.
         if outputs.failing and not self._try_zero():
             return
         try:
@@ -570,12 +587,12 @@ class PwmTorqueCoils:
             outputs.error = str(error)
         else:
             outputs.failing = False
-            # A failure that was repaired at once is still reported until the next period.
+            # A failure that was repaired at once remains reported until the next period.
             outputs.error = repaired
 
     def _write_newest(self) -> None:
         for left in reversed(range(self._settings.tries)):
-            # Read again at each try: a newer command counts, above all a withdrawal.
+            # The mailbox is read at each attempt, because a newer request may have arrived.
             counts, braked, number = self._mailbox.newest()
             try:
                 self._outputs.write(counts, braked)
@@ -603,7 +620,10 @@ def _state_of(
     error: str,
     braked: Axes,
 ) -> CoilState:
-    """Return the state, made once for all who ask in a cycle; `signed` A are the currents of a count."""
+    """Return a cached driver state, so that several calls in a control cycle share one object.
+
+    The values `signed` are the mean currents of one count, with the sign of the coil, A.
+    """
     return CoilState(
         command=np.array(command),
         current=np.array([mean_current(*axis) for axis in zip(written, signed, strict=True)]),

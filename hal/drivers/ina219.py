@@ -1,9 +1,10 @@
-"""The INA219: current of all coils together, bus voltage and power (TI SBOS448G).
+"""Driver of the INA219 current monitor (TI SBOS448G), which measures the coils' total current and voltage.
 
-The current is shunt voltage over shunt resistance; the chip's Calibration register, which a brown-out clears,
-is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms PWM periods, so it
-may be 18 % off; the mean of five may be 7 % off (a test computes both). A current beyond the range is
-reported as the end of the range and marked as clipped.
+The current is computed as shunt voltage divided by shunt resistance. The Calibration register of the chip is
+not used, because a brown-out clears the register. Each conversion averages 128 samples within 68 ms. This is
+not a multiple of the PWM period of 20 ms, so that a single conversion has an error of up to 18 %, and the
+mean of five conversions an error of up to 7 % (both computed in a test). A current outside the measuring
+range is reported as the limit of the range and marked as clipped.
 """
 
 from __future__ import annotations
@@ -25,33 +26,37 @@ BUS_STEP_V = 4e-3
 CONVERSION_READY = 0b10
 OVERFLOW = 0b01
 
-_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # in the order of the PG bits
+_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # by the value of the PG bits
 _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
-"""Number of reads in a row after which a ready flag that stays set counts as stuck."""
+"""Number of consecutive reads with a set ready flag after which the flag is considered stuck."""
 _REACH_NS = 300_000_000
-"""Largest age (ns) of the beginning of a conversion: 136 ms + 10 %, and as long again until it is read."""
+"""Largest age (ns) of the start of a conversion when it is read.
+
+A conversion of both voltages takes up to 150 ms (136 ms + 10 %), and the result is at most as old when it is
+read.
+"""
 
 
 def range_for(maximum_current: float, shunt_ohm: float) -> int:
-    """Return the PG bits of the narrowest shunt range that holds a current in A.
+    """Return the PG bits of the smallest shunt voltage range that covers `maximum_current` (A).
 
-    Raises OutOfRange when none does.
+    Raises OutOfRange if no range covers the current.
     """
     for bits, full_scale in enumerate(_SHUNT_RANGES_V):
-        # 0.8 A in 0.1 ohm is 80 mV, despite rounding.
+        # Rounding must not exclude an exact limit, such as 0.8 A at 0.1 ohm in the 80 mV range.
         if maximum_current * shunt_ohm <= full_scale * (1.0 + 1e-12):
             return bits
     raise OutOfRange("ina219", "maximum current", maximum_current, 0.0, _SHUNT_RANGES_V[-1] / shunt_ohm, "A")
 
 
 def config_for(range_bits: int) -> int:
-    """Return the Config word: 16 V bus range, the shunt range, 128 samples for both, continuous."""
+    """Return the Config word for the 16 V bus range, the given shunt range and continuous conversions."""
     return range_bits << 11 | AVERAGE_128 << 7 | AVERAGE_128 << 3 | CONTINUOUS
 
 
 class Ina219:
-    """One monitor, read by a job of the clock, which also sets it up, again after a brown-out."""
+    """Current monitor, read and, at the start and after a brown-out, configured by a periodic job."""
 
     def __init__(
         self,
@@ -63,7 +68,16 @@ class Ina219:
         maximum_current: float = 0.8,
         averaged: int = 5,
     ) -> None:
-        """Start reading every `period_ns`; a reading is the mean of the last `averaged` conversions.
+        """Start reading the monitor periodically.
+
+        Args:
+            bus: I2C bus of the monitor.
+            address: I2C address of the monitor.
+            clock: clock that runs the periodic job.
+            shunt_ohm: shunt resistance, ohm.
+            period_ns: period of reading, ns.
+            maximum_current: largest current to be measured, A.
+            averaged: number of conversions whose mean is a reading.
 
         Raises OutOfRange for a shunt or a current outside the range of the chip.
         """
@@ -89,24 +103,24 @@ class Ina219:
         self._ticker = clock.ticker("ina219", period_ns, self._serve)
 
     def latest(self) -> PowerReading | None:
-        """Return the newest reading, None before the first."""
+        """Return the newest reading, None before the first reading."""
         with self._lock:
             return self._latest
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings arrive."""
+        """Return the text of the current failure, or an empty text while readings arrive."""
         with self._lock:
             return self._error
 
     def close(self) -> None:
-        """Stop reading. Safe to call twice."""
+        """Stop reading. A second call has no effect."""
         self._ticker.stop()
 
     def _serve(self) -> None:
         try:
             conversion = self._convert()
         except DeviceError as error:
-            # A mean must not bridge a gap: the current may have changed meanwhile.
+            # A mean must not include conversions before a gap, because the current may have changed.
             self._conversions.clear()
             with self._lock:
                 self._error = str(error)
@@ -123,12 +137,12 @@ class Ina219:
             self._latest = PowerReading(
                 now_ns, voltage, current, voltage * current, newest, since_ns, any(clipped)
             )
-            # A failure is reported until the mean is complete again, for readers that read once per second.
+            # A failure is reported until the mean is complete, because some callers ask only once a second.
             if count == self._conversions.maxlen:
                 self._error = ""
 
     def _convert(self) -> tuple[float, float, bool] | None:
-        """Return bus voltage V and current A of a new conversion, and whether it is clipped; None without."""
+        """Return voltage (V), current (A) and clipping flag of a new conversion, None if there is none."""
         if self._read(CONFIG) != self._config:
             self._set_up()
             return None
@@ -140,7 +154,7 @@ class Ina219:
                 raise NotResponding(self.name, f"no conversion for {silence * 1e-9:.1f} s; check its supply")
             return None
         shunt = self._read(SHUNT)
-        self._read(POWER)  # clears "ready", so that no conversion is counted twice
+        self._read(POWER)  # clears the ready flag, so that no conversion is counted twice
         self._flag_stays = self._flag_stays + 1 if self._read(BUS) & CONVERSION_READY else 0
         if self._flag_stays >= _SURE_STUCK:
             raise NotResponding(self.name, "its registers are stuck: a conversion that was read stays new")
@@ -148,7 +162,7 @@ class Ina219:
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]
         current, clipped = signed * SHUNT_STEP_V / self._ohm, abs(signed) >= round(full_scale / SHUNT_STEP_V)
-        if bus & OVERFLOW and not clipped:  # of Current and Power: another has written Calibration
+        if bus & OVERFLOW and not clipped:  # other software has set Calibration
             bound = full_scale / self._ohm
             raise OutOfRange(self.name, "overflow: coil current", current, -bound, bound, "A")
         return (bus >> 3) * BUS_STEP_V, current, clipped

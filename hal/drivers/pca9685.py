@@ -1,6 +1,6 @@
-"""The PCA9685: sixteen PWM outputs of 12 bits on I2C (NXP data sheet).
+"""Driver of the PCA9685, an I2C chip with sixteen 12-bit PWM outputs (NXP data sheet).
 
-Uses neither numpy nor threads: the guardian process imports this module to switch the coils off.
+This module uses neither numpy nor threads, because the guardian process imports it to switch the coils off.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused, answering
 
-if TYPE_CHECKING:  # at run time the Protocols would import numpy, with the readings' types
+if TYPE_CHECKING:  # these Protocols import numpy, which the guardian must not load
     from hal.interfaces.wires import Clock, I2cBus
 
 MODE1 = 0x00
@@ -21,36 +21,39 @@ PRE_SCALE = 0xFE
 
 RESTART = 0x80
 AUTO_INCREMENT = 0x20
-EXTERNAL_CLOCK = 0x40  # sticky: only a reset clears it
+EXTERNAL_CLOCK = 0x40  # bit that only a reset clears
 SLEEP = 0x10
 TOTEM_POLE = 0x04
-FULL = 0x10  # bit 4 of an ON_H or OFF_H register: the whole period
+FULL = 0x10  # bit 4 of an ON_H or OFF_H register: on or off for the whole period
 
 GENERAL_CALL = 0x00
-"""Address of all chips on a bus."""
+"""General call address, to which all chips on a bus respond."""
 SOFTWARE_RESET = 0x06
-"""Byte to the general call that returns all chips to their power-on state (NXP data sheet, 7.6)."""
+"""Byte sent to the general call address that resets all chips (NXP data sheet, section 7.6)."""
 
 CHANNELS = 16
 COUNTS = 4096
-BLOCK_CHANNELS = 8  # fit into the 32 bytes of one SMBus block
+BLOCK_CHANNELS = 8  # maximum number of channels in one SMBus block of 32 bytes
 OSCILLATOR_HZ = 25e6
 FREQUENCY_HZ = 50.0
-"""Frequency of the PWM period."""
+"""PWM frequency, Hz."""
 OSCILLATOR_START_NS = 500_000
 
 PwmCounts = tuple[int, int]
-"""Counts (on, off) at which an output rises and falls, 0 .. 4095; 4096 is the full bit, full OFF wins."""
+"""Counts (on, off) within the PWM period at which an output is switched on and off, 0 to 4095.
+
+The value 4096 means on or off for the whole period. If both counts are 4096, the output is off.
+"""
 
 FULL_ON: PwmCounts = (COUNTS, 0)
 FULL_OFF: PwmCounts = (0, COUNTS)
 
 
 def switch_off(bus: I2cBus, address: int, tries: int = 3) -> None:
-    """Switch every output of the chip off, whatever its state.
+    """Switch all outputs of the chip off, whatever the state of the chip.
 
-    Writes one byte to ALL_LED_OFF_H, which needs no set-up and works with or without auto-increment. Raises
-    NotResponding after `tries` failures in a row.
+    One byte is written to the register ALL_LED_OFF_H, which works without any configuration of the chip.
+    Raises NotResponding after `tries` consecutive failures.
     """
     for left in reversed(range(tries)):
         try:
@@ -62,19 +65,22 @@ def switch_off(bus: I2cBus, address: int, tries: int = 3) -> None:
 
 
 def prescale_for(frequency_hz: float) -> int:
-    """Return the PRE_SCALE value of a PWM frequency: round(25 MHz / (4096 f)) - 1; 50 Hz gives 121.
+    """Return the PRE_SCALE value of a PWM frequency f: round(25 MHz / (4096 f)) - 1.
 
-    Raises OutOfRange outside 24 .. 1526 Hz, the range of the chip.
+    Raises OutOfRange outside the frequency range of the chip, 24 Hz to 1526 Hz.
     """
     low, high = OSCILLATOR_HZ / (COUNTS * 256), OSCILLATOR_HZ / (COUNTS * 4)
-    # Written so that NaN is rejected too.
+    # This form of the condition also rejects NaN.
     if not low <= frequency_hz <= high:
         raise OutOfRange("pca9685", "PWM frequency", frequency_hz, low, high, "Hz")
     return round(OSCILLATOR_HZ / (COUNTS * frequency_hz)) - 1
 
 
 class Pca9685:
-    """One chip on a bus. Nothing is retried here; the caller handles failures."""
+    """PCA9685 chip on an I2C bus.
+
+    Failed transactions are not retried, because the caller handles failures.
+    """
 
     def __init__(self, bus: I2cBus, address: int, clock: Clock) -> None:
         self._bus = bus
@@ -84,12 +90,12 @@ class Pca9685:
         self.name = _name(address)
 
     def configure(self) -> None:
-        """Set the chip up with every output off, and read the set-up back.
+        """Configure the chip with all outputs off, and read the configuration back.
 
-        All outputs go off first, in case a dead process left the chip running. A chip that an upset has
-        switched to an external clock is reset, and with it each chip of the bus that obeys the general call:
-        an ADS1115 loses its conversion. Raises NotResponding, or Refused if a register does not keep its
-        value.
+        All outputs are switched off first, in case a dead process left the chip running. If a bit flip has
+        switched the chip to an external clock, the chip is reset by a general call. The general call also
+        resets other chips on the bus, for example an ADS1115, which loses its conversion. Raises
+        NotResponding if the chip does not answer, and Refused if a register does not keep its value.
         """
         self.all_off()
         mode = self._read(MODE1)
@@ -99,7 +105,7 @@ class Pca9685:
             mode = self._read(MODE1)
         asleep = mode & ~RESTART | SLEEP
         self._write(MODE1, asleep)
-        self._write(PRE_SCALE, self._prescale)  # writable only while the chip sleeps
+        self._write(PRE_SCALE, self._prescale)  # writable only in sleep mode
         self._write(MODE1, AUTO_INCREMENT)
         self._clock.sleep_until_ns(self._clock.now_ns() + OSCILLATOR_START_NS)
         self._write(MODE2, TOTEM_POLE)
@@ -112,19 +118,23 @@ class Pca9685:
                 )
 
     def is_configured(self) -> bool:
-        """Return whether the chip still holds its set-up, lost in a brown-out. Raises NotResponding."""
+        """Return whether the chip still has its configuration, which a brown-out erases.
+
+        Raises NotResponding.
+        """
         return all(found == wanted for _, wanted, found in self._set_up())
 
     def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
-        """Return whether up to 8 neighbouring channels hold these counts. Raises NotResponding."""
+        """Return whether consecutive channels, at most 8, have the given counts. Raises NotResponding."""
         wanted = _values(counts)
         with answering(self.name):
             return self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted)) == wanted
 
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
-        """Write up to 8 neighbouring channels in one block; their outputs change together, at its end.
+        """Write the counts of consecutive channels, at most 8, in one block.
 
-        Raises OutOfRange for counts that the chip does not define (equal ones among them), NotResponding.
+        The outputs change simultaneously at the end of the block. Raises OutOfRange for counts without a
+        defined effect, such as equal on and off counts, and NotResponding if the chip does not answer.
         """
         if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
             raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
@@ -136,11 +146,11 @@ class Pca9685:
             self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
 
     def all_off(self) -> None:
-        """Switch every output off. Raises NotResponding."""
+        """Switch all outputs off. Raises NotResponding if the chip does not answer."""
         switch_off(self._bus, self._address, tries=1)
 
     def _set_up(self) -> list[tuple[str, int, int]]:
-        # RESTART only records that the chip slept with channels running; it changes no output.
+        # The RESTART bit only records that the chip was put to sleep with active channels, so it is ignored.
         return [
             ("MODE1", AUTO_INCREMENT, self._read(MODE1) & ~RESTART),
             ("MODE2", TOTEM_POLE, self._read(MODE2)),
@@ -157,7 +167,7 @@ class Pca9685:
 
 
 def _values(counts: Sequence[PwmCounts]) -> list[int]:
-    """Return the values of the four registers of each channel."""
+    """Return the values of the four registers of each channel for the given counts."""
     return [byte for on, off in counts for byte in (on & 0xFF, on >> 8, off & 0xFF, off >> 8)]
 
 

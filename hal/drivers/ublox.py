@@ -1,14 +1,14 @@
-"""A u-blox GPS receiver on a serial line: the UBX protocol, and a driver that reads NAV-PVT once per period.
+"""Driver of a u-blox GPS receiver on a serial line, which reads one NAV-PVT message per period.
 
 UBX is the binary protocol of u-blox receivers (u-blox M8 interface description, UBX-13003221, chapter 32). A
-frame is B5 62, class, identifier, length (little endian), payload, and an 8-bit Fletcher checksum over all
-but the first two bytes. One NAV-PVT frame carries the time, position, velocity and accuracies of one epoch.
-NMEA would spread them over several sentences, round the position to 2 m in the usual format, and omit the
-vertical velocity.
+UBX frame consists of the bytes B5 62, class, identifier, length (little endian), payload and checksum. The
+checksum is an 8-bit Fletcher checksum over all bytes except the first two. One NAV-PVT message contains the
+time, position, velocity and accuracies of one epoch. The NMEA protocol is not used, because it distributes
+these values over several sentences, usually rounds the position to 2 m, and lacks the vertical velocity.
 
-The receiver loses its set-up with its power. The driver therefore requests NAV-PVT until the request is
-acknowledged, and again whenever no NAV-PVT arrives for three seconds. No call waits. Consumer receivers stop
-at 18 km and 515 m/s; a satellite needs a firmware without that limit.
+The receiver loses its configuration at a power loss. The driver therefore requests NAV-PVT messages at the
+start, and again whenever none has arrived for three seconds. No call blocks. Consumer receivers stop working
+above 18 km or 515 m/s, so that a satellite needs a firmware without this limit.
 """
 
 from __future__ import annotations
@@ -32,26 +32,31 @@ OVERHEAD = 8
 PVT_LENGTH = 92
 _PVT = struct.Struct("<IHBBBBBBIiBBBBiiiiIIiiiiiIIHHIihH")
 THREE_DIMENSIONS = 3
-"""Value of fixType in NAV-PVT for a position in three dimensions."""
+"""Value of the NAV-PVT field `fixType` for a three-dimensional fix."""
 DATE_AND_TIME = 0b011
-"""Bits of `valid` in NAV-PVT for a valid date and time."""
+"""Bits of the NAV-PVT field `valid` for a valid date and time."""
 FIX_OK = 0b1
-"""Bit of `flags` in NAV-PVT for a valid fix."""
+"""Bit of the NAV-PVT field `flags` for a valid fix."""
 
 Kind = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Pvt:
-    """NAV-PVT in the receiver's own units.
+    """Content of a NAV-PVT message in the units of the receiver.
 
     Attributes:
-        date: year, month, day, hour, minute, second UTC; `nano` is added, ns of either sign.
-        valid: validity bits of date and time; `fix` is the type of the fix, `flags` its bits.
-        satellites: number of satellites in use.
-        longitude, latitude: 1e-7 deg; `height` is above WGS 84, mm.
-        horizontal, vertical: accuracies of the position, mm.
-        velocity: mm/s, north, east, down; `speed_accuracy` in mm/s.
+        date: UTC year, month, day, hour, minute and second.
+        nano: fraction of the second to be added to the date, ns; may be negative.
+        valid: validity bits of date and time.
+        fix: type of the fix.
+        flags: status bits of the fix.
+        satellites: number of GPS satellites used in the solution.
+        longitude, latitude: geodetic longitude and latitude, 1e-7 deg.
+        height: height above the WGS 84 ellipsoid, mm.
+        horizontal, vertical: horizontal and vertical accuracy of the position, mm.
+        velocity: velocity to the north, to the east and downwards, mm/s.
+        speed_accuracy: accuracy of the speed, mm/s.
     """
 
     date: tuple[int, int, int, int, int, int]
@@ -69,14 +74,14 @@ class Pvt:
     speed_accuracy: int
 
     def packed(self, time_of_week_ms: int = 0) -> bytes:
-        """Return the payload."""
+        """Return the payload of the NAV-PVT message."""
         north, east, _ = self.velocity
         ground = round((north * north + east * east) ** 0.5)
         return _PVT.pack(
             time_of_week_ms,
             *self.date,
             self.valid,
-            30,  # ns, accuracy of the time
+            30,  # time accuracy, ns
             self.nano,
             self.fix,
             self.flags,
@@ -93,7 +98,7 @@ class Pvt:
             0,
             self.speed_accuracy,
             0,
-            150,  # position's dilution of precision, 0.01
+            150,  # position dilution of precision, units of 0.01
             0,
             0,
             0,
@@ -103,7 +108,7 @@ class Pvt:
 
 
 def unpack_pvt(payload: bytes) -> Pvt:
-    """Return the content of NAV-PVT; `payload` has its length."""
+    """Return the content of a NAV-PVT payload of 92 bytes."""
     values = _PVT.unpack(payload)
     (_, year, month, day, hour, minute, second, valid, _, nano, fix, flags, _, satellites) = values[:14]
     longitude, latitude, height, _, horizontal, vertical, north, east, down, _, _, accuracy = values[14:26]
@@ -125,7 +130,7 @@ def unpack_pvt(payload: bytes) -> Pvt:
 
 
 def checksum(body: bytes) -> bytes:
-    """Return the two check bytes over class, identifier, length and payload."""
+    """Return the two checksum bytes of a frame body: class, identifier, length and payload."""
     a = b = 0
     for byte in body:
         a = (a + byte) & 0xFF
@@ -134,16 +139,18 @@ def checksum(body: bytes) -> bytes:
 
 
 def frame(kind: Kind, payload: bytes = b"") -> bytes:
-    """Return a whole frame."""
+    """Return a complete UBX frame with the given class, identifier and payload."""
     body = bytes(kind) + len(payload).to_bytes(2, "little") + payload
     return SYNC + body + checksum(body)
 
 
 class UbxParser:
-    """Splits received bytes into frames; after a false start the search continues two bytes later.
+    """Decoder that extracts UBX frames from received bytes.
+
+    If a candidate frame is invalid, the search continues two bytes after the candidate's start.
 
     Attributes:
-        bytes_received: number of bytes fed.
+        bytes_received: number of received bytes.
         frames: number of frames with a valid checksum.
         bad_checksum: number of frames with a wrong checksum.
         discarded_bytes: number of bytes outside valid frames.
@@ -159,7 +166,10 @@ class UbxParser:
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[tuple[Kind, bytes, int]]:
-        """Return the frames that `data` completes: kind, payload, and the number of bytes after the frame."""
+        """Return the frames that `data` completes.
+
+        Each frame is a tuple of kind (class and identifier), payload, and number of bytes after the frame.
+        """
         self.bytes_received += len(data)
         buffer, found, position = self._buffer + data, [], 0
         while True:
@@ -196,7 +206,7 @@ _HIGHEST = 3e6
 
 
 class UbloxReceiver:
-    """The receiver on a serial port; implements `hal.interfaces.devices.GpsReceiver`."""
+    """Driver of a u-blox receiver, which implements `hal.interfaces.devices.GpsReceiver`."""
 
     def __init__(self, port: SerialPort, clock: Clock, period_ns: int = SECOND_NS) -> None:
         """Request a fix every `period_ns`. Raises OutOfRange for a period outside 0.1 to 60 s."""
@@ -212,7 +222,7 @@ class UbloxReceiver:
         self._refused = self._out_of_range = 0
 
     def poll(self) -> list[GpsReading]:
-        """Return the readings since the last call, oldest first. Raises NotResponding for a lost port."""
+        """Return the readings since the last call, oldest first. Raises NotResponding if the port is lost."""
         readings = []
         for arrival_ns, data in self._port.receive():
             self._last_byte_ns = arrival_ns
@@ -225,7 +235,7 @@ class UbloxReceiver:
         return readings
 
     def link(self) -> GpsLink:
-        """Return the line's counters."""
+        """Return the counters of the serial line."""
         parser = self._parser
         return GpsLink(
             bytes_received=parser.bytes_received,
@@ -238,7 +248,7 @@ class UbloxReceiver:
         )
 
     def close(self) -> None:
-        """Release the port."""
+        """Close the serial port."""
         self._port.close()
 
     def _reading(self, kind: Kind, payload: bytes, arrival_ns: int) -> GpsReading | None:
@@ -253,7 +263,10 @@ class UbloxReceiver:
         return None
 
     def _set_up(self) -> None:
-        """Request NAV-PVT only, at most once in three seconds, while none arrives."""
+        """Configure the receiver to send only NAV-PVT.
+
+        Repeated every three seconds until a message arrives.
+        """
         now_ns = self._clock.now_ns()
         never = self._parser.frames == 0 and self._requested_ns < 0
         if (
@@ -261,8 +274,8 @@ class UbloxReceiver:
         ) or now_ns - self._requested_ns < SILENCE_NS:
             return
         self._requested_ns = now_ns
-        rate = (self._period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # GPS time
-        # Port 1 is UART 1: 8N1, UBX in and out, no NMEA.
+        rate = (self._period_ns // 1_000_000).to_bytes(2, "little") + b"\x01\x00\x01\x00"  # time system GPS
+        # Port 1 is UART 1, configured as 8N1 with UBX in both directions and without NMEA.
         port = (
             b"\x01\x00\x00\x00\xd0\x08\x00\x00" + self._port.baud_rate.to_bytes(4, "little") + b"\x01\x00" * 2
         )
@@ -271,7 +284,13 @@ class UbloxReceiver:
 
 
 def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
-    """Return a reading. Raises OutOfRange for values that are impossible on the ground and in orbit."""
+    """Return the reading of a NAV-PVT message. Raises OutOfRange for physically impossible values.
+
+    Args:
+        pvt: content of the message.
+        arrival_ns: host time at which the last byte of the message was received, ns.
+        baud_rate: baud rate of the serial line.
+    """
     limits: tuple[tuple[str, float, float, float, str], ...] = (
         ("latitude", pvt.latitude * 1e-7, -90.0, 90.0, "deg"),
         ("longitude", pvt.longitude * 1e-7, -180.0, 180.0, "deg"),
@@ -299,7 +318,7 @@ def reading_of(pvt: Pvt, arrival_ns: int, baud_rate: int) -> GpsReading:
 def _utc_ns(pvt: Pvt) -> int:
     year, month, day, hour, minute, second = pvt.date
     try:
-        # Second 60 is a leap second, which counts as the first second of the next minute.
+        # Second 60 is a leap second, which is converted to the first second of the next minute.
         whole = datetime(year, month, day, hour, minute, min(second, 59), tzinfo=UTC).timestamp()
     except ValueError as error:
         raise OutOfRange(DEVICE, "year", year, 1999, 2099, "") from error
@@ -307,7 +326,7 @@ def _utc_ns(pvt: Pvt) -> int:
 
 
 def _position(pvt: Pvt) -> tuple[FloatArray, FloatArray]:
-    """Return the position (3,) m, ITRS, and its directions north, east and down as rows (3, 3)."""
+    """Return the ITRS position (3,), m, and the unit vectors north, east and down as rows (3, 3)."""
     longitude, latitude = math.radians(pvt.longitude * 1e-7), math.radians(pvt.latitude * 1e-7)
     co, so, ca, sa = math.cos(longitude), math.sin(longitude), math.cos(latitude), math.sin(latitude)
     squared = _FLATTENING * (2.0 - _FLATTENING)

@@ -1,18 +1,18 @@
-"""A monochrome camera of Video for Linux (USB or a board's own), free-running, with manual exposure.
+"""Driver of free-running monochrome cameras (Video for Linux 2) with manual exposure.
 
-Such a camera has no trigger: it exposes frame after frame, and the kernel stamps each frame on the monotonic
-clock. `trigger` selects the first frame whose whole exposure lies after the call; all other frames are
-returned unread.
+A free-running camera has no trigger. It exposes frames continuously, and the kernel stamps each frame with
+the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. All other
+frames are returned to the kernel without reading their pixels.
 
-The driver's flag states whether a time stamp is that of the start of exposure (SOE) or of the frame's end.
-The kernel's uvcvideo always flags SOE, but unless its parameter `hwtimestamps` is set it stamps the arrival
-of the frame's first packet (uvc_video_decode_start), after the exposure has ended; `Stamp` accounts for
-that.
+A flag of the kernel driver states whether the time stamp refers to the start of exposure (SOE) or to the end
+of the frame. The kernel driver uvcvideo always sets the flag SOE. Unless the module parameter `hwtimestamps`
+is set, however, uvcvideo stamps the arrival of the first packet of a frame (uvc_video_decode_start), which is
+after the end of the exposure. The setting `Stamp` corrects this.
 
-`VideoDevice` makes the system calls. Every call raises OSError with the kernel's errno. No call waits for a
-frame, because the device is non-blocking. The structures and request numbers are those of linux/videodev2.h
-(Linux Media Infrastructure userspace API, part "Video for Linux"); ctypes lays them out for this machine. A
-request number contains the size of its structure.
+`VideoDevice` executes the system calls. A failed call raises OSError with the kernel's errno. The device is
+opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers are those
+of linux/videodev2.h (Linux Media Infrastructure userspace API, part "Video for Linux"). A request number
+contains the size of its structure, which ctypes computes for the machine.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ EXPOSURE_ABSOLUTE, EXPOSURE_UNIT_NS = 0x009A_0902, 100_000
 
 
 def _words(names: str) -> list[tuple[str, type[ctypes.c_uint32]]]:
-    """Return the definitions of unsigned fields of 32 bits, from their names in order."""
+    """Return ctypes definitions of unsigned 32-bit fields with the given names."""
     return [(name, ctypes.c_uint32) for name in names.split()]
 
 
 class Capability(ctypes.Structure):
-    """struct v4l2_capability."""
+    """Structure v4l2_capability of the kernel."""
 
     _fields_ = (
         ("driver", ctypes.c_char * 16),
@@ -77,7 +77,7 @@ class Capability(ctypes.Structure):
 
 
 class FormatDescription(ctypes.Structure):
-    """struct v4l2_fmtdesc."""
+    """Structure v4l2_fmtdesc of the kernel."""
 
     _fields_ = (
         *_words("index type flags"),
@@ -88,7 +88,7 @@ class FormatDescription(ctypes.Structure):
 
 
 class PixelFormat(ctypes.Structure):
-    """struct v4l2_pix_format."""
+    """Structure v4l2_pix_format of the kernel."""
 
     _fields_ = (
         *_words("width height pixelformat field bytesperline sizeimage colorspace priv flags"),
@@ -97,7 +97,7 @@ class PixelFormat(ctypes.Structure):
 
 
 class _FormatUnion(ctypes.Union):
-    # The window of an overlay holds pointers, which is what aligns the kernel's union.
+    # The kernel's union also contains a structure with pointers, which determines the alignment.
     _fields_ = (("pix", PixelFormat), ("raw_data", ctypes.c_uint8 * 200), ("pointer", ctypes.c_void_p))
 
 
@@ -159,7 +159,7 @@ class Fraction(ctypes.Structure):
 
 
 class StreamParameters(ctypes.Structure):
-    """struct v4l2_streamparm, its capture side."""
+    """Structure v4l2_streamparm of the kernel, for video capture."""
 
     _fields_ = (
         *_words("type capability capturemode"),
@@ -191,7 +191,7 @@ class QueryControl(ctypes.Structure):
 
 
 def _request(direction: int, number: int, structure: type[ctypes.Structure] | type[ctypes.c_int]) -> int:
-    """Return the request's code as asm-generic/ioctl.h composes it; 1 writes to the kernel, 2 reads."""
+    """Return an ioctl request number (asm-generic/ioctl.h) with direction 1 (write), 2 (read) or 3 (both)."""
     return direction << 30 | ctypes.sizeof(structure) << 16 | ord("V") << 8 | number
 
 
@@ -218,7 +218,14 @@ _MOST_FORMATS = 64
 
 @dataclass(frozen=True, slots=True)
 class PixelLayout:
-    """PixelLayout of the pixels in a buffer: `fourcc` names their format, rows are `stride` bytes apart."""
+    """Layout of the pixels in a frame buffer.
+
+    Attributes:
+        columns: number of image columns.
+        rows: number of image rows.
+        fourcc: four-character code of the pixel format.
+        stride: distance between the starts of two rows, bytes.
+    """
 
     columns: int
     rows: int
@@ -228,7 +235,7 @@ class PixelLayout:
 
 @dataclass(frozen=True, slots=True)
 class ControlRange:
-    """The range of a control."""
+    """Name and value range of a camera control."""
 
     name: str
     minimum: int
@@ -238,7 +245,7 @@ class ControlRange:
 
 @dataclass(frozen=True, slots=True)
 class Filled:
-    """A filled buffer: its index, bytes used, time stamp, sequence number and flags."""
+    """Buffer with a received frame: index, used bytes, time stamp, sequence number and flags."""
 
     index: int
     used_bytes: int
@@ -248,17 +255,17 @@ class Filled:
 
 
 def fourcc(name: str) -> int:
-    """Return the code of a pixel format of up to four letters, padded with blanks."""
+    """Return the numeric code of a pixel format from its name of up to four letters."""
     return int.from_bytes(name.ljust(4).encode("ascii"), "little")
 
 
 def fourcc_name(code: int) -> str:
-    """Return the letters of a pixel format's code."""
+    """Return the name of a pixel format from its numeric code."""
     return code.to_bytes(4, "little").decode("ascii", "replace").rstrip()
 
 
 class VideoDevice:
-    """One open /dev/videoN and its buffers."""
+    """Open video device /dev/videoN with its frame buffers."""
 
     def __init__(self, path: str) -> None:
         """Open the device. Raises OSError."""
@@ -275,7 +282,7 @@ class VideoDevice:
         self.close()
 
     def capability(self) -> tuple[str, str, int]:
-        """Return the names of driver and card, and the capabilities of this node."""
+        """Return the driver name, the camera name and the capability bits of the device."""
         answer = Capability()
         self._ask(QUERYCAP, answer)
         own = answer.device_caps if answer.capabilities & CAP_DEVICE_CAPS else answer.capabilities
@@ -294,7 +301,7 @@ class VideoDevice:
             yield fourcc_name(answer.pixelformat)
 
     def set_format(self, columns: int, rows: int, name: str) -> PixelLayout:
-        """Request a format; return the one that the device set, which may differ."""
+        """Request an image format and return the format that the device has chosen, which may differ."""
         answer = Format(type=VIDEO_CAPTURE)
         pix = answer.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = columns, rows, fourcc(name), FIELD_NONE
@@ -302,7 +309,7 @@ class VideoDevice:
         return PixelLayout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
     def set_interval(self, interval_ns: int) -> int:
-        """Request an interval between frames; return the device's, 0 when it cannot be set."""
+        """Request a frame interval (ns) and return the resulting interval, 0 if it cannot be set."""
         answer = StreamParameters(type=VIDEO_CAPTURE)
         try:
             self._ask(G_PARM, answer)
@@ -318,7 +325,7 @@ class VideoDevice:
         return time.numerator * _SECOND_NS // time.denominator if time.denominator else 0
 
     def control_range(self, control: int) -> ControlRange | None:
-        """Return the range of a control, None when the device has no such control."""
+        """Return the value range of a control, None if the device does not have the control."""
         answer = QueryControl(id=control)
         try:
             self._ask(QUERYCTRL, answer)
@@ -331,14 +338,17 @@ class VideoDevice:
         return ControlRange(_text(answer.name), answer.minimum, answer.maximum, max(answer.step, 1))
 
     def set_control(self, control: int, value: int) -> int:
-        """Set a control; return its resulting value."""
+        """Set a control and return the resulting value of the control."""
         answer = ControlValue(control, value)
         self._ask(S_CTRL, answer)
         self._ask(G_CTRL, answer)
         return int(answer.value)
 
     def start(self, count: int) -> int:
-        """Map and queue buffers and start streaming; return how many buffers the device granted."""
+        """Map and queue `count` buffers and start streaming.
+
+        Return the number of buffers granted by the device.
+        """
         request = RequestBuffers(count=count, type=VIDEO_CAPTURE, memory=MMAP)
         self._ask(REQBUFS, request)
         for index in range(request.count):
@@ -351,7 +361,10 @@ class VideoDevice:
         return int(request.count)
 
     def dequeue(self) -> Filled | None:
-        """Return the oldest filled buffer, None when there is none. Return it with `queue`."""
+        """Return the oldest filled buffer, None if there is none.
+
+        The caller must pass the buffer to `queue`.
+        """
         buffer = _numbered(0)
         try:
             self._ask(DQBUF, buffer)
@@ -362,11 +375,11 @@ class VideoDevice:
         return Filled(buffer.index, buffer.bytesused, stamp_ns, buffer.sequence, buffer.flags)
 
     def queue(self, index: int) -> None:
-        """Return a buffer to the kernel to be filled again."""
+        """Return a buffer to the kernel, so that it can be filled again."""
         self._ask(QBUF, _numbered(index))
 
     def pixels(self, index: int, layout: PixelLayout, kind: np.dtype[Any]) -> npt.NDArray[Any]:
-        """Return a copy (rows, columns) of a buffer's pixels, without the padding of its rows."""
+        """Return a copy (rows, columns) of the pixels in a buffer, without the padding of the rows."""
         memory = self._maps[index]
         view: npt.NDArray[Any] = np.ndarray(
             (layout.rows, layout.columns), kind, memory, strides=(layout.stride, kind.itemsize)
@@ -374,12 +387,12 @@ class VideoDevice:
         return view.astype(kind.newbyteorder("="), order="C")
 
     def close(self) -> None:
-        """Stop streaming and release everything. Safe to call twice."""
+        """Stop streaming and close the device. A second call has no effect."""
         if self._descriptor < 0:
             return
         if self._streaming:
             self._streaming = False
-            with contextlib.suppress(OSError):  # a lost camera has stopped
+            with contextlib.suppress(OSError):  # a lost camera has already stopped
                 self._ask(STREAMOFF, ctypes.c_int(VIDEO_CAPTURE))
         for memory in self._maps:
             memory.close()
@@ -388,12 +401,12 @@ class VideoDevice:
         os.close(descriptor)
 
     def _ask(self, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
-        # The kernel returns EINTR only where a call may wait; these do not.
+        # No retry for EINTR is needed, because these calls do not wait.
         ioctl(self._descriptor, request, argument)
 
 
 def _text(name: bytes) -> str:
-    """Return a name of the device; one too long for its field may be cut inside a character."""
+    """Return a device name as text. A long name may be truncated within a UTF-8 character."""
     return name.decode("utf-8", "replace")
 
 
@@ -407,11 +420,11 @@ PIXEL_KINDS: dict[str, np.dtype[Any]] = {
     "Y12": np.dtype("<u2"),
     "Y16": np.dtype("<u2"),
 }
-"""V4L2's grey pixel formats, "Luma-Only Formats": those of 10 and 12 bits use the low bits of 16."""
+"""Luma-only pixel formats of V4L2, stored in the low bits of 8 or 16 bits per pixel."""
 
 
 class Stamp(Enum):
-    """The instant of the kernel's stamp: as the driver flags it, or start or end of exposure regardless."""
+    """Meaning of the kernel's time stamp: as flagged by the driver, start of exposure, or end of exposure."""
 
     TOLD = "told"
     START = "start"
@@ -424,14 +437,14 @@ class V4l2Settings:
 
     Attributes:
         path: path of the device, such as /dev/knightcube-camera.
-        columns, rows: of the image.
-        pixel_format: a key of PIXEL_KINDS.
-        exposure_ns: the usual exposure; the interval between frames is set to it.
-        gain: in the camera's own steps, None to leave it unchanged.
-        stamp: the instant of the stamps.
-        stamp_delay_ns: from that instant to the stamp.
-        settling: frames that may still have the old exposure after it was changed.
-        buffers: how many frames the kernel may hold.
+        columns, rows: size of the image, pixels.
+        pixel_format: name of a pixel format in PIXEL_KINDS.
+        exposure_ns: usual exposure time, ns; the frame interval is set to the same value.
+        gain: gain in the camera's own units, None to leave the gain unchanged.
+        stamp: meaning of the time stamps.
+        stamp_delay_ns: delay of the time stamp after the start or end of exposure, ns.
+        settling: number of frames that may still have the old exposure time after a change.
+        buffers: number of frame buffers of the kernel.
     """
 
     path: str
@@ -447,24 +460,24 @@ class V4l2Settings:
 
     @property
     def kind(self) -> np.dtype[Any]:
-        """The type of a pixel."""
+        """Numpy type of a pixel."""
         return PIXEL_KINDS[self.pixel_format]
 
 
 UVC_STAMPS = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 
-# A stamp may be ahead of the clock by its rounding and by the fit of a camera's clock to the host's.
+# A time stamp can be slightly in the future, because the kernel estimates the offset of the camera's clock.
 _STAMP_AHEAD_NS = 10_000_000
-# Of the exposure: a shorter interval between frames contradicts the exposure.
+# tolerance of the frame interval, relative to the exposure time
 _INTERVAL_SLACK = 0.05
 _CONTRADICTIONS = 3
 
 
 class ExposureTiming:
-    """Derives the start of each exposure; detects a camera that exposes for less time than it claims."""
+    """Computation of exposure start times, and detection of exposures that are shorter than reported."""
 
     def __init__(self, settings: V4l2Settings, clock: Clock, counts: CameraCounts) -> None:
-        """Use the camera's settings and clock; contradictory frames are added to `counts`."""
+        """Use the camera's settings and clock, and count contradictory frames in `counts`."""
         self._name = settings.path
         self._settings = settings
         self._clock = clock
@@ -473,12 +486,15 @@ class ExposureTiming:
         self._contradictions = 0
 
     def begin(self, driver: str) -> None:
-        """Begin with a camera of this kernel driver."""
+        """Restart for a newly opened camera with the given kernel driver."""
         self._arrival_stamps = driver == "uvcvideo" and not _uvc_uses_device_clock()
         self._contradictions = 0
 
     def start_of(self, filled: Filled, exposure_ns: int) -> int:
-        """Return when a frame's exposure began. Raises CorruptData for a stamp of another clock."""
+        """Return the host time (ns) of the start of a frame's exposure.
+
+        Raises CorruptData if the time stamp is not from the monotonic clock.
+        """
         if filled.flags & STAMP_MASK != STAMP_MONOTONIC:
             raise CorruptData(self._name, "stamps its frames by another clock than the monotonic one")
         ahead_ns = filled.stamp_ns - self._clock.now_ns()
@@ -497,10 +513,11 @@ class ExposureTiming:
         return start_ns if at_start else start_ns - exposure_ns
 
     def contradicts(self, interval_ns: int, exposure_ns: int) -> bool:
-        """Return whether a frame followed the previous one sooner than its exposure takes.
+        """Return whether the interval between two frames is shorter than the reported exposure time.
 
-        A rate is the streak's length over the exposure: a camera that exposes for less time than it claims
-        makes every rate wrong. One such frame may have a late stamp; several in a row raise Refused.
+        A body rate is computed from streak length divided by exposure time, so that a wrong exposure time
+        makes all rates wrong. A single short interval can be caused by a late time stamp. Raises Refused
+        after several consecutive short intervals.
         """
         if interval_ns >= exposure_ns * (1.0 - _INTERVAL_SLACK):
             self._contradictions = 0
@@ -520,11 +537,11 @@ def _uvc_uses_device_clock() -> bool:
     try:
         return UVC_STAMPS.read_text(encoding="ascii").strip() not in {"0", "N"}
     except OSError:
-        return False  # the kernel's default
+        return False  # default of the kernel
 
 
 def open_device(name: str) -> VideoDevice:
-    """Return the open device. Raises NotResponding or Refused, with the cure."""
+    """Open a video device. Raises NotResponding or Refused with advice for the user."""
     try:
         return VideoDevice(name)
     except FileNotFoundError as error:
@@ -540,7 +557,7 @@ def open_device(name: str) -> VideoDevice:
 
 
 def meaning(name: str, error: OSError, doing: str) -> DeviceError:
-    """Return the device error that an errno of the kernel means."""
+    """Return the DeviceError that corresponds to an errno of the kernel."""
     if error.errno in {errno.ENODEV, errno.ENXIO}:
         return NotResponding(name, f"gone while {doing}: was it unplugged?")
     if error.errno == errno.EBUSY:
@@ -551,7 +568,7 @@ def meaning(name: str, error: OSError, doing: str) -> DeviceError:
 
 
 def identity(name: str, device: VideoDevice) -> tuple[str, str]:
-    """Return the names of driver and card. Raises Refused when this node delivers no video."""
+    """Return the driver name and the camera name. Raises Refused if the device cannot capture video."""
     driver, card, can = device.capability()
     if not (can & CAP_VIDEO_CAPTURE and can & CAP_STREAMING):
         raise Refused(name, f"{card} ({driver}) delivers no video here: give its capture node")
@@ -559,7 +576,7 @@ def identity(name: str, device: VideoDevice) -> tuple[str, str]:
 
 
 def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelLayout:
-    """Set the image format; raises Refused or CorruptData when the camera has no such format."""
+    """Set the image format. Raises Refused or CorruptData if the camera does not support the format."""
     name = settings.path
     layout = device.set_format(settings.columns, settings.rows, settings.pixel_format)
     if layout.fourcc != settings.pixel_format:
@@ -577,7 +594,7 @@ def set_format(device: VideoDevice, settings: V4l2Settings, card: str) -> PixelL
 
 
 def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
-    """Set the gain and switch its automatic control off. Raises Refused or OutOfRange."""
+    """Switch automatic gain control off and set the gain. Raises Refused or OutOfRange."""
     if device.control_range(AUTO_GAIN) is not None:
         device.set_control(AUTO_GAIN, 0)
     gain = settings.gain
@@ -594,7 +611,10 @@ def set_gain(device: VideoDevice, settings: V4l2Settings) -> None:
 
 
 def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:
-    """Switch automatic exposure off; return the range of exposures. Raises Refused without one."""
+    """Switch automatic exposure off and return the range of exposure times.
+
+    Raises Refused if the camera has no control of the exposure time.
+    """
     exposures = device.control_range(EXPOSURE_ABSOLUTE)
     if exposures is None:
         raise Refused(name, f"{card} has no exposure to be set in units of time (exposure_absolute)")
@@ -605,15 +625,18 @@ def manual_exposures(name: str, device: VideoDevice, card: str) -> ControlRange:
 
 _SEQUENCE_MODULUS = 1 << 32
 _EXPOSURE_LIMIT = (1 << 31) - 1
-# The kernel's documentation: EIO of VIDIOC_DQBUF may be a signal that was lost for a moment.
+# According to the kernel documentation, EIO of VIDIOC_DQBUF may be caused by a temporary signal loss.
 _PASSING_NS = 500_000_000
 
 
 class V4l2Camera:
-    """A `hal.drivers.camera.CameraDevice`; its clock must be CLOCK_MONOTONIC, as that of the stamps is."""
+    """Driver of a V4L2 camera, which implements `hal.drivers.camera.CameraDevice`.
+
+    The clock must be based on CLOCK_MONOTONIC, like the time stamps of the kernel.
+    """
 
     def __init__(self, settings: V4l2Settings, clock: Clock) -> None:
-        """Keep the settings; nothing is opened yet."""
+        """Store the settings without opening the device."""
         self.name = settings.path
         self.counts = CameraCounts()
         self._settings = settings
@@ -624,16 +647,16 @@ class V4l2Camera:
         self._layout = PixelLayout(0, 0, "", 0)
         self._exposures: ControlRange | None = None
         self._asked_steps = 0
-        self._exposure_ns = 0  # as the camera set it
+        self._exposure_ns = 0  # exposure time reported by the camera
         self._numbers = FrameNumbers(_SEQUENCE_MODULUS)
-        self._before: tuple[int, int] | None = None  # number and stamp of the last frame
+        self._before: tuple[int, int] | None = None  # number and time stamp of the last frame
         self._trigger_ns: int | None = None
         self._changed_ns = 0
         self._to_settle = 0
-        self._failing_ns: int | None = None  # since when fetching fails
+        self._failing_ns: int | None = None  # time of the first of consecutive read failures
 
     def open(self) -> None:
-        """Open the device and start streaming. Raises NotResponding, Refused or OutOfRange, with the cure."""
+        """Open the device and start streaming. Raises NotResponding, Refused or OutOfRange with advice."""
         self.close()
         self._device = open_device(self.name)
         try:
@@ -642,7 +665,7 @@ class V4l2Camera:
             raise meaning(self.name, error, "setting it up") from error
 
     def check(self, exposure_ns: int) -> None:
-        """Raise OutOfRange for an exposure that the camera cannot make."""
+        """Raise OutOfRange for an exposure time (ns) that the camera does not support."""
         known = self._exposures
         low, high = (known.minimum, known.maximum) if known else (1, _EXPOSURE_LIMIT)
         if not low <= round(exposure_ns / EXPOSURE_UNIT_NS) <= high:
@@ -650,7 +673,7 @@ class V4l2Camera:
             raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, low * unit, high * unit, "s")
 
     def expose(self, exposure_ns: int, trigger_ns: int) -> None:
-        """Select the first whole exposure that begins after the trigger. Raises DeviceError."""
+        """Select the first exposure that begins after the trigger time. Raises DeviceError."""
         device = self._opened()
         self._trigger_ns = trigger_ns
         try:
@@ -659,7 +682,10 @@ class V4l2Camera:
             raise meaning(self.name, error, "setting the exposure") from error
 
     def collect(self) -> Frame | None:
-        """Return the selected frame; all others go back to the kernel. Raises DeviceError."""
+        """Return the selected frame, None if it has not arrived. Raises DeviceError.
+
+        All other frames are returned to the kernel.
+        """
         device = self._opened()
         try:
             while (filled := self._dequeue(device)) is not None:
@@ -673,13 +699,13 @@ class V4l2Camera:
         return None
 
     def close(self) -> None:
-        """Stop streaming and release the camera. Safe to call when it is not open."""
+        """Stop streaming and close the camera. Has no effect if the camera is not open."""
         device, self._device = self._device, None
         if device is not None:
             device.close()
 
     def _dequeue(self, device: VideoDevice) -> Filled | None:
-        """Return the oldest filled buffer; None, for a while, when the kernel fails to return one."""
+        """Return the oldest filled buffer, None if there is none or during a short read failure."""
         try:
             filled = device.dequeue()
         except OSError as error:
@@ -704,7 +730,7 @@ class V4l2Camera:
         self._layout = set_format(device, settings, card)
         device.set_interval(settings.exposure_ns)
         device.start(settings.buffers)
-        # After the start: some cameras then lose what was set before.
+        # The controls are set after the start, because some cameras reset their controls at the start.
         set_gain(device, settings)
         self._exposures = manual_exposures(self.name, device, card)
         self.check(settings.exposure_ns)
@@ -724,7 +750,7 @@ class V4l2Camera:
         self._to_settle = self._settings.settling
 
     def _judge(self, device: VideoDevice, filled: Filled) -> Frame | None:
-        """Return the frame of a buffer if it is the selected one."""
+        """Return the frame in a buffer if it is the selected frame, otherwise None."""
         number = self._numbers.number(filled.sequence)
         before, self._before = self._before, (number, filled.stamp_ns)
         if before is not None:

@@ -1,6 +1,6 @@
-"""The hardware interface of the flight application: Protocols, readings, errors.
+"""Hardware interfaces of the flight application: Protocols of devices and buses, readings, and errors.
 
-`devices` holds the Protocols of the devices and their readings, `wires` the Protocols of the buses below the
-drivers (hal and sim_hal implement them), `guardian` the Protocols of the processes that watch the flight,
-`errors` the exceptions.
+The module `devices` defines the Protocols of the devices and their readings. The module `wires` defines the
+Protocols of the buses, which hal and sim_hal implement. The module `guardian` defines the Protocols of the
+processes that monitor the flight process. The module `errors` defines the exceptions.
 """

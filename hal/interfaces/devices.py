@@ -1,7 +1,7 @@
-"""Protocols of the devices that the flight application uses, and their readings.
+"""Protocols of the devices that the flight application uses, and the readings of these devices.
 
-Times are integer nanoseconds of the injected clock (`hal.interfaces.wires.Clock`), so a grid of 25 ms stays
-exact for years. Arrays are float64 and must be treated as read-only.
+Times are integer nanoseconds of the injected clock (`hal.interfaces.wires.Clock`), so that a time grid of 25
+ms stays exact for years. Arrays are float64 and must be treated as read-only.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 Axes = tuple[bool, bool, bool]
-"""One flag for each coil."""
+"""One flag for each of the coils x, y and z."""
 NO_AXES: Axes = (False, False, False)
 
 
@@ -23,13 +23,13 @@ class ImuReading:
     """One sample of the inertial unit, in the body frame and the mission's reference frame.
 
     Attributes:
-        time_ns: host clock at the instant of the sample (arrival less the time on the wire).
-        arrival_ns: host clock when the last byte of the packet was received.
-        device_time_ns: the unit's own clock, since its start-up.
-        quaternion: (4,) scalar last, reference frame into body.
-        rate: (3,) rad/s, body with respect to inertial, body axes.
-        field: (3,) tesla, body axes.
-        acceleration: (3,) m/s^2, specific force, body axes.
+        time_ns: host time of the sample, ns: arrival time minus transmission time of the packet.
+        arrival_ns: host time at which the last byte of the packet was received, ns.
+        device_time_ns: time of the unit's own clock since the unit was started, ns.
+        quaternion: (4,) rotation of the reference frame into the body frame, scalar last.
+        rate: (3,) body rate with respect to inertial space, in body axes, rad/s.
+        field: (3,) magnetic field in body axes, T.
+        acceleration: (3,) specific force in body axes, m/s^2.
     """
 
     time_ns: int
@@ -43,10 +43,19 @@ class ImuReading:
 
 @dataclass(frozen=True, slots=True)
 class ImuLink:
-    """Counters of the inertial unit's line since start; they only grow, so differences give rates.
+    """Counters of the inertial unit's serial line since the start of the driver.
 
-    On a silent line `last_byte_ns` does not change; on a corrupt one bytes arrive without packets.
-    `last_byte_ns` is -1 before the first byte.
+    The counters never decrease. On a silent line, `last_byte_ns` does not change. On a corrupted line, bytes
+    arrive but no packets.
+
+    Attributes:
+        bytes_received: number of received bytes.
+        packets: number of valid packets.
+        bad_checksum: number of packets with a wrong checksum.
+        discarded_bytes: number of bytes outside valid packets.
+        out_of_range: number of samples rejected because a value is physically impossible.
+        not_finite: number of samples rejected because a value is not finite.
+        last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
     """
 
     bytes_received: int
@@ -60,16 +69,17 @@ class ImuLink:
 
 @dataclass(frozen=True, slots=True)
 class GpsReading:
-    """One epoch of a GPS receiver.
+    """Navigation solution of a GPS receiver for one epoch.
 
     Attributes:
-        time_ns: host clock when the receiver began to send; the epoch itself is up to 0.2 s older.
-        arrival_ns: host clock when the last byte was received.
+        time_ns: host time at which the receiver began to send, ns; the epoch itself is up to 0.2 s earlier.
+        arrival_ns: host time at which the last byte of the message was received, ns.
         utc_ns: UTC of the epoch, ns since 1970; 0 if the receiver does not know the time.
-        position: (3,) m, ITRS.
-        velocity: (3,) m/s with respect to the ground, ITRS.
-        sigma: reported standard deviation per axis, m; `velocity_sigma` in m/s.
-        satellites: number of satellites in use.
+        position: (3,) position in the ITRS, m.
+        velocity: (3,) velocity with respect to the ground, in ITRS axes, m/s.
+        sigma: reported standard deviation of the position per axis, m.
+        velocity_sigma: reported standard deviation of the velocity per axis, m/s.
+        satellites: number of GPS satellites used in the solution.
         valid: whether the receiver reports time and position as valid.
     """
 
@@ -86,9 +96,16 @@ class GpsReading:
 
 @dataclass(frozen=True, slots=True)
 class GpsLink:
-    """Counters of the receiver's line since start; they only grow. `last_byte_ns` is -1 before any byte.
+    """Counters of the GPS receiver's serial line since the start of the driver, which never decrease.
 
-    `refused` counts commands that the receiver rejected, `out_of_range` impossible epochs.
+    Attributes:
+        bytes_received: number of received bytes.
+        frames: number of valid frames.
+        bad_checksum: number of frames with a wrong checksum.
+        discarded_bytes: number of bytes outside valid frames.
+        out_of_range: number of navigation solutions rejected because a value is physically impossible.
+        refused: number of commands that the receiver rejected.
+        last_byte_ns: host time of the last received byte, ns; -1 before the first byte.
     """
 
     bytes_received: int
@@ -102,7 +119,7 @@ class GpsLink:
 
 @dataclass(frozen=True, slots=True)
 class StringReading:
-    """Currents (n,) A of the solar strings at `time_ns` of the host clock."""
+    """Currents (n,) of the solar cell strings, A, with the host time `time_ns` of the measurement."""
 
     time_ns: int
     currents: FloatArray
@@ -110,10 +127,14 @@ class StringReading:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One image: `pixels` is (rows, columns), uint8 or uint16; times are of the host clock.
+    """Image of a camera, with the times of its exposure.
 
-    The exposure lasts `exposure_ns` from `exposure_start_ns`; `sequence` is the camera's own count, which
-    reveals a frozen camera.
+    Attributes:
+        sequence: frame number assigned by the camera, by which a frozen camera is detected.
+        exposure_start_ns: host time of the start of the exposure, ns.
+        exposure_ns: duration of the exposure, ns.
+        arrival_ns: host time at which the frame arrived, ns.
+        pixels: (rows, columns) pixel values, uint8 or uint16.
     """
 
     sequence: int
@@ -125,11 +146,17 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class PowerReading:
-    """A measurement of bus voltage (V), total current of the coils (A) and power (W).
+    """Measurement of the coils' supply voltage, total current and power.
 
-    The values are means over about a second; `newest` (A) is the current of the last conversion alone, whose
-    window lies between `newest_since_ns` and `time_ns`. `clipped`: a conversion was beyond the monitor's
-    range, so the currents are at least these.
+    Attributes:
+        time_ns: host time of the reading, ns.
+        voltage: mean supply voltage over about one second, V.
+        current: mean total current of the coils over about one second, A.
+        power: mean power over about one second, W.
+        newest: total current in the newest ADC conversion, A.
+        newest_since_ns: earliest possible start of the newest ADC conversion, host time in ns.
+        clipped: whether a conversion exceeded the range of the monitor, so that the true current may be
+            larger.
     """
 
     time_ns: int
@@ -143,18 +170,19 @@ class PowerReading:
 
 @dataclass(frozen=True, slots=True)
 class CoilState:
-    """The coil driver's last command and last acknowledged output.
+    """State of the coil driver: newest command and last acknowledged output.
 
     Attributes:
-        command: (3,) A, as requested, finite.
-        current: (3,) A, as written, after limiting and rounding to PWM counts; zeros when off.
-        written_ns: host clock since when that current is on the wire, -1 before the first.
-        saturated: whether any axis was limited.
-        command_ns: host clock of the newest command, -1 before the first.
-        stale: the command was too old, so the driver brought the coils to zero.
-        faults: failed transactions since start.
-        error: the text of the last failure while it lasts, empty when the last transaction succeeded.
-        braked: (3,) bridges with both inputs high, so that a leg stuck high drives no current.
+        command: (3,) requested currents, A.
+        current: (3,) currents written to the PWM chip, limited and rounded to PWM counts, A.
+        written_ns: host time since which these currents are written, ns; -1 before the first write.
+        saturated: whether the current of any coil was limited.
+        command_ns: host time of the newest command, ns; -1 before the first command.
+        stale: whether the newest command was too old, so that the driver set the coils to zero.
+        faults: number of failed bus transactions since start.
+        error: text of the current failure, empty if the last transaction succeeded.
+        braked: flags of the bridges with both inputs high, in which a leg that is stuck high drives no
+            current.
     """
 
     command: FloatArray
@@ -169,106 +197,112 @@ class CoilState:
 
 
 class InertialUnit(Protocol):
-    """Measures attitude, rate, field and acceleration at a steady rate."""
+    """Inertial unit that measures attitude, body rate, magnetic field and acceleration at a fixed rate."""
 
     def configure(self) -> None:
-        """Set the unit up; may take seconds. Raises DeviceError when the unit does not answer or refuses."""
+        """Configure the unit, which may take seconds.
+
+        Raises DeviceError if the unit does not answer or refuses a command.
+        """
 
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 
-        Raises NotResponding when the line itself is lost. Corrupt and implausible packets are
-        counted in `link`.
+        Corrupted and implausible packets are counted, see `link`. Raises NotResponding if the serial port is
+        lost.
         """
 
     def link(self) -> ImuLink:
-        """Return the line's counters."""
+        """Return the counters of the serial line."""
 
     def close(self) -> None:
-        """Stop and release the line."""
+        """Stop the driver and close the serial line."""
 
 
 class TorqueCoils(Protocol):
-    """Three torque coils; any failure leads to zero current."""
+    """Driver of three torque coils, which sets the currents to zero after any failure."""
 
     def start(self) -> None:
-        """Set the PWM chip up with every output off. Raises DeviceError when it does not answer."""
+        """Configure the PWM chip with all outputs off. Raises DeviceError if the chip does not answer."""
 
     def command(self, currents: FloatArray) -> None:
-        """Request currents (3,) in A; values beyond the limit are limited. Never waits for the bus.
+        """Request coil currents (3,), A. Never waits for the bus.
 
-        Raises OutOfRange, and brings the coils to zero, if a value is not finite.
+        Currents above the limit are limited. If a value is not finite, the coils are set to zero and
+        OutOfRange is raised.
         """
 
     def brake(self, axes: Axes) -> None:
-        """Hold both inputs of these bridges high from now on, whatever is commanded: never waits for the bus.
+        """Brake the given bridges: hold both inputs high, whatever currents are commanded.
 
-        A bridge then drives no current, even with a leg stuck high. Valid until `start` or another call.
+        Never waits for the bus. A braked bridge drives no current, even if a leg is stuck high. The brakes
+        hold until `start` or the next call of this method.
         """
 
     def off(self) -> None:
-        """Bring all coils to zero now, with retries; returns when written or given up.
+        """Set all coils to zero now, and return after a successful write or after the last retry.
 
-        Braked bridges stay braked: with low inputs a leg that is stuck high would drive its coil.
+        Braked bridges stay braked, because a leg that is stuck high would drive its coil if the inputs were
+        low.
         """
 
     def state(self) -> CoilState:
-        """Return what is on the wire."""
+        """Return the newest command and the last acknowledged output."""
 
     def close(self) -> None:
-        """Bring the coils to zero, then release the bus."""
+        """Set the coils to zero and release the bus."""
 
 
 class PowerMonitor(Protocol):
-    """Measures the total coil current and power."""
+    """Monitor of the total current and power of the coils."""
 
     def latest(self) -> PowerReading | None:
-        """Return the newest reading, None before the first."""
+        """Return the newest reading, None before the first reading."""
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings arrive."""
+        """Return the text of the current failure, or an empty text while readings arrive."""
 
     def close(self) -> None:
         """Stop reading."""
 
 
 class FrameSource(Protocol):
-    """A camera that exposes on a trigger."""
+    """Camera that starts an exposure at each trigger."""
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now. Raises NotResponding when the camera is lost."""
+        """Start one exposure now. Raises NotResponding if the camera is lost."""
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None without a new one. Never blocks."""
+        """Return the newest finished frame once, None if there is no new frame. Never blocks."""
 
     def close(self) -> None:
-        """Release the camera."""
+        """Close the camera."""
 
 
 class GpsReceiver(Protocol):
-    """Reports where the satellite is, and the time, about once a second."""
+    """GPS receiver that reports position, velocity and UTC about once a second."""
 
     def poll(self) -> list[GpsReading]:
-        """Return the epochs since the last call, oldest first. Never blocks.
+        """Return the readings since the last call, oldest first. Never blocks.
 
-        Raises NotResponding when the line itself is lost.
+        Raises NotResponding if the serial port is lost.
         """
 
     def link(self) -> GpsLink:
-        """Return the line's counters."""
+        """Return the counters of the serial line."""
 
     def close(self) -> None:
-        """Release the line."""
+        """Close the serial line."""
 
 
 class SolarStrings(Protocol):
-    """Measures the currents of the solar strings."""
+    """Monitor of the currents of the solar cell strings."""
 
     def latest(self) -> StringReading | None:
-        """Return the newest reading, None before the first."""
+        """Return the newest reading, None before the first reading."""
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings arrive."""
+        """Return the text of the current failure, or an empty text while readings arrive."""
 
     def close(self) -> None:
         """Stop reading."""

@@ -1,4 +1,4 @@
-"""The exceptions of the hardware layer; each carries its facts as attributes."""
+"""Exceptions of the hardware layer, with device, quantity and values as attributes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 
 class DeviceError(Exception):
-    """A device failed to do what was requested."""
+    """Raised if a device fails to execute a request."""
 
     def __init__(self, device: str, message: str) -> None:
         super().__init__(f"{device}: {message}")
@@ -16,12 +16,12 @@ class DeviceError(Exception):
 
 
 class NotResponding(DeviceError):
-    """No answer: no acknowledge, no bytes, a closed port, a bus that hangs."""
+    """Raised if a device does not answer, for example because a port is closed or a bus hangs."""
 
 
 @contextmanager
 def answering(device: str) -> Iterator[None]:
-    """Raise NotResponding of a device for an OSError of its bus."""
+    """Convert an OSError of the bus, raised in the context, into NotResponding of the device."""
     try:
         yield
     except OSError as error:
@@ -29,15 +29,15 @@ def answering(device: str) -> Iterator[None]:
 
 
 class CorruptData(DeviceError):
-    """An answer that the protocol does not allow."""
+    """Raised for an answer that the protocol of the device does not allow."""
 
 
 class Refused(DeviceError):
-    """The device refused: an error answer, or a register that does not keep the value."""
+    """Raised if a device answers with an error, or if a register does not keep a written value."""
 
 
 class OutOfRange(DeviceError):
-    """A command or a reading is outside the range of the device or of physics."""
+    """Raised for a command or reading that exceeds the range of the device or is physically impossible."""
 
     def __init__(self, device: str, quantity: str, value: float, low: float, high: float, unit: str) -> None:
         super().__init__(device, f"{quantity} = {value!r} {unit} is outside {low!r} .. {high!r} {unit}")
@@ -49,7 +49,13 @@ class OutOfRange(DeviceError):
 
 
 def check_limits(device: str, holder: object, limits: Mapping[str, tuple[float, float, str]]) -> None:
-    """Raise OutOfRange for an attribute of `holder` that is not within its (low, high, unit); NaN is not."""
+    """Raise OutOfRange for an attribute of `holder` that is NaN or outside its limits.
+
+    Args:
+        device: name of the device in the error message.
+        holder: object with the checked attributes.
+        limits: tuple (low, high, unit) by attribute name.
+    """
     for name, (low, high, unit) in limits.items():
         value = getattr(holder, name)
         if not low <= value <= high:

@@ -1,6 +1,6 @@
-"""Protocols and messages of the processes that watch the control loop: coil guardian and service manager.
+"""Protocols and messages of the processes that monitor the control loop: coil guardian, service manager.
 
-Flight process and guardian exchange single bytes on a socket pair.
+The flight process and the guardian exchange messages of one byte over a socket pair.
 """
 
 from __future__ import annotations
@@ -13,30 +13,33 @@ from pathlib import Path
 from typing import Protocol
 
 BEAT = b"."
-"""Flight: a control cycle succeeded."""
+"""Message from the flight process: a control cycle succeeded (heartbeat)."""
 
 BYE = b"q"
-"""Flight: the coils are off and the flight is over."""
+"""Message from the flight process: the flight has ended and the coils are off (goodbye)."""
 
 READY = b"r"
-"""Guardian: the bus is open and the coils are zeroed."""
+"""Message from the guardian: the bus is open and the coils are at zero."""
 
 ACTED = b"z"
-"""Guardian: the heartbeat stopped, the coils are zeroed."""
+"""Message from the guardian: the heartbeats stopped and the coils were set to zero."""
 
 FAILED = b"x"
-"""Guardian: the coils could not be zeroed; it keeps trying."""
+"""Message from the guardian: the coils could not be set to zero, and the guardian keeps trying."""
 
 
 NOTE = "coils"
-"""Name of the file that records bus and address of the coils."""
+"""Name of the file that contains the I2C bus and address of the coils' PWM chip."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoilReach:
-    """How a process without numpy accesses the coils' PWM chip.
+    """Access to the coils' PWM chip for a process without numpy.
 
-    `opener` names the function that opens the bus as `module:function`, `where` is its argument.
+    Attributes:
+        opener: function that opens the bus, written as `module:function`.
+        where: argument of this function, such as a device file.
+        address: I2C address of the PWM chip.
     """
 
     opener: str
@@ -44,7 +47,10 @@ class CoilReach:
     address: int
 
     def note(self, folder: Path) -> None:
-        """Write bus and address durably to a file in a folder, for `deploy/coils-off`. Never raises."""
+        """Write the bus and address durably to a file in `folder`, for the script `deploy/coils-off`.
+
+        Never raises.
+        """
         beside = folder / f"{NOTE}.part"
         with contextlib.suppress(OSError):
             with beside.open("wb") as note:
@@ -60,7 +66,7 @@ class CoilReach:
 
 
 class GuardianNews(Enum):
-    """Events of the guardian; the values are texts for the event log."""
+    """Events of the guardian. The enumeration values are texts for the event log."""
 
     LOST = "the guardian died or hangs; another one is started"
     READY = "the guardian watches the heartbeats"
@@ -69,20 +75,20 @@ class GuardianNews(Enum):
 
 
 class CoilGuardian(Protocol):
-    """A running guardian: zeroes the coils when heartbeats stop."""
+    """Running guardian process, which sets the coils to zero when the heartbeats stop."""
 
     def beat(self) -> None:
-        """Report that a control cycle succeeded. Never waits, never raises."""
+        """Send a heartbeat after a successful control cycle. Never blocks, never raises."""
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
-        """Replace a lost guardian; return what happened since the last call."""
+        """Replace a lost guardian and return the events since the last call."""
 
 
 class Overseer(Protocol):
-    """The service manager, as far as the flight uses it."""
+    """Service manager of the operating system, such as systemd."""
 
     def ready(self, status: str) -> None:
-        """Report that the start is complete; repeated by `feed_watchdog` until it is delivered."""
+        """Report that the start is complete. The method `feed_watchdog` repeats the report until delivery."""
 
     def feed_watchdog(self) -> None:
-        """Report that every task makes progress."""
+        """Report that all tasks make progress."""

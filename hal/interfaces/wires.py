@@ -1,7 +1,7 @@
-"""Protocols at the wire: clock, serial port, I2C bus, and the rig that holds them.
+"""Protocols of the connections to the hardware: clock, serial port, I2C bus, and the rig that contains them.
 
-hal implements these Protocols on Linux, sim_hal with emulated devices. Flight and simulation differ only
-below these Protocols, so every simulated run exercises the flight drivers.
+The package hal implements these Protocols on Linux, and sim_hal implements them with emulated devices. Flight
+and simulation differ only below these Protocols, so that each simulated run executes the flight drivers.
 """
 
 from __future__ import annotations
@@ -18,107 +18,115 @@ SECOND_NS = 1_000_000_000
 
 
 class Ticker(Protocol):
-    """A small job that a clock runs periodically beside the control loop."""
+    """Short job that a clock runs periodically, in parallel to the control loop."""
 
     @property
     def name(self) -> str:
-        """The job's name."""
+        """Name of the periodic job."""
 
     @property
     def period_ns(self) -> int:
-        """The period of the job, unless kicked."""
+        """Period (ns) of the job. The method `kick` can run the job earlier."""
 
     @property
     def error(self) -> str:
-        """The exception of the last run as text, empty when it completed."""
+        """Exception of the last run as text, empty if the run succeeded."""
 
     @property
     def served_ns(self) -> int:
-        """When a run last completed, or when the ticker was made."""
+        """Time (ns) at which a run last succeeded, initially the time at which the ticker was created."""
 
     def kick(self) -> None:
-        """Run the job as soon as possible, without waiting for its next period."""
+        """Run the job as soon as possible, without waiting for the next period."""
 
     def stop(self) -> None:
-        """Stop running the job; returns when it is not running. Safe to call twice."""
+        """Stop the job and return when no run is in progress. A second call has no effect."""
 
 
 class Clock(Protocol):
-    """Monotonic time in integer nanoseconds; the only source of time."""
+    """Clock of the flight, with monotonic time in integer nanoseconds.
+
+    All code takes the time from a clock.
+    """
 
     def now_ns(self) -> int:
-        """Return the monotonic time."""
+        """Return the monotonic time, ns."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after the deadline; at once if it has passed."""
+        """Sleep until the monotonic time `deadline_ns`. Return at once if the deadline has passed."""
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
-        """Run `job` every `period_ns`, beside the caller: on a thread in real time, in turn in simulation.
+        """Run `job` every `period_ns`, in a separate thread or, in a simulation, interleaved with the caller.
 
-        A job must not block for long and must be safe beside the control loop. The ticker reports a job that
-        raises, and runs it again in its next period.
+        A job must be thread-safe and must not block for long. If a job raises an exception, the ticker stores
+        the exception and runs the job again in the next period.
         """
 
     @property
     def tickers(self) -> Sequence[Ticker]:
-        """The running tickers, in the order in which they were made."""
+        """Running tickers in the order of their creation."""
 
     def utc_ns(self) -> int:
-        """Return UTC as nanoseconds since 1970: a label for telemetry, never an input of control."""
+        """Return UTC in ns since 1970. UTC is used as a label in telemetry, never for control."""
 
 
 class SerialPort(Protocol):
-    """A byte line. Receiving never blocks; each chunk carries the host time of its last byte."""
+    """Serial port. Receiving never blocks, and received data carry the host time of their arrival."""
 
     baud_rate: int
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return what arrived since the last call as (arrival_ns, bytes), oldest first.
+        """Return the data received since the last call as tuples (arrival_ns, bytes), oldest first.
 
-        Raises NotResponding when the port itself is lost.
+        The time `arrival_ns` is the host time of the last byte. Raises NotResponding if the port is lost.
         """
 
     def send(self, data: bytes) -> None:
-        """Queue bytes for sending. Raises NotResponding when the port is lost."""
+        """Queue bytes for sending. Raises NotResponding if the port is lost."""
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Change the line's speed."""
+        """Change the baud rate of the port."""
 
     def close(self) -> None:
-        """Close the port. Safe to call twice."""
+        """Close the port. A second call has no effect."""
 
 
 class I2cBus(Protocol):
-    """The part of smbus2's interface that the drivers use; one transaction per call.
+    """I2C bus with the methods of smbus2 that the drivers use. Each call is one bus transaction.
 
-    Every call raises OSError (with the errno of the kernel's I2C fault codes) when the bus or the device does
-    not answer, and always returns within the bus's time-out. Safe to call from several threads.
+    A call returns within the timeout of the bus, and raises OSError with the kernel's I2C fault code if the
+    bus or device does not answer. The methods are thread-safe.
     """
 
     def write_byte(self, address: int, value: int) -> None:
-        """Write one byte without a register, as to the general call address 0."""
+        """Write one byte to a device without a register address, for example to general call address 0."""
 
     def read_byte_data(self, address: int, register: int) -> int:
-        """Read one byte."""
+        """Read one byte from a register of a device."""
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte."""
+        """Write one byte to a register of a device."""
 
     def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
-        """Read `length` <= 32 bytes."""
+        """Read `length` bytes, at most 32, from consecutive registers of a device."""
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
-        """Write up to 32 bytes."""
+        """Write at most 32 bytes to consecutive registers of a device."""
 
     def close(self) -> None:
-        """Close the bus. Safe to call twice."""
+        """Close the bus. A second call has no effect."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wires:
-    """The connections of the drivers: the inertial unit's serial line, one I2C bus, and a camera or None.
+    """Connections to the hardware, on which the drivers operate.
 
-    A satellite has a GPS receiver's serial line and wide cameras besides.
+    Attributes:
+        serial: serial port of the inertial unit.
+        i2c: I2C bus of the coils and monitors.
+        frames: star camera, None if not fitted.
+        gps: serial port of the GPS receiver, None if not fitted.
+        wide: wide-angle cameras of a satellite.
     """
 
     serial: SerialPort
@@ -129,27 +137,34 @@ class Wires:
 
 
 class HostFaults(Protocol):
-    """Simulated faults inside the flight process itself: its workers and its disk."""
+    """Simulated faults inside the flight process, in its workers and file operations."""
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return the worker specifications with functions that may fail."""
+        """Return copies of the worker specifications whose functions can fail by simulated faults."""
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
-        """Return a job runner before `runner` that may fail; `result` makes a job's result."""
+        """Return a wrapper of the job runner `runner` that can fail.
+
+        The function `result` creates a job result.
+        """
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return an opener of files on a disk that may fail."""
+        """Return a wrapper of the file opener `opener` that can fail like a faulty disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The clock, the wires and other values that depend on the kind of hardware.
+    """Hardware or simulation on which a flight runs: clock, connections and settings.
 
     Attributes:
-        release: function that is called with mission time zero.
-        latency: latencies of planner and vision, ns, in lock-step only.
-        reach: access of the guardian to the coils, in real time only.
-        host: simulated faults inside this process, if any.
+        clock: clock of the flight.
+        wires: connections to the devices.
+        release: function called with the clock time of mission time zero, ns, when the flight starts.
+        realtime: whether the flight runs in real time; otherwise it is a lock-step simulation.
+        seed: seed of the simulation, 0 on hardware.
+        latency: simulated latencies of planner and vision (ns), used in a lock-step simulation only.
+        reach: access of the guardian to the coils, used in real time only.
+        host: simulated faults inside the flight process, None for no faults.
     """
 
     clock: Clock

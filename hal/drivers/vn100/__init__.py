@@ -1,1 +1,1 @@
-"""VectorNav VN-100 inertial unit: its `protocol` and its `driver`."""
+"""VectorNav VN-100 inertial unit: serial protocol and driver."""

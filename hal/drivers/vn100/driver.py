@@ -1,17 +1,17 @@
-"""The VN-100 driver: sets the unit up over its own protocol, reads its output, recovers a lost unit.
+"""VN-100 driver, which configures the unit, converts its output to readings and recovers a lost unit.
 
-Attitude: the unit sends (q0, q1, q2, q3), scalar last, a Hamilton quaternion that rotates body into NED. In
-this project's convention the same four numbers rotate NED into the sensor frame. Two constant linear maps of
-the settings convert it to the mission's reference frame and the body's axes
-(`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically impossible are
-rejected and counted.
+The unit sends its attitude as a Hamilton quaternion (q0, q1, q2, q3), scalar last, which rotates the sensor
+frame into NED. In this project's convention the same four numbers rotate NED into the sensor frame. Constant
+linear maps in the settings convert the attitude and the measured vectors to the mission's reference frame and
+the body axes (`knightcube.astro.quaternion.attitude_map`). Readings that are not finite or physically
+impossible are rejected and counted.
 
-`set_up` is the dialogue that configures a unit, as a generator of questions; the caller decides how to wait.
-`Recovery` advances one step at each poll and never waits. A unit that lost power or was reset runs on the
-settings in its flash, perhaps at another baud rate; a unit that was unplugged may return in any of these
-states. Packets show that the baud rate is right. Bytes without packets suggest that it is wrong; other baud
-rates are then tried, alternating with the configured rate. At the right baud rate the unit is set up again,
-one question at a time.
+The generator `set_up` yields the questions (commands) that configure a unit, and the caller decides how to
+wait for the answers. `Recovery` advances by one step at each poll and never blocks. A unit that lost power or
+was reset runs with the settings in its flash memory, possibly at another baud rate. Received packets show
+that the baud rate is correct. If bytes arrive but no packets, the recovery tries other baud rates,
+alternating with the configured rate. At the correct baud rate, the recovery configures the unit again, one
+question at a time.
 """
 
 from __future__ import annotations
@@ -44,29 +44,34 @@ IMU_RATE_HZ = 800
 ASCII_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 STANDARD_GRAVITY = 9.80665
 
-# TimeStartup, Quaternion, AngularRate, Accel of group 1 and Mag of group 3: one reading in 67 bytes.
+# These fields are TimeStartup, Quaternion, AngularRate and Accel of group 1, and Mag of group 3.
 OUTPUT_SET = {0: 0x0131, 2: 0x0100}
-_QMR_LENGTH = 137  # with a CRC16
-_LINE_LOAD_LIMIT = 0.8  # the rest is left for answers
+_QMR_LENGTH = 137  # length (bytes) of a VNQMR line with a CRC16
+_LINE_LOAD_LIMIT = 0.8  # fraction of the line capacity for output; the rest is for answers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vn100Settings:
-    """Mounting and output of the unit.
+    """Settings of the VN-100 driver.
 
     Attributes:
-        attitude_map: (4, 4), maps the unit's quaternion (NED into sensor) to ours (reference into body).
-        mounting: (3, 3) rotation matrix, sensor axes into body axes.
-        rate_hz: samples per second; binary rates divide 800, ASCII rates are register 7's.
-        output: binary packets, or ASCII VNQMR lines (which carry no device time).
-        unit_port: the unit's own serial port that the cable is on, 1 or 2.
-        rate_range, field_range, acceleration_range: rad/s, T, m/s^2, per axis; samples beyond are
-            rejected. The testbed's unit states 6 G, present-day units 2.5 G.
-        configure: False leaves the unit unchanged; any output with a complete reading is then accepted.
-        response_timeout_ns: the wait for an answer, each try.
-        tries: how often a command is sent before the unit counts as silent.
-        stuck_after: samples in a row with identical values after which they count as out of range, because
-            every sensor has noise. 0: never.
+        attitude_map: (4, 4) matrix that maps the unit's quaternion (NED into sensor frame) to the project's
+            quaternion (reference frame into body frame).
+        mounting: (3, 3) rotation matrix from sensor axes into body axes.
+        rate_hz: samples per second; a binary rate must divide 800, an ASCII rate must be listed for register
+            7.
+        output: output format, either binary packets or ASCII VNQMR lines without device time.
+        unit_port: number of the unit's serial port to which the cable is connected, 1 or 2.
+        rate_range: largest accepted body rate per axis, rad/s.
+        field_range: largest accepted magnetic field per axis, T; 6 gauss for the testbed's unit, 2.5 gauss
+            for current units.
+        acceleration_range: largest accepted acceleration per axis, m/s^2.
+        configure: whether the driver configures the unit; otherwise any output with a complete reading is
+            accepted.
+        response_timeout_ns: timeout of an answer for each attempt, ns.
+        tries: number of attempts to send a command before the unit is considered silent.
+        stuck_after: number of consecutive identical samples after which samples are rejected as stuck,
+            because a working sensor has noise; 0 disables the check.
     """
 
     attitude_map: FloatArray
@@ -84,7 +89,7 @@ class Vn100Settings:
 
 
 def check(settings: Vn100Settings, baud_rate: int) -> None:
-    """Raise Refused or OutOfRange for settings beyond the unit or the line."""
+    """Raise Refused or OutOfRange for settings that the unit or the serial line does not support."""
     if settings.output == "binary":
         possible = tuple(rate for rate in range(1, IMU_RATE_HZ + 1) if IMU_RATE_HZ % rate == 0)
         length = layout_of(OUTPUT_SET).length
@@ -103,50 +108,53 @@ def check(settings: Vn100Settings, baud_rate: int) -> None:
         raise Refused(DEVICE, f"unit_port = {settings.unit_port}: the unit has serial ports 1 and 2")
 
 
-# Transient errors, worth another try. All other codes are refusals.
+# The driver retries a command after these transient errors. All other error codes are refusals.
 PASSING_ERRORS = frozenset({-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF})
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A command and its fields; the first field identifies its answer."""
+    """Command to the unit, whose answer is recognised by the command's name and first field."""
 
     command: str
     fields: tuple[object, ...]
 
     def message(self) -> bytes:
-        """Return the bytes for the wire."""
+        """Return the command as bytes to be sent."""
         return build(self.command, *self.fields)
 
     def text(self) -> str:
-        """Return the text for messages."""
+        """Return the command as text for error messages."""
         return f"$VN{self.command},{','.join(map(str, self.fields))}"
 
     def answer(self, sentence: Sentence) -> tuple[str, ...] | None:
-        """Return the fields after the first if `sentence` is the answer; numbers may be zero-padded."""
+        """Return the fields after the first field if `sentence` answers this command, otherwise None.
+
+        Numbers in the answer may be padded with zeros.
+        """
         if sentence.command != self.command or not sentence.fields:
             return None
         return sentence.fields[1:] if _same(str(self.fields[0]), sentence.fields[0], False) else None
 
     def complaint(self, sentence: Sentence) -> tuple[int, str] | None:
-        """Return (code, text) of an error that the unit reports; None for other sentences."""
+        """Return code and text if `sentence` is an error message of the unit, otherwise None."""
         error = error_meaning(sentence)
         return None if error is None else (error[0], f"error {error[0]:02X}, {error[1]}")
 
 
 Dialogue = Generator[Question, tuple[str, ...], None]
-"""Yields questions and receives the fields of their answers. Raises Refused when the unit refuses."""
+"""Generator that yields questions and receives the fields of the answers. Raises Refused."""
 
 
 def set_up(settings: Vn100Settings) -> Dialogue:
-    """Set the unit up in its volatile memory; its flash is not written."""
+    """Yield the questions that configure the unit. The flash memory of the unit is not written."""
     model = yield Question("RRG", (1,))
     if not model or not model[0].startswith("VN-100"):
         raise Refused(DEVICE, f"the unit reports the model {','.join(model)!r}: this line needs a VN-100")
     yield from _write(6, 0)
-    # The unit's own hard and soft iron estimation would mistake the coils' field for the unit's.
+    # The unit's hard and soft iron estimation is disabled, because the coils would disturb it.
     yield from _write(44, 0, 1, 5)
-    # Boxcar filters of one 40 Hz period (magnetometer, accelerometer, gyro), on both outputs.
+    # The boxcar filters of magnetometer, accelerometer and gyro average over one period of 40 Hz.
     yield from _write(85, 20, 20, 20, 4, 0, 3, 3, 3, 3, 0)
     yield from _switch_off(76)
     yield from _switch_off(77)
@@ -157,7 +165,7 @@ def set_up(settings: Vn100Settings) -> Dialogue:
         yield from _write(75, settings.unit_port, divisor, groups, *words)
     else:
         yield from _switch_off(75)
-        # CRC16 on the lines too: XOR of 8 bits misses two flips in one column.
+        # ASCII lines get a CRC16, because an 8-bit XOR does not detect two flips of the same bit.
         yield from _write(30, 0, 0, 0, 0, 3, 0, 1)
         yield from _write(7, settings.rate_hz)
         yield from _write(6, 8)
@@ -174,7 +182,7 @@ def _write(register: int, *values: object) -> Dialogue:
 
 
 def _switch_off(register: int) -> Dialogue:
-    """Switch a binary output off; the remaining fields do not matter then."""
+    """Yield the question that switches a binary output off."""
     echo = yield Question("WRG", (register, 0, 20, "01", "0001"))
     if not echo or not _same("0", echo[0], True):
         raise Refused(DEVICE, f"register {register} should be off, but the unit answered {','.join(echo)}")
@@ -189,20 +197,20 @@ def _same(asked: str, echoed: str, base16: bool) -> bool:
         return False
 
 
-# In order of likelihood, the factory's setting first.
+# Baud rates in order of likelihood, beginning with the factory setting.
 BAUD_RATES = (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)
 
-_PATIENCE_NS = 150_000_000  # without a reading, before recovery begins
-_LISTEN_NS = 90_000_000  # at one baud rate: three packets of 40 Hz
+_PATIENCE_NS = 150_000_000  # time without a reading after which the recovery begins
+_LISTEN_NS = 90_000_000  # listening time at one baud rate, three packets at 40 Hz
 _REFUSED_WAIT_NS = 1_000_000_000
 
 
 class Recovery:
-    """The dialogue with a lost unit.
+    """Recovery of a lost unit: search for the baud rate and configuration.
 
     Attributes:
-        completed: how often a unit was set up again.
-        refusal: the unit's last refusal, empty without one.
+        completed: number of times the unit was configured again.
+        refusal: text of the unit's last refusal, empty if there was none.
     """
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
@@ -226,16 +234,23 @@ class Recovery:
         self._has_written = False
 
     def reset(self) -> None:
-        """Note that the unit has restarted: even with readings, its settings are those in its flash."""
-        # The first sample after a recovery shows the restart that was handled already.
+        """Record that the unit has restarted, and therefore runs with the settings in its flash memory."""
+        # The first sample after a recovery shows the restart that the recovery has already handled.
         self._was_reset = not self._is_fresh
 
     def advance(
         self, now_ns: int, readings: int, sentences: Sequence[Sentence], packets: int, received: int
     ) -> None:
-        """Advance by one poll with its number of readings, its sentences, and all packets and bytes so far.
+        """Advance the recovery by one poll.
 
-        Raises NotResponding when the port is gone.
+        Args:
+            now_ns: current time, ns.
+            readings: number of readings received in this poll.
+            sentences: ASCII sentences received in this poll.
+            packets: number of valid packets received since the start of the driver.
+            received: number of bytes received since the start of the driver.
+
+        Raises NotResponding if the port is lost.
         """
         if self._reading_ns is None:
             self._reading_ns = now_ns
@@ -268,13 +283,16 @@ class Recovery:
         self._dialogue = None
 
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
-        """Listen at this baud rate; begin the dialogue if it is right or the line silent, else change it."""
+        """Listen at the current baud rate and then either configure the unit or change the baud rate.
+
+        The unit is configured if valid packets arrive or if the line is silent.
+        """
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
         elif now_ns - self._listening_since_ns >= _LISTEN_NS:
             if received == self._bytes:
-                # Silence: its output may be switched off.
+                # The line is silent, possibly because the output of the unit is switched off.
                 self._begin(now_ns)
             else:
                 self._change_rate()
@@ -294,7 +312,7 @@ class Recovery:
 
     def _whole_dialogue(self) -> Dialogue:
         if self._port.baud_rate != self._own_rate:
-            # Answered at the old baud rate.
+            # The unit answers this command at the old baud rate.
             yield Question("WRG", (5, self._own_rate))
             self._port.set_baud_rate(self._own_rate)
         yield from set_up(self._settings)
@@ -328,7 +346,7 @@ class Recovery:
             self._is_fresh = True
             self.completed += 1
             self.refusal = ""
-            # Readings should arrive now; if not, recovery begins again after the same time.
+            # If no readings arrive from now on, the recovery begins again after the usual time.
             self._reading_ns = now_ns
 
     def _repeat(self, question: Question, now_ns: int) -> None:
@@ -341,7 +359,7 @@ class Recovery:
             self._port.set_baud_rate(self._own_rate)
 
     def _give_up(self) -> None:
-        """Return to the state before the dialogue; the next step listens again."""
+        """Abort the configuration, so that the next step listens again."""
         self._dialogue = None
         self._listening_since_ns = None
         self._has_written = False
@@ -358,9 +376,9 @@ class Recovery:
 
 TESLA_PER_GAUSS = 1e-4
 _UNIT_NORM_TOLERANCE = 1e-2
-_CERTAIN = 4  # intervals, or polls with lines, in a row that do not match the settings
+_CERTAIN = 4  # number of consecutive contradictions that prove wrong settings
 
-# Where a packet may carry each quantity, in order of preference.
+# Each row lists the packet fields that can contain a quantity, in order of preference.
 _SOURCES = (
     ("common.quaternion", "attitude.quaternion"),
     ("common.angular_rate", "imu.angular_rate"),
@@ -369,23 +387,26 @@ _SOURCES = (
 )
 _TIMES = ("common.time_startup", "time.time_startup")
 
-# Device time in ns, quaternion, rate, magnetic field in gauss, acceleration.
+# A sample contains device time (ns), quaternion, rate, magnetic field (gauss) and acceleration.
 _Sample = tuple[int, tuple[float, ...], tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 
 class ReadingConverter:
-    """Converts packets and lines into readings; detects a unit that does not run on our settings.
+    """Converter of packets and ASCII lines to readings, which also detects a unit with wrong settings.
 
     Attributes:
-        resets: how often the device's time went backwards, because the unit restarted.
-        out_of_range: samples rejected as impossible, repeated values among them.
-        not_finite: samples rejected because a value is not finite.
+        resets: number of restarts of the unit, detected by backward steps of the device time.
+        out_of_range: number of samples rejected because values are physically impossible or stuck.
+        not_finite: number of samples rejected because a value is not finite.
     """
 
     def __init__(self, settings: Vn100Settings, byte_ns: float, on_reset: Callable[[], None]) -> None:
-        """Convert for `settings`; a byte takes `byte_ns` on the line.
+        """Use the given settings.
 
-        `on_reset` is called when the unit has restarted or its settings differ from ours.
+        Args:
+            settings: settings of the driver.
+            byte_ns: transmission time of one byte on the serial line, ns.
+            on_reset: function that is called if the unit has restarted or has wrong settings.
         """
         self.resets = 0
         self.out_of_range = 0
@@ -401,13 +422,13 @@ class ReadingConverter:
         self._alike = 0
 
     def reading(self, item: BinaryPacket | AsciiLine) -> ImuReading | None:
-        """Return the reading that an item carries, None when it carries none or an impossible one."""
+        """Return the reading in a packet or line, None if there is no reading or the reading is rejected."""
         sample = self._binary_sample(item) if isinstance(item, BinaryPacket) else self._ascii_sample(item)
         if sample is None:
             return None
         device_ns, q, rate, mag, accel = sample
         numbers = (*q, *rate, *mag, *accel)
-        # The sum is finite only when all are: floats of 32 bits cannot overflow it.
+        # The sum of 32-bit floats cannot overflow, so the sum is finite only if all values are finite.
         if not math.isfinite(sum(numbers)):
             self.not_finite += 1
             return None
@@ -424,10 +445,10 @@ class ReadingConverter:
         ):
             self.out_of_range += 1
             return None
-        # One array for all: making one of each takes longer than the products.
+        # One common array is faster than an array for each quantity.
         values = np.array(numbers)
         quaternion = settings.attitude_map @ values[:4]
-        # Both signs are one attitude; the one of the shorter turn from the reference frame is returned.
+        # Of the two equivalent signs of the quaternion, the sign with a positive scalar part is returned.
         quaternion /= math.copysign(norm, quaternion[3])
         length = item.layout.length if isinstance(item, BinaryPacket) else item.length
         return ImuReading(
@@ -441,7 +462,7 @@ class ReadingConverter:
         )
 
     def check_for_lines(self, items: Sequence[BinaryPacket | AsciiLine]) -> None:
-        """Detect a unit that was set up for packets and also sends measurements as lines."""
+        """Detect a unit that sends ASCII measurement lines although it is configured for binary packets."""
         lines = (item.sentence for item in items if isinstance(item, AsciiLine))
         found = self._settings.output == "binary" and any(measurement(line) is not None for line in lines)
         self._odd_polls = self._odd_polls + 1 if found else 0
@@ -455,7 +476,7 @@ class ReadingConverter:
         places = self._places[header]
         if places is None:
             return None
-        values: tuple[float, ...] = packet.values  # type: ignore[assignment]  # these fields hold no bytes
+        values: tuple[float, ...] = packet.values  # type: ignore[assignment]  # these fields are numbers
         device_ns = 0
         if places.time is not None:
             device_ns = int(values[places.time])
@@ -468,9 +489,10 @@ class ReadingConverter:
         return device_ns, values[q], values[rate], values[mag], values[accel]
 
     def _check_step(self, step_ns: int) -> None:
-        """Detect a unit that sends samples at another rate because its divisor register was corrupted.
+        """Detect a unit that sends samples at a wrong rate, because its rate divisor register was corrupted.
 
-        After lost packets a step is a whole number of periods; after a bit flip in the divisor it is not.
+        Lost packets cause time steps that are multiples of the sample period. A corrupted divisor causes
+        other time steps.
         """
         part_ns = step_ns % self._period_ns
         off = min(part_ns, self._period_ns - part_ns) > 500_000_000 // IMU_RATE_HZ
@@ -480,7 +502,7 @@ class ReadingConverter:
 
     def _ascii_sample(self, line: AsciiLine) -> _Sample | None:
         values = measurement(line.sentence)
-        # A VNYMR line is not accepted as a reading: a unit that lost its settings sends it.
+        # VNYMR lines are not accepted, because a unit that has lost its settings sends them.
         if values is None or len(values.attitude) != 4:
             return None
         return 0, values.attitude, values.gyro, values.mag, values.accel
@@ -488,14 +510,19 @@ class ReadingConverter:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Positions of a packet's values: index of the time; slices of quaternion, rate, field, acceleration."""
+    """Positions of the time and of the sensor values in the list of a packet's values.
+
+    Attributes:
+        time: index of the device time, None if the packet contains no time.
+        sensors: slices of quaternion, rate, magnetic field and acceleration.
+    """
 
     time: int | None
     sensors: tuple[slice, slice, slice, slice]
 
 
 def _places(layout: OutputLayout) -> _Places | None:
-    """Return the positions of a reading in a packet; None if a part other than the time is missing."""
+    """Return the positions of a reading's values in a packet, None if a sensor value is missing."""
     sensors: list[slice] = []
     for names in _SOURCES:
         place = next((layout.places[name] for name in names if name in layout.places), None)
@@ -504,21 +531,21 @@ def _places(layout: OutputLayout) -> _Places | None:
         sensors.append(place)
     time = next((layout.places[name].start for name in _TIMES if name in layout.places), None)
     q, rate, mag, accel = sensors
-    # The first three values of MagPres are the field.
+    # The first three values of the field MagPres are the magnetic field.
     return _Places(time, (q, rate, slice(mag.start, mag.start + 3), accel))
 
 
 __all__ = ["OUTPUT_SET", "Vn100", "Vn100Settings"]
 
-_LONGEST_PACKET = 128  # above any output set that 40 Hz needs; bounds the wait on a false start
+_LONGEST_PACKET = 128  # bytes; limits the delay by noise that looks like a packet
 _POLL_STEP_NS = 1_000_000
 
 
 class Vn100:
-    """A VN-100 on a serial port; implements `hal.interfaces.devices.InertialUnit`."""
+    """Driver of a VN-100 on a serial port, which implements `hal.interfaces.devices.InertialUnit`."""
 
     def __init__(self, port: SerialPort, clock: Clock, settings: Vn100Settings) -> None:
-        """Use the port. Raises Refused or OutOfRange for settings beyond the unit or the line."""
+        """Use an open port. Raises Refused or OutOfRange for settings that unit or line do not support."""
         check(settings, port.baud_rate)
         self._unit_error = ""
         self._port = port
@@ -531,14 +558,14 @@ class Vn100:
         self._last_byte_ns = -1
 
     def configure(self) -> None:
-        """Set the unit up in its volatile memory; its flash is not written.
+        """Configure the unit in its volatile memory. The flash memory is not written.
 
-        Raises NotResponding on silence, CorruptData for meaningless answers, and Refused if the unit refuses,
-        is not a VN-100, or does not keep its settings.
+        Raises NotResponding if the unit does not answer, CorruptData for corrupted answers, and Refused if
+        the unit refuses a command, is not a VN-100, or does not keep its settings.
         """
         if not self._settings.configure:
             return
-        # Its output is switched off first, so that answers are not lost in it.
+        # The measurement output is switched off first, so that answers are not lost between measurements.
         self._ask(Question("ASY", (0,)))
         dialogue = set_up(self._settings)
         question = next(dialogue)
@@ -547,14 +574,15 @@ class Vn100:
                 question = dialogue.send(self._ask(question))
 
     def model(self) -> str:
-        """Return the model that the unit reports; nothing is changed in it. Raises as `configure`."""
+        """Return the model name that the unit reports. Raises the same exceptions as `configure`."""
         return ",".join(self._ask(Question("RRG", (1,))))
 
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 
-        A unit that sends none is searched for and set up again, one question per call. Raises NotResponding
-        when the line itself is gone. Corrupt and implausible packets are counted in `link`.
+        If the unit sends no samples, the driver searches for the unit and configures it again, one question
+        per call. Corrupted and implausible packets are counted, see `link`. Raises NotResponding if the
+        serial port is lost.
         """
         items = self._receive()
         found = (self._converter.reading(item) for item in items)
@@ -569,7 +597,7 @@ class Vn100:
         return readings
 
     def link(self) -> ImuLink:
-        """Return the line's counters; `packets` counts packets and lines with a valid checksum."""
+        """Return the counters of the serial line. Packets and ASCII lines are counted together."""
         parser = self._parser
         return ImuLink(
             parser.bytes_received,
@@ -583,16 +611,16 @@ class Vn100:
 
     @property
     def resets(self) -> int:
-        """Number of restarts of the unit, detected by steps back of its own time."""
+        """Number of restarts of the unit, detected by backward steps of the device time."""
         return self._converter.resets
 
     @property
     def recoveries(self) -> int:
-        """Number of times that a lost unit was found and set up again."""
+        """Number of times that a lost unit was found and configured again."""
         return self._recovery.completed
 
     def close(self) -> None:
-        """Release the line."""
+        """Close the serial port."""
         self._port.close()
 
     def _receive(self) -> list[BinaryPacket | AsciiLine]:
@@ -603,7 +631,7 @@ class Vn100:
         return items
 
     def _ask(self, question: Question) -> tuple[str, ...]:
-        """Send a command until its answer comes; return the answer's fields after the first."""
+        """Send a command with retries and return the answer's fields after the first field."""
         before = self.link()
         self._unit_error = ""
         for _ in range(self._settings.tries):
@@ -614,7 +642,7 @@ class Vn100:
         raise self._no_answer(question.text(), before)
 
     def _await(self, question: Question) -> tuple[str, ...] | None:
-        """Return the answer, or None when the time is up or the try failed."""
+        """Wait for the answer to a question and return it, None after the timeout or a transient error."""
         deadline_ns = self._clock.now_ns() + self._settings.response_timeout_ns
         while True:
             for item in self._receive():

@@ -1,15 +1,17 @@
-"""The VN-100's protocol: binary packets, ASCII sentences, and a parser of the byte stream.
+"""VN-100 protocol: binary packets, ASCII sentences, and a decoder of the byte stream.
 
-A binary packet is `FA | group byte | one u16 LE word of field bits per group | payload LE | CRC16
-big-endian` (VectorNav UM001 v2.43 section 4.3). The CRC is CRC-16/XMODEM over the bytes between the FA and
-the CRC. Units are the unit's own: gauss, degrees, m/s^2, rad/s, ns.
+A binary packet consists of the sync byte FA, a group byte, a 16-bit word of field bits per group, the payload
+and a CRC (VectorNav UM001 v2.43, section 4.3). Words and payload are little-endian, the CRC is big-endian.
+The CRC is CRC-16/XMODEM over the bytes between the sync byte and the CRC. The quantities have the units of
+the device: gauss, degrees, m/s^2, rad/s and ns.
 
-An ASCII sentence is `$VNxxx,field,...*checksum` and a line end. The checksum covers the bytes strictly
-between `$` and `*`: two hexadecimal digits are the XOR of the bytes, four are CRC-16/XMODEM, and `XX`,
-accepted by the unit only, means no checksum (section 4.2; its remark on polynomial 0x07 is an error).
+An ASCII sentence consists of `$VNxxx,field,...*checksum` and a line end (VectorNav UM001 v2.43, section 4.2).
+The checksum covers the bytes between `$` and `*`, excluding both. Two hexadecimal digits are the XOR of the
+bytes, and four digits are a CRC-16/XMODEM. The unit also accepts `XX`, which means no checksum. The remark on
+polynomial 0x07 in section 4.2 of the manual is wrong.
 
-`StreamParser` resynchronises after any garbage. A false start costs one byte only, so a valid packet behind
-or inside a broken packet is still found. Work and memory are bounded by the length of the longest candidate.
+`StreamParser` finds valid packets after or inside corrupted data, because the search continues one byte after
+an invalid candidate. Its computing time and memory are limited by the length of the longest possible packet.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from typing import Literal
 
 SYNC = 0xFA
 
-# (name, struct code) by bit. No VN-100 has groups 4 and 7 (GNSS); their sizes are not listed.
+# Each table lists the names and struct codes of a group's fields. The GNSS groups 4 and 7 are omitted.
 _COMMON = (
     ("time_startup", "Q"), ("time_gps", "Q"), ("time_sync_in", "Q"), ("yaw_pitch_roll", "3f"),
     ("quaternion", "4f"), ("angular_rate", "3f"), ("position", "3d"), ("velocity", "3f"),
@@ -55,7 +57,7 @@ _INS = (
     ("reserved_11", "68s"), ("reserved_12", "64s"),
 )  # fmt: skip
 
-# By the group's bit in the group byte.
+# The keys are the bits of the groups in the group byte.
 FIELDS: Mapping[int, tuple[tuple[str, str], ...]] = {0: _COMMON, 1: _TIME, 2: _IMU, 4: _ATTITUDE, 5: _INS}
 GROUP_NAMES: Mapping[int, str] = {0: "common", 1: "time", 2: "imu", 4: "attitude", 5: "ins"}
 
@@ -64,14 +66,14 @@ Value = float | bytes
 
 @dataclass(frozen=True, slots=True)
 class OutputLayout:
-    """OutputLayout of the packets of one output set.
+    """Layout of binary packets with a given set of output fields.
 
     Attributes:
-        header: the bytes after the sync byte: group byte and field words.
-        fields: ((group bit, field bit), ...) in the order of the payload.
-        places: field as "group.name" -> slice of the unpacked values.
-        payload: the payload's struct.
-        length: bytes of the whole packet, from sync to checksum.
+        header: bytes after the sync byte, which are group byte and field words.
+        fields: group bit and field bit of each field, in the order of the payload.
+        places: slice of the field's values in the unpacked payload, by field name "group.name".
+        payload: struct format of the payload.
+        length: length of the whole packet, from sync byte to CRC, bytes.
     """
 
     header: bytes
@@ -81,16 +83,19 @@ class OutputLayout:
     length: int
 
     def pack(self, values: Iterable[Value]) -> bytes:
-        """Return the packet with the payload `values`, flat, in the order of the fields."""
+        """Return the packet with the given payload values, listed in the order of the fields."""
         body = self.header + self.payload.pack(*values)
         return b"".join((b"\xfa", body, crc16(body).to_bytes(2, "big")))
 
 
 @dataclass(frozen=True, slots=True)
 class BinaryPacket:
-    """A packet with a valid checksum.
+    """Received binary packet with a valid checksum.
 
-    `arrival_ns` is the host's time of its last byte; `values` is the payload, flat.
+    Attributes:
+        arrival_ns: host time at which the last byte was received, ns.
+        layout: layout of the packet.
+        values: all values of the payload, in the order of the fields.
     """
 
     arrival_ns: int
@@ -98,19 +103,19 @@ class BinaryPacket:
     values: tuple[Value, ...]
 
     def __getitem__(self, field: str) -> tuple[Value, ...]:
-        """Return the values of a field named "group.name"; raises KeyError without one."""
+        """Return the values of the field "group.name". Raises KeyError if the packet lacks the field."""
         return self.values[self.layout.places[field]]
 
 
 def crc16(data: bytes) -> int:
-    """Return CRC-16/XMODEM of `data`: polynomial 0x1021, start 0, check value 0x31C3 of "123456789"."""
+    """Return the CRC-16/XMODEM of `data` (polynomial 0x1021, initial value 0)."""
     return crc_hqx(data, 0)
 
 
 def layout_of(words: Mapping[int, int]) -> OutputLayout:
-    """Return the layout of field words by group bit, {0: 0x0131, 2: 0x0100}.
+    """Return the packet layout for the given field words by group bit, such as {0: 0x0131, 2: 0x0100}.
 
-    Raises ValueError for a group or a field that is not in the tables.
+    Raises ValueError for an unknown group or field.
     """
     groups = sum(1 << bit for bit in words)
     header = struct.pack(f"<B{len(words)}H", groups, *(words[bit] for bit in sorted(words)))
@@ -121,7 +126,7 @@ def layout_of(words: Mapping[int, int]) -> OutputLayout:
 
 
 def header_length(group_byte: int) -> int:
-    """Return the length of group byte and field words; 0 when no known unit sends this group byte."""
+    """Return the length (bytes) of group byte and field words, 0 for an unsupported group byte."""
     if group_byte == 0 or any(group_byte >> bit & 1 and bit not in FIELDS for bit in range(8)):
         return 0
     return 1 + 2 * group_byte.bit_count()
@@ -129,7 +134,7 @@ def header_length(group_byte: int) -> int:
 
 @lru_cache(maxsize=256)
 def layout_of_header(header: bytes) -> OutputLayout | None:
-    """Return the layout of `header` (group byte and its field words); None when there is none."""
+    """Return the packet layout for a header (group byte and field words), None for an invalid header."""
     if not header:
         return None
     bits = [bit for bit in range(8) if header[0] >> bit & 1]
@@ -177,7 +182,13 @@ ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """One sentence: `command` is the part after `$VN` ("QMR"), `fields` the rest, as text."""
+    """ASCII sentence of the VN-100.
+
+    Attributes:
+        command: command name after `$VN`, such as "QMR".
+        fields: fields of the sentence as text.
+        checksum: type of the checksum.
+    """
 
     command: str
     fields: tuple[str, ...]
@@ -186,7 +197,13 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class AsciiLine:
-    """A sentence with a valid checksum; `arrival_ns` is the host's time of its last byte."""
+    """Received ASCII sentence with a valid checksum.
+
+    Attributes:
+        arrival_ns: host time at which the last byte was received, ns.
+        length: length of the line, bytes.
+        sentence: decoded sentence.
+    """
 
     arrival_ns: int
     length: int
@@ -195,10 +212,13 @@ class AsciiLine:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """The values of an asynchronous VNQMR or VNYMR line, in the unit's own units.
+    """Measured values in an asynchronous VNQMR or VNYMR line.
 
-    `attitude` is (q0, q1, q2, q3), scalar last, or (yaw, pitch, roll) in degrees; `mag` gauss, `accel` m/s^2,
-    `gyro` rad/s.
+    Attributes:
+        attitude: quaternion (q0, q1, q2, q3), scalar last, or yaw, pitch and roll, deg.
+        mag: magnetic field, gauss.
+        accel: acceleration, m/s^2.
+        gyro: angular rate, rad/s.
     """
 
     attitude: tuple[float, ...]
@@ -213,7 +233,7 @@ def xor8(data: bytes) -> int:
 
 
 def build(command: str, *fields: object, checksum: Checksum = "crc16") -> bytes:
-    """Return the sentence `$VN<command>,<fields>*<checksum>` with its line end."""
+    """Return the line `$VN<command>,<fields>*<checksum>` with a line end."""
     body = ",".join(("VN" + command, *map(str, fields))).encode("ascii")
     digits = "XX"
     if checksum != "none":
@@ -222,12 +242,13 @@ def build(command: str, *fields: object, checksum: Checksum = "crc16") -> bytes:
 
 
 def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
-    """Return the sentence of a whole line, or None if the line is not a sentence or its checksum fails.
+    """Return the sentence in a line, None if the line is not a sentence or has a wrong checksum.
 
-    `XX` instead of a checksum is accepted only with `allow_none`: a unit never sends it.
+    The placeholder `XX` instead of a checksum is accepted only if `allow_none` is true. A unit never sends
+    `XX`.
     """
     text = line.rstrip(b"\r\n")
-    body, star, digits = text[1:].partition(b"*")  # a sentence has one star
+    body, star, digits = text[1:].partition(b"*")  # a sentence contains exactly one star
     if not (text.startswith(b"$VN") and star and body.isascii() and len(body) >= 5):
         return None
     checksum = _verify(body, digits, allow_none)
@@ -240,7 +261,7 @@ def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
 def _verify(body: bytes, digits: bytes, allow_none: bool) -> Checksum | None:
     if allow_none and digits == b"XX":
         return "none"
-    # bytes.isalnum excludes what int() accepts besides digits: a sign, an underscore, blanks.
+    # The function int() also accepts signs, underscores and blanks, which isalnum() excludes.
     if len(digits) not in {2, 4} or not digits.isalnum():
         return None
     try:
@@ -253,10 +274,10 @@ def _verify(body: bytes, digits: bytes, allow_none: bool) -> Checksum | None:
 
 
 def measurement(sentence: Sentence) -> Measurement | None:
-    """Return the values of a VNQMR or VNYMR sentence; None for other sentences and for unreadable numbers.
+    """Return the values of a VNQMR or VNYMR sentence, None for other sentences and for invalid numbers.
 
-    Trailing `T...` and `S...` fields (register 30: count and status) are ignored. A value may be NaN or
-    infinite as the unit sent it; the driver rejects those.
+    Trailing fields that begin with T or S (count and status, see register 30) are ignored. NaN and infinite
+    values are returned, and the driver rejects them.
     """
     heads = {"QMR": 4, "YMR": 3}.get(sentence.command)
     if heads is None or len(sentence.fields) < heads + 9:
@@ -272,9 +293,9 @@ def measurement(sentence: Sentence) -> Measurement | None:
 
 
 def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
-    """Return (code, meaning) of a `$VNERR` sentence, None for any other.
+    """Return the code and meaning of a `$VNERR` sentence, None for other sentences.
 
-    The code is hexadecimal; an unreadable one counts as -1.
+    The code is -1 if the sentence does not contain a valid hexadecimal code.
     """
     if sentence.command != "ERR":
         return None
@@ -285,10 +306,10 @@ def error_meaning(sentence: Sentence) -> tuple[int, str] | None:
     return code, ERRORS.get(code, "an error without a published meaning")
 
 
-LONGEST_LINE = 256  # the unit's own receive buffer; its longest answer (register 83) has about 100
+LONGEST_LINE = 256  # bytes; receive buffer of the unit (longest answer: about 100 bytes)
 
 _START = re.compile(rb"[\xfa$]")
-# A `$` inside ends the candidate, so that a cut line cannot swallow the next one.
+# A `$` ends a candidate line, so that the line after a truncated line is still found.
 _LINE = re.compile(rb"\$VN[\x20-\x23\x25-\x7e]{0,%d}\r?\n" % (LONGEST_LINE - 5))
 _LINE_BEGUN = re.compile(rb"\$(?:V(?:N[\x20-\x23\x25-\x7e]{0,%d}\r?)?)?" % (LONGEST_LINE - 5))
 
@@ -298,19 +319,22 @@ _INCOMPLETE = -1
 
 
 class StreamParser:
-    """Splits the line's bytes into binary packets and ASCII lines, and counts the rest.
+    """Decoder that extracts binary packets and ASCII lines from received bytes.
 
     Attributes:
-        bytes_received: all bytes fed.
-        packets: packets and lines with a valid checksum.
-        bad_checksum: complete packets and lines whose checksum failed.
-        discarded_bytes: bytes outside valid packets and lines.
+        bytes_received: number of received bytes.
+        packets: number of packets and lines with a valid checksum.
+        bad_checksum: number of complete packets and lines with a wrong checksum.
+        discarded_bytes: number of bytes outside valid packets and lines.
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
-        """Parse with `byte_ns`, the time of a byte on the wire, and packets of at most `longest` bytes.
+        """Prepare the decoder.
 
-        A small `longest` prevents a false start in noise from delaying the next good packet.
+        Args:
+            byte_ns: transmission time of one byte on the serial line, ns.
+            longest: maximum length of a packet, bytes; a small value avoids that noise which looks like the
+                start of a long packet delays the next valid packet.
         """
         self.byte_ns = byte_ns
         self.bytes_received = 0
@@ -322,10 +346,14 @@ class StreamParser:
         self._previous_ns = _LONG_AGO_NS
 
     def feed(self, arrival_ns: int, data: bytes) -> list[BinaryPacket | AsciiLine]:
-        """Accept a chunk whose last byte arrived at `arrival_ns`; return what it completed, oldest first.
+        """Return the packets and lines that are completed by received data, oldest first.
 
-        An item that ends inside the chunk arrived earlier by the bytes behind it, but not before the
-        previous chunk.
+        The arrival time of a packet or line is corrected for the transmission time of the bytes that follow
+        it in `data`, but is never earlier than the arrival of the previous data.
+
+        Args:
+            arrival_ns: host time at which the last byte of `data` was received, ns.
+            data: received bytes.
         """
         self.bytes_received += len(data)
         buffer = self._buffer
@@ -359,7 +387,7 @@ class StreamParser:
         return found
 
     def _span(self, position: int) -> int:
-        """Return the length of the candidate at `position`, or _FALSE, or _INCOMPLETE."""
+        """Return the length (bytes) of the candidate at offset `position`, or _FALSE, or _INCOMPLETE."""
         if self._buffer[position] == SYNC:
             return self._packet_span(position)
         line = _LINE.match(self._buffer, position)
@@ -386,7 +414,7 @@ class StreamParser:
             sentence = parse(raw)
             if sentence is not None:
                 return AsciiLine(arrival_ns, span, sentence)
-        # The CRC over a valid packet including its checksum is zero.
+        # The CRC over a valid packet including its own CRC is zero.
         elif crc16(raw[1:]) == 0:
             header = raw[1 : 1 + HEADER_LENGTHS[raw[1]]]
             layout = layout_of_header(header)
