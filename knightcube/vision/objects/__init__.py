@@ -1,6 +1,6 @@
-"""Resident space objects in an image of stars (Sease chapter 4).
+"""Detection of resident space objects in images of stars (Sease, chapter 4).
 
-`detect` finds objects among streaks by their motion and tests with `star_light` whether stars explain their
-pixels; `streak_ends` measures the ends of streaks. `measure` gives the directions of possible objects in
-images whose stars are streaks or points.
+`detect` finds objects among the streaks of an image by their motion, and tests with `star_light` whether
+stars explain the pixels. `streak_ends` measures the two ends of streaks. `measure` gives the directions of
+possible objects in images whose stars are streaks or points.
 """

@@ -1,23 +1,25 @@
-"""Resident space objects among the star streaks of one image (Sease chapter 4).
+"""Detection of resident space objects among the star streaks of one image (Sease, chapter 4).
 
     found = detect_objects(image, camera, rate, exposure)
 
-In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak
-belongs to something else: its chord misses the common centre of rotation, it subtends another angle there, or
-it leaves a residual in OLAE (Sease 4.11-4.15, corrected). If the axis is nearly normal to the boresight, the
-centre recedes to infinity, and slope and length of the chord replace centre and angle. The projection of a
-pinhole changes slopes and lengths across a wide field by far more than their errors. Each indicator is
-therefore compared with a star at the same position, in units of the expected error of an endpoint. The strict
-rule of 2.5 sigma lacks lower bounds (text at Table 4.4); the bounds here are the measured spread without an
-object.
+In camera axes, all stars rotate about the same axis by the same angle. Three indicators show that a streak is
+not a star: the bisector of its chord misses the common centre of rotation, the streak subtends a different
+angle at this centre, or its OLAE residual is large (Sease, eq. (4.11) to (4.15), with corrections; OLAE is
+the Optimal Linear Attitude Estimator). If the rotation axis is nearly normal to the boresight, the centre
+recedes to infinity, and the chord's slope and length are used instead of centre and angle. In a wide field,
+the pinhole projection changes slopes and lengths by far more than their errors. Each indicator is therefore
+compared with that of a star at the same position, in units of the expected error of an endpoint. The rule of
+Sease, a threshold of 2.5 standard deviations over the streaks (text at Table 4.4), is used together with a
+minimum threshold for each indicator, which was measured in images without objects.
 
-A deviating streak is not yet an object: two stars whose streaks overlap, or a segment of a faint star's
-streak, deviate as well (Table 4.4: "overlapping streak"). `Judge` therefore tests whether stars explain the
-pixels (`star_light`). Regions with more than two corners, which the thesis discards, may be stars or an
-object that crosses a star. Bright points in an image whose stars are streaks are tracked objects (Figure
-4.5). Regions that are saturated or otherwise deviate, or in which objects and stars are merged, are searched
-after their stars are removed. The search needs only the rotation of the camera. The maximum-likelihood
-estimate of that rotation succeeds in more images than the corners' estimate and is more accurate.
+A streak with a large indicator may also be two stars whose streaks overlap, or a segment of a faint star's
+streak ("overlapping streak" in Sease, Table 4.4). `Judge` therefore tests whether stars explain the pixels
+(`star_light`). Regions with more than two corners, which Sease discards, may be stars or an object that
+crosses a star. Bright points in an image whose stars are streaks are objects that the camera tracks (Sease,
+Figure 4.5). Saturated regions, regions with large indicators, and regions that merge objects and stars are
+searched after their stars are removed. The search needs only the rotation of the camera during the exposure.
+The maximum-likelihood estimate of the rotation from the streaks is more accurate than an estimate from the
+corners, and succeeds in more images.
 """
 
 from __future__ import annotations
@@ -56,7 +58,7 @@ from knightcube.vision.objects.streak_ends import (
 )
 
 INDICATORS = ("centre", "displacement", "residual")
-"""Names of the three indicators."""
+"""Names of the three indicators that a streak is not a star."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +66,12 @@ class Indicators:
     """The three indicators of n streaks, in the order of `INDICATORS`.
 
     Attributes:
-        endpoints: ends of the streaks (n, 2, 2), px, in the order of time in which a star would have moved.
-        deviations: deviations from a star at the same position (n, 3), in standard deviations.
-        fired: which deviations exceed their thresholds (n, 3).
-        centre: centre of rotation (2,), px, by least squares; meaningless if `degenerate`.
-        degenerate: whether slope and length replace centre and angle.
+        endpoints: ends of the streaks (n, 2, 2), px, in the order in which a star would have passed them.
+        deviations: differences of the indicators from those of a star at the same position (n, 3), in
+            standard deviations.
+        fired: which indicators exceed their thresholds (n, 3).
+        centre: centre of rotation in the image by least squares (2,), px; meaningless if `degenerate`.
+        degenerate: whether slope and length of the chords are used instead of centre and angle.
     """
 
     endpoints: FloatArray
@@ -79,33 +82,40 @@ class Indicators:
 
 
 def centre_residuals(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the distances (n,), px, of a centre (2,) from the bisectors of chords, by 4.11-4.13."""
+    """Return the distances (n,), px, of a centre (2,) from the bisectors of chords (n, 2, 2), px.
+
+    Source: Sease, eq. (4.11) to (4.13).
+    """
     chord = endpoints[:, 1] - endpoints[:, 0]
     missed = np.sum(chord * (centre - endpoints.mean(axis=1)), axis=-1)
     return np.asarray(missed / np.maximum(np.linalg.norm(chord, axis=-1), np.finfo(float).tiny))
 
 
 def slopes(endpoints: FloatArray) -> FloatArray:
-    """Return the directions (n,), rad, of chords (n, 2, 2) in the image."""
+    """Return the directions (n,), rad, of chords (n, 2, 2), px, in the image."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.asarray(np.arctan2(chord[:, 1], chord[:, 0]))
 
 
 def angular_displacements(endpoints: FloatArray, centre: FloatArray) -> FloatArray:
-    """Return the angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,), by 4.14."""
+    """Return the angles (n,), rad, that streaks (n, 2, 2) subtend at a centre (2,) (Sease, eq. (4.14))."""
     first, second = endpoints[:, 0] - centre, endpoints[:, 1] - centre
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    # The arc cosine would be inaccurate for small angles.
+    # The arc tangent is used, because the arc cosine is inaccurate for small angles.
     return np.asarray(np.arctan2(np.abs(cross), np.sum(first * second, axis=-1)))
 
 
 def lengths(endpoints: FloatArray) -> FloatArray:
-    """Return the lengths (n,), px, of chords (n, 2, 2), by 4.15."""
+    """Return the lengths (n,), px, of chords (n, 2, 2), px (Sease, eq. (4.15))."""
     return np.asarray(np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1))
 
 
 def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the norms (n,) of the OLAE residuals of directions (n, 2, 3), first and second, by 4.7."""
+    """Return the norms (n,) of the OLAE residuals of streaks (Sease, eq. (4.7)).
+
+    The streaks are given by the unit vectors to their first and last ends (n, 2, 3), and `rotation` (3,),
+    rad, is the camera's rotation vector.
+    """
     angle = float(np.linalg.norm(rotation))
     scale = np.tan(0.5 * angle) / angle if angle > 0.0 else 0.5
     sums, differences = vectors[:, 0] + vectors[:, 1], vectors[:, 1] - vectors[:, 0]
@@ -113,10 +123,10 @@ def olae_residuals(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the first and last directions (n, 2, 3) of stars whose chords have the midpoints of `vectors`.
+    """Return the first and last directions (n, 2, 3) of stars with the same chord midpoints as `vectors`.
 
-    The midpoint of a chord lies inside of the circle: its component normal to the axis is too short by the
-    cosine of half the rotation angle.
+    A star moves on a circle about the axis, and the midpoint of its chord is nearer to the axis than the
+    circle by the cosine of half the rotation angle.
     """
     angle = float(np.linalg.norm(rotation))
     middle = vectors.mean(axis=1)
@@ -129,9 +139,8 @@ def star_ends(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
     return np.stack([middle @ half.T for half in halves], axis=1)
 
 
-# Distance of the centre of rotation from the boresight, in focal lengths, beyond which it is degenerate. The
-# axis of the rotation decides, because the centre by least squares is too near: its errors and the projection
-# make parallel chords intersect.
+# Distance of the rotation centre from the boresight, in focal lengths, beyond which it is degenerate.
+# The rotation axis decides, because errors make a least-squares centre appear nearer than it is.
 _FARTHEST_CENTRE = 3.0
 
 
@@ -143,15 +152,15 @@ def evaluate(
     bounds: tuple[float, float, float],
     strict: float = 2.5,
 ) -> Indicators:
-    """Return the indicators of streaks under the rotation that the stars share.
+    """Return the indicators of streaks for a given rotation of the camera.
 
     Args:
-        endpoints: ends of the streaks (n, 2, 2), px, without bias, in any order.
-        sigma: expected errors of an endpoint (n,), px.
-        rotation: rotation of the camera over the exposure (3,), rad, camera axes.
-        pinhole: the camera.
-        bounds: least deviations at which each indicator fires.
-        strict: robust standard deviations within the image that must be exceeded too, as in the thesis.
+        endpoints: ends of the streaks (n, 2, 2), px, corrected for bias, in any order.
+        sigma: expected standard deviation of the endpoints of each streak (n,), px.
+        rotation: rotation of the camera during the exposure (3,), rad, camera axes.
+        pinhole: camera that took the image.
+        bounds: minimum thresholds of the three indicators, in expected standard deviations.
+        strict: threshold of the indicators in robust standard deviations over the streaks of the image.
     """
     vectors = pinhole.unit_vectors(endpoints)
     stars = star_ends(vectors, rotation)
@@ -166,7 +175,7 @@ def evaluate(
     normal_to_boresight = float(np.hypot(rotation[0], rotation[1])) > _FARTHEST_CENTRE * abs(rotation[2])
     degenerate = normal_to_boresight or not np.all(np.isfinite(centre))
     length = lengths(endpoints)
-    # The differences from a star are in px across and along the streak at one end.
+    # The differences from a star are displacements (px) of one end across and along the streak.
     if degenerate:
         across = np.sin(slopes(endpoints) - slopes(expected)) * length
         along = length - lengths(expected)
@@ -178,14 +187,14 @@ def evaluate(
     deviations = np.stack([across / error, along / error, residual], axis=-1)
     fired = np.zeros((0, 3), dtype=np.bool_)
     if len(deviations):
-        # The median absolute deviation is used, because an object increases the standard deviation.
-        # Of ten streaks, none can exceed 2.85 standard deviations.
+        # The median absolute deviation is used, because an object itself increases the standard deviation.
+        # For this reason, no value among ten can exceed 2.85 standard deviations of the ten values.
         spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
         fired = np.abs(deviations) > np.maximum(bounds, strict * spread)
     return Indicators(endpoints, deviations, fired, centre, degenerate)
 
 
-# Length (px) below which a bright part of a region is a point.
+# Length (px) below which the bright part of a region counts as a point.
 _LEAST_LINE_PX = 4.0
 
 
@@ -196,10 +205,11 @@ def short_regions(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return the bright regions that are too short for corners, where stars would not be short.
+    """Return bright regions that are shorter than the streak of a star at the same position.
 
-    The result is their ends (n, 2, 2), px, errors (n,), px, and labels (n,). The ends are those of the
-    uniform line with the moments of the region's bright part; both ends of a point are equal.
+    The result is the ends of the regions (n, 2, 2), px, their standard deviations (n,), px, and the labels of
+    the regions (n,). The ends are those of the uniform line with the same moments as the region's bright
+    part. Both ends of a point are equal.
     """
     regions = segmented.regions
     noise = segmented.background.typical_noise
@@ -215,24 +225,28 @@ def short_regions(
     for (top, bottom, left, right), label in zip(short.boxes, short.label, strict=True):
         row, column = positions(short.labels[top:bottom, left:right] == label)
         weight = segmented.signal[row + top, column + left].astype(float)
-        # Only pixels above half of the maximum are used, so that a faint streak does not lengthen a point.
+        # Pixels below half the maximum are excluded, because a faint star's streak would lengthen a point.
         bright = weight >= 0.5 * weight.max()
         points = np.stack([column + left, row + top], axis=-1)[bright].astype(float)
         weight = weight[bright] / weight[bright].sum()
         centre = weight @ points
         offset = points - centre
-        # If the region is smaller than the point spread, the moments are dominated by noise.
+        # A line shorter than the PSF becomes a point, because noise dominates the moments.
         lines.append(line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX))
     ends = np.array(lines).reshape(-1, 2, 2)
     sigma = np.hypot(1.0, expected_sigma(short, segmented.background, settings))
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
-    # Near the axis of rotation, the images of stars are points too.
+    # Near the axis of rotation, stars are also points, so regions there are excluded.
     streaked: BoolArray = np.linalg.norm(expected[:, 1] - expected[:, 0], axis=-1) >= settings.least_length
     return ends[streaked], sigma[streaked], short.label[streaked]
 
 
 class Verdict(Enum):
-    """The verdict on a streak: a star by its indicators, stars by its pixels, an object, or undecided."""
+    """Classification of a streak or region.
+
+    STAR means that the indicators agree with a star, STARS that stars explain the pixels, OBJECT that an
+    object is present, and UNCLEAR that neither stars nor an object explain the pixels.
+    """
 
     STAR = "star"
     STARS = "stars"
@@ -245,13 +259,15 @@ class SpaceObject:
     """A streak or point that does not move as the stars do.
 
     Attributes:
-        endpoints: ends (2, 2), px, in the order of time for which the motion among the stars is slower.
-        fired: names of the indicators that fired; empty if the object was found by its pixels alone.
-        flux: light, counts.
-        improvement: gain in chi-square over stars alone.
-        relative_rate: angular rate of its motion among the stars, rad/s.
-        direction: direction of that motion in the image at mid-exposure, unit vector (2,), x and y.
-        other_relative_rate: rate for the other order of the endpoints, which one image cannot exclude, rad/s.
+        endpoints: ends of the object's streak (2, 2), px, in the order for which the motion relative to the
+            stars is slower.
+        fired: names of the indicators that exceed their thresholds; empty if only the pixels show the object.
+        flux: flux of the object, counts.
+        improvement: decrease of chi-square if the object is added to the stars.
+        relative_rate: angular rate of the object relative to the stars, rad/s.
+        direction: direction of the motion relative to the stars, a unit vector (x, y) in the image.
+        other_relative_rate: angular rate relative to the stars for the reverse order of the ends, rad/s; one
+            image does not show the order.
     """
 
     endpoints: FloatArray
@@ -265,14 +281,14 @@ class SpaceObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectReport:
-    """The examined streaks and the objects among them.
+    """The examined streaks of an image and the objects among them.
 
     Attributes:
-        indicators: indicators of all streaks with two ends, then of the short regions.
-        verdicts: verdict on each streak and each short region.
-        crowded: verdicts on the regions with more than two corners.
-        objects: the objects, the brightest first.
-        rotation: the rotation that was used (3,), rad, camera axes.
+        indicators: indicators of the streaks with two ends, followed by those of the short regions.
+        verdicts: classification of each streak with two ends, followed by those of the short regions.
+        crowded: classification of each region with more than two corners.
+        objects: the objects found, the brightest first.
+        rotation: rotation of the camera that the search assumed (3,), rad, camera axes.
     """
 
     indicators: Indicators
@@ -282,17 +298,26 @@ class ObjectReport:
     rotation: FloatArray
 
 
-# Distance (px) below which two corners are one corner that was found twice.
+# Distance (px) below which two corners count as the same corner, found twice.
 _LEAST_CROSSING_PX = 10.0
-# Largest distance (px) of the fitted ends of a star from those that the rotation predicts.
+# Largest distance (px) between fitted ends and the predicted ends of a star for which they count as a star.
 _FITTED_PX = 1.0
-# Distance (px) from the border beyond which a region ends inside of the image.
+# Minimum distance (px) of a region from the border of the image for its ends to be inside the image.
 _BORDER_PX = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """Distinguishes objects from stars by their pixels; the camera rotates by `rotation` (3,), rad."""
+    """Distinguishes objects from stars by their pixels.
+
+    Attributes:
+        segmented: segmented frame.
+        rotation: rotation of the camera during the exposure (3,), rad, camera axes.
+        pinhole: camera that took the frame.
+        exposure: exposure time, s.
+        settings: settings of the segmentation and of the ends of streaks.
+        objects: thresholds of the search for objects.
+    """
 
     segmented: Segmented
     rotation: FloatArray
@@ -302,7 +327,10 @@ class Judge:
     objects: ObjectSettings
 
     def streak(self, ends: FloatArray, fired: tuple[str, ...]) -> tuple[Verdict, SpaceObject | None]:
-        """Return the verdict on a streak or point for which the named indicators fired."""
+        """Classify a streak or point; `fired` names the indicators that exceed their thresholds.
+
+        If it is an object, the object is returned too.
+        """
         if not fired:
             return Verdict.STAR, None
         try:
@@ -315,7 +343,7 @@ class Judge:
         return self._stars_or_unclear(light), None
 
     def crowd(self, corners: FloatArray) -> tuple[Verdict, SpaceObject | None]:
-        """Return the verdict on a region with more than two corners (k, 2), px."""
+        """Classify a region with more than two corners (k, 2), px, and return its object, if any."""
         if len(corners) > self.objects.most_corners:
             return Verdict.UNCLEAR, None
         pairs = np.array([corners[list(pair)] for pair in itertools.combinations(range(len(corners)), 2)])
@@ -323,7 +351,7 @@ class Judge:
         lines = extend(pairs, chord_outward(pairs), self.settings.endpoint_bias) if len(pairs) else pairs
         try:
             light = self._light(corners)
-            # A line cannot improve chi-square by more than its excess over the number of pixels.
+            # A line reduces chi-square by at most about its excess over the number of pixels.
             hopeless = light.chi_square - light.pixels < self.objects.improvement
             tried = [] if hopeless else [(ends, light.explain(ends)) for ends in lines]
         except FlightError:
@@ -337,9 +365,10 @@ class Judge:
         return self._stars_or_unclear(light), None
 
     def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
-        """Return the objects in regions whose labels are not `settled`; `strange` labels are tried first.
+        """Return the objects in regions in which objects and stars may be merged.
 
-        The light of the stars in a region is removed, and the brightest remainder is tested.
+        The stars of each region are removed, and the brightest remainder is tested. Regions with a label in
+        `settled` are not examined. Regions with a label in `strange` are examined first.
         """
         regions = self.segmented.regions
         noise = self.segmented.background.typical_noise
@@ -370,7 +399,10 @@ class Judge:
         return objects
 
     def _remaining_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
-        """Return the object between `ends` (2, 2), px, beside stars on known paths; None if there is none."""
+        """Return the object between `ends` (2, 2), px, or None if stars explain the pixels.
+
+        `stars` holds the paths of known stars nearby.
+        """
         if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
             return None
         try:
@@ -395,10 +427,10 @@ class Judge:
         )
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float) -> bool:
-        """Return whether an object explains enough, most of the light that stars leave, and fits."""
+        """Return whether an object improves chi-square enough and explains the pixels along its streak."""
         enough = light.chi_square - found.chi_square >= improvement
         most = found.misfit <= 0.5 * found.misfit_of_stars
-        # A saturated point has a position error of 0.1 px, so that its wings do not fit within their noise.
+        # A saturated point has a position error of 0.1 px, so that residuals in its wings exceed the noise.
         fits = found.misfit <= max(self.objects.worst_fit, 0.1 * found.misfit_of_stars)
         return enough and most and fits
 
@@ -406,7 +438,7 @@ class Judge:
         return Verdict.STARS if light.chi_square <= self.objects.worst_fit * light.pixels else Verdict.UNCLEAR
 
     def _moves_like_a_star(self, ends: FloatArray, within: float = 2.0) -> bool:
-        """Return whether ends (2, 2), px, lie `within` that many px of the ends of a star."""
+        """Return whether ends (2, 2), px, lie within `within` px of the predicted ends of a star."""
         star = self.pinhole.project(star_ends(self.pinhole.unit_vectors(ends[None]), self.rotation))[0]
         missed = min(np.abs(star - ends).max(), np.abs(star[::-1] - ends).max())
         return bool(missed < within)
@@ -414,7 +446,7 @@ class Judge:
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
     ) -> SpaceObject:
-        """Return the object between `ends`, in the order of time with the slower motion among the stars."""
+        """Return the object between `ends`, ordered so that its motion relative to the stars is slower."""
         rate, direction = self._among_stars(ends)
         other, other_direction = self._among_stars(ends[::-1])
         if other < rate:
@@ -423,10 +455,10 @@ class Judge:
         return SpaceObject(ends, fired, found.flux, improvement, rate, direction, other)
 
     def _among_stars(self, ends: FloatArray) -> tuple[float, FloatArray]:
-        """Return rate, rad/s, and direction (2,) in the image of a motion from the first end to the second.
+        """Return the rate, rad/s, and the image direction (2,) of a motion relative to the stars.
 
-        Both ends are propagated to mid-exposure as stars would be. Their remaining difference is the motion
-        of the object.
+        The motion leads from the first of the `ends` to the second. Both ends are rotated to mid-exposure as
+        if they were stars; the remaining difference is the motion relative to the stars.
         """
         middle = at_mid_exposure(self.pinhole.unit_vectors(ends), self.rotation)
         angle = np.arctan2(np.linalg.norm(np.cross(middle[0], middle[1])), middle[0] @ middle[1])
@@ -434,7 +466,7 @@ class Judge:
         return float(angle) / self.exposure, np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
 
 
-# Deviation (standard deviations) above which a streak is searched for a merged object.
+# Indicator of a streak, in standard deviations, above which its region is searched for merged objects.
 _STRANGE = 5.0
 
 
@@ -446,10 +478,10 @@ def detect(
     settings: EndpointSettings,
     objects: ObjectSettings,
 ) -> ObjectReport | None:
-    """Return the report on an image (rows, columns); None if it has too few streaks.
+    """Search an image (rows, columns) for objects and return a report; None if it has too few streaks.
 
-    The camera rotates by `rotation` (3,), rad, in `exposure` s. If the sign of the rotation is unknown, all
-    directions of motion are known up to one common reversal.
+    The camera rotates by `rotation` (3,), rad, during the `exposure`, s. If the sign of the rotation is
+    unknown, all directions of motion may be reversed together.
     """
     segmented = segment_frame(pixels, replace(settings, most_streaks=objects.most_streaks))
     streaks = measure_streaks(segmented, settings)
@@ -471,7 +503,10 @@ def detect(
 
 
 def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Streaks) -> ObjectReport:
-    """Return the verdicts on the streaks of `indicators`, in regions `labels` (n,), and on crowds."""
+    """Classify all streaks and crowded regions of an image, and return the report.
+
+    `labels` (n,) holds the region labels of the streaks in `indicators`.
+    """
     found: list[SpaceObject] = []
     settled: list[int] = []
     strange: list[int] = []
@@ -496,13 +531,13 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DetectedObjects:
-    """The objects in one image, the brightest first. The result is true if there is an object.
+    """The objects in one image, which are true in a condition if there is at least one object.
 
     Attributes:
-        objects: the n objects.
-        directions: directions at mid-exposure (n, 3), unit vectors in camera axes.
-        covariance: covariance of their errors (n, 3, 3), rad^2, zero along the direction.
-        reason: why the image could not be searched; empty if it was searched, with or without a result.
+        objects: the n objects, the brightest first.
+        directions: unit vectors to the objects at mid-exposure (n, 3), camera axes.
+        covariance: covariances of the directions (n, 3, 3), rad^2, zero along each direction.
+        reason: why the image could not be searched; empty if it was searched.
     """
 
     objects: tuple[SpaceObject, ...]
@@ -511,7 +546,7 @@ class DetectedObjects:
     reason: str = ""
 
     def __bool__(self) -> bool:
-        """Return whether there is an object."""
+        """Return whether the image shows an object."""
         return len(self.objects) > 0
 
 
@@ -522,22 +557,22 @@ def detect_objects(
     exposure: float,
     settings: ObjectSettings | None = None,
 ) -> DetectedObjects:
-    """Return the objects that do not move as the stars do, in an image whose stars are streaks.
+    """Return the objects in an image whose stars are streaks, which are objects that move unlike the stars.
 
     Args:
         image: pixel values (rows, columns) of an unsigned integer type, with streaks of 20 px or more.
-        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size. The
-            distortion of a lens is neglected.
-        rate: angular velocity of the camera with respect to inertial space (3,), camera axes, rad/s, for
-            instance from the streaks of the image. If its sign is unknown, all motions are known up to one
-            reversal.
+        camera: camera model of the image, a `Pinhole` or `Lens` of `knightcube.vision.camera.lens`. The
+            search neglects the distortion of a lens.
+        rate: angular velocity of the camera relative to inertial space (3,), camera axes, rad/s, for instance
+            from the streaks of the image. If the sign of the rate is unknown, all motions of objects may be
+            reversed together.
         exposure: exposure time, s.
-        settings: thresholds, gain and saturation; None: the defaults.
+        settings: thresholds, gain and saturation; None for the defaults.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
 
-    Source: Sease 2013, chapter 4, with the errata; the tests of the pixels are this project's.
+    Source: Sease 2013, chapter 4, as corrected in the errata. The tests of the pixels are not from Sease.
     """
     settings = ObjectSettings() if settings is None else settings
     check_image(image, camera)
@@ -547,8 +582,8 @@ def detect_objects(
     objects = () if report is None else report.objects
     middles = np.array([item.endpoints.mean(axis=0) for item in objects]).reshape(-1, 2)
     directions = camera.unit_vectors(middles)
-    # Off the boresight a pixel subtends a smaller angle; the larger one of the boresight is used.
+    # A pixel subtends the largest angle on the boresight; this angle is used for all directions.
     sigma = settings.streak_sigma / camera.focal_length
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    reason = f"fewer than {ends.least_streaks} streaks stand out of the noise" if report is None else ""
+    reason = f"fewer than {ends.least_streaks} significant streaks" if report is None else ""
     return DetectedObjects(objects, directions, sigma**2 * across, reason)

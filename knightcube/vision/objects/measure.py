@@ -1,15 +1,16 @@
-"""Directions of possible objects in an image whose attitude the stars determine.
+"""Directions of possible objects in an image whose attitude is determined from the stars.
 
-If the stars are streaks, `detect` finds objects by indicators and pixels. If the stars are points, an object
-is a point or a short streak too. Every area of light that stands well above the noise and is not at the
-position of a catalogue star may be an object, and so may light beside a star that the star does not explain.
-One image does not show which of these candidates moves; tracks over several images do.
+If the stars are streaks, `detect` finds objects by their motion and their pixels. If the stars are points, an
+object is also a point or a short streak. In this case, a possible object is an area of light that is
+significantly brighter than the noise and not at the position of a catalogue star, or light beside a star that
+the star does not explain. One image does not show which of the possible objects move relative to the stars;
+tracks over several images show this.
 
-All pixels of an object are fitted together with the known stars nearby. An object is a short trail of
-constant brightness with the camera's point spread. Gauss-Newton fits position, extent and brightness of the
-object, the sky, and the brightness of each star, weighted by the noise of the fitted light. Saturated pixels
-are excluded: they would shift a centre of light by 0.03 px. The covariance is that of the fit, increased if
-the residuals exceed the noise.
+The pixels of each object are fitted together with the known stars nearby. An object is modelled as a short
+trail of constant brightness, blurred by the camera's point spread function (PSF). A Gauss-Newton iteration
+fits the position, extent and brightness of the object, the sky level and the brightness of each star,
+weighted by the noise of the modelled light. Saturated pixels are excluded, because they would displace a
+centroid by 0.03 px. The covariance of the fit is increased if the residuals exceed the noise.
 """
 
 from __future__ import annotations
@@ -31,20 +32,26 @@ from knightcube.vision.startracker.solve import FrameSolution
 from knightcube.vision.streaks.streak_result import MotionResult
 
 _REACH = 5.0
-"""Half size of an object's patch, in sigmas of the point spread."""
+"""Half-width of an object's patch beyond the object, in standard deviations of the PSF."""
 _STEP_PX = 0.7
-"""Distance (px) of the points that make up a trail."""
+"""Distance (px) between the points that model a trail."""
 _ROUNDS, _CONVERGED = 12, 1e-4
-"""Largest number of steps, and the step (px) that ends the iteration."""
+"""Maximum number of Gauss-Newton steps, and the step (px) below which the iteration ends."""
 _EXTENT = 2.0
-"""Prior standard deviation (px) of the half extent relative to its first guess."""
+"""Prior standard deviation (px) of an object's half extent, about its initial guess."""
 STAR_SIGMA = 0.3
-"""Relative error of a star's brightness by the catalogue, whose colour band differs."""
+"""Relative error of a star's catalogue brightness, due to the different passband of the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trails:
-    """Straight trails of n stars: `middle` and `half` extent (n, 2), px, and `flux` (n,), counts."""
+    """Straight trails of n stars in an image.
+
+    Attributes:
+        middle: middles of the trails (n, 2), px.
+        half: vectors from the middle of each trail to its end (n, 2), px.
+        flux: flux of each star (n,), counts.
+    """
 
     middle: FloatArray
     half: FloatArray
@@ -53,16 +60,16 @@ class Trails:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObjectPatch:
-    """The pixels around a point.
+    """A rectangle of the image around a possible object.
 
     Attributes:
-        light: counts above the sky (rows, columns).
-        corner: position of the first pixel (2,), px.
-        noise: noise of a pixel without light, counts.
+        light: counts above the sky level (rows, columns).
+        corner: position (x, y) of the first pixel of the patch in the image (2,), px.
+        noise: standard deviation of a background pixel, counts.
         gain: electrons per count.
         usable: which pixels are not saturated (rows, columns).
-        psf: sigma of the point spread, px.
-        ceiling: counts above the sky at which pixels saturate.
+        psf: standard deviation of the PSF, px.
+        ceiling: counts above the sky level at which pixels saturate.
     """
 
     light: FloatArray
@@ -74,19 +81,19 @@ class ObjectPatch:
     ceiling: float
 
     def image(self, middle: FloatArray, half: FloatArray) -> FloatArray:
-        """Return the image of a trail of one count (rows, columns)."""
+        """Return the image (rows, columns) of a trail of one count with a middle and half extent (2,), px."""
         rows, columns = self.light.shape
         return spread_over(_trail(middle - self.corner, half)[0], columns, rows, self.psf)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedObject:
-    """A fitted object.
+    """Position and flux of an object, fitted to its pixels.
 
     Attributes:
-        middle, covariance: position (2,), px, and its covariance (2, 2), px^2.
-        flux, flux_sigma: light and its standard deviation, counts.
-        misfit: chi-square per degree of freedom.
+        middle, covariance: middle of the object's trail (2,), px, and its covariance (2, 2), px^2.
+        flux, flux_sigma: flux of the object and its standard deviation, counts.
+        misfit: chi-square of the fit per degree of freedom.
     """
 
     middle: FloatArray
@@ -97,30 +104,33 @@ class FittedObject:
 
 
 def _trail(middle: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points (m, 2), px, along a trail, and their distances (m,) from its middle, from -1 to 1."""
+    """Return points (m, 2), px, along a trail, and their distances (m,) from the middle in half extents."""
     count = max(4, int(np.ceil(2.0 * float(np.linalg.norm(half)) / _STEP_PX)))
     share = (np.arange(count) + 0.5) * 2.0 / count - 1.0
     return middle + share[:, None] * half, share
 
 
 def _patch_reach(half: FloatArray, psf: float) -> float:
-    """Return the distance (px) from the middle of an object that its patch must cover on each side."""
+    """Return the half-width (px) of the patch for an object with half extent `half` (2,), px."""
     return float(np.abs(half).max()) + _REACH * psf
 
 
 def _fit_object(
     patch: ObjectPatch, middle: FloatArray, half: FloatArray, flux: float, stars: Trails
 ) -> FittedObject | None:
-    """Return the object near `middle` (2,), px, of a half extent (2,), px; None if there is none."""
+    """Return the object fitted to a patch together with known stars; None if the fit fails.
+
+    `middle` (2,), px, `half` (2,), px, and `flux`, counts, are the initial guess.
+    """
     images = [patch.image(star, extent) for star, extent in zip(stars.middle, stars.half, strict=True)]
     given = np.maximum(stars.flux, 1e-9)
-    # Prior values and standard deviations of the extent and of the light of the stars.
+    # The priors are (index, value, standard deviation) of the extent and of the flux of each star.
     prior = [(2 + k, float(half[k]), _EXTENT) for k in range(2)]
     prior += [(6 + k, float(light), STAR_SIGMA * float(light)) for k, light in enumerate(given)]
     unknowns = np.concatenate([middle, half, [flux, 0.0], given])
     rows, columns = patch.light.shape
     for _ in range(_ROUNDS):
-        # The modelled light, and its derivatives by the unknowns (k, pixels).
+        # `light` is the modelled image, and `by_unknown` (k, pixels) its derivatives by the unknowns.
         path, share = _trail(unknowns[:2] - patch.corner, unknowns[2:4])
         both = np.stack([np.ones(len(share)), share])
         shape, *slopes = spread_with_slopes(path, both, columns, rows, patch.psf)
@@ -145,7 +155,7 @@ def _fit_object(
         misfit = float(np.sum(weight * off**2)) / spare
         if np.abs(step[:2]).max() < _CONVERGED:
             break
-    # As for the stars (`inflation`), an excess of less than three deviations of chi-square is chance.
+    # The covariance is increased only if chi-square exceeds its mean by three standard deviations.
     excess = misfit if misfit > 1.0 + 3.0 * (2.0 / spare) ** 0.5 else 1.0
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * excess
     away = np.abs(unknowns[:2] - middle).max()
@@ -156,23 +166,26 @@ def _fit_object(
 
 
 _BRIGHTEST = 1.0 + 3.0 * STAR_SIGMA
-"""Largest ratio of a star's brightness to its catalogue brightness. Light above this ratio is not attributed
-to the star."""
+"""Largest ratio of the flux attributed to a star to the flux predicted from the catalogue."""
 _LEAST_SHARE = 0.15
-"""Minimum brightness of an object relative to the stars beside it, because the model of star images has
-errors of about a tenth."""
+"""Minimum flux of an object relative to stars beside it; modelled star images have errors of about 10 %."""
 _APART = 1.0
-"""Minimum distance (px) of an object from the nearest star. A closer object cannot be distinguished from a
-close pair of stars."""
+"""Minimum distance (px) of an object from the nearest star; a closer object may be a pair of stars."""
 _STEP_TO_SIGMA = 1.4826 / np.sqrt(2.0)
-"""Ratio of the noise of a pixel to the median step between neighbouring pixels."""
+"""Ratio of the noise of a pixel to the median absolute difference between neighbouring pixels."""
 _MISFIT = 3.0
-"""Largest chi-square per degree of freedom of the patch with the object."""
+"""Largest chi-square per degree of freedom of the fit of an object beside a star."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CatalogueTrails:
-    """The trails of n catalogue stars: `middle` and `half` extent (n, 2), px, and `magnitude` (n,)."""
+    """Trails of n catalogue stars in an image.
+
+    Attributes:
+        middle: middles of the trails (n, 2), px.
+        half: vectors from the middle of each trail to its end (n, 2), px.
+        magnitude: V magnitudes of the stars (n,).
+    """
 
     middle: FloatArray
     half: FloatArray
@@ -180,7 +193,10 @@ class CatalogueTrails:
 
 
 def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: FloatArray) -> CatalogueTrails:
-    """Return the stars in and around an image; the camera rotates by `rotation` (3,), rad, camera axes."""
+    """Return the trails of catalogue stars in and around an image of the given shape (rows, columns).
+
+    The camera rotates by `rotation` (3,), rad, camera axes, during the exposure; `epoch` is a Julian year.
+    """
     known = catalogue.load()
     directions = known.directions_at(epoch)
     centre = np.array([[(shape[1] - 1) / 2.0, (shape[0] - 1) / 2.0]])
@@ -198,37 +214,40 @@ def _stars_in(sky: SkyMap, epoch: float, shape: tuple[int, ...], rotation: Float
 
 
 class FramePatches:
-    """The pixels around any place of an image, with the catalogue stars there.
+    """Fits of possible objects at any position of an image, together with the catalogue stars nearby.
 
     Args:
         seen: survey of the image.
-        stars: the catalogue stars.
-        zero: magnitude of one count.
-        psf: sigma of the point spread, px.
+        stars: trails of the catalogue stars.
+        zero: magnitude of a star with a flux of one count.
+        psf: standard deviation of the PSF, px.
     """
 
     def __init__(self, seen: Survey, stars: CatalogueTrails, zero: float, psf: float) -> None:
         self._light, self._sky = seen.pixels, seen.sky
-        # The noise of the survey includes the faint stars, which are as smooth as their images.
+        # Differences of neighbouring pixels exclude the light of faint stars, which is in the survey's noise.
         steps = np.abs(np.diff(seen.pixels[::4].astype(np.float64), axis=1))
         self._noise = max(float(np.median(steps)) * _STEP_TO_SIGMA, 1e-3)
         self._gain, self._ceiling, self._psf = seen.settings.gain or 1.0, seen.areas.ceiling, psf
         self._trails = Trails(stars.middle, stars.half, 10.0 ** (0.4 * (zero - stars.magnitude)))
 
     def measured(self, point: FloatArray, half: FloatArray, flux: float) -> FittedObject | None:
-        """Return the object near `point` (2,), px, of a half extent (2,), px; None if there is none."""
+        """Return the object fitted near `point` (2,), px; None if the fit fails.
+
+        `half` (2,), px, and `flux`, counts, are the initial guess of half extent and flux.
+        """
         patch = self._patch(point, _patch_reach(half, self._psf))
         return None if patch is None else _fit_object(patch, point, half, flux, self._near(point, patch))
 
     def beside(self, point: FloatArray, length: float, significance: float) -> FittedObject | None:
-        """Return an object whose light is merged with that of known stars; None if there is none.
+        """Return an object whose light is merged with that of known stars; None if no object is found.
 
-        The object is searched where the most light remains after the stars are subtracted.
+        The fit of the object starts at the brightest pixel after the stars are subtracted.
 
         Args:
-            point: middle of the merged light (2,), px.
-            length: length of the merged light, px.
-            significance: least light of the object, in standard deviations.
+            point: centre of the area of light (2,), px.
+            length: length of the area of light, px.
+            significance: minimum flux of the object, in standard deviations.
         """
         patch = self._patch(point, 0.5 * length + _patch_reach(np.zeros(2), self._psf))
         if patch is None:
@@ -238,7 +257,7 @@ class FramePatches:
         for middle, half, flux in zip(stars.middle, stars.half, stars.flux, strict=True):
             image = patch.image(middle, half)
             share = patch.usable * image / (patch.noise**2 + flux * image / patch.gain)
-            # The light of a star is limited, because it must not include the light of the object.
+            # The flux of a star is limited, so that it does not include the light of the object.
             light = float(np.sum(share * left)) / max(float(np.sum(share * image)), 1e-300)
             left -= np.clip(light, 0.0, _BRIGHTEST * flux) * image
         top = np.where(patch.usable, left, -np.inf)[1:-1, 1:-1]
@@ -255,14 +274,14 @@ class FramePatches:
         return found if distinct else None
 
     def _near(self, point: FloatArray, patch: ObjectPatch) -> Trails:
-        """Return the stars that illuminate a patch and stand above its noise."""
+        """Return the stars in or near a patch whose flux exceeds three standard deviations of the noise."""
         trails, reach = self._trails, 0.5 * max(patch.light.shape) + 3.0 * self._psf
         near = np.all(np.abs(trails.middle - point) - np.abs(trails.half) < reach, axis=1)
         near &= trails.flux > 3.0 * patch.noise
         return Trails(trails.middle[near], trails.half[near], trails.flux[near])
 
     def _patch(self, point: FloatArray, reach: float) -> ObjectPatch | None:
-        """Return the pixels within `reach` px of a point (2,) along each axis; None beyond the border."""
+        """Return the patch within `reach` px of a point (2,) along each axis; None at the image border."""
         rows, columns = self._light.shape
         x, y = np.rint(point).astype(int)
         size = int(np.ceil(reach))
@@ -278,9 +297,9 @@ class FramePatches:
 
 
 _OFF_PLACE, _TOO_BRIGHT = 0.25, 0.2
-"""Deviations of a star's light from the catalogue (px and magnitudes) beyond which it may hold an object."""
+"""Deviations of a star from the catalogue (px and magnitudes) beyond which an object is suspected."""
 _SAME = 1.0
-"""Distance (px) within which two fits belong to the same light."""
+"""Distance (px) below which two fits count as the same object."""
 
 
 def measure_objects(
@@ -292,16 +311,16 @@ def measure_objects(
     detection: DetectionSettings,
     settings: ObjectMeasurementSettings,
 ) -> MeasuredObjects | None:
-    """Return the possible objects in an image; None if its attitude is unknown.
+    """Return the possible objects in an image; None if the attitude of the image is unknown.
 
     Args:
-        pixels: the image (rows, columns).
-        solution: solution of the star tracker.
+        pixels: counts of the image (rows, columns).
+        solution: star tracker solution of the image.
         exposure: exposure time, s.
         epoch: Julian year of the positions of the stars.
-        velocity: velocity (3,), m/s, with which the image was solved.
+        velocity: velocity of the camera (3,), m/s, which corrects directions for aberration; None for none.
         detection: settings of the survey of the image.
-        settings: settings of the measurement.
+        settings: settings of the measurement of objects.
     """
     sky = solution.sky_map(velocity)
     if sky is None or solution.fix is None:
@@ -313,7 +332,7 @@ def measure_objects(
         fits = _among_streaks(seen, stars, solution, motion, rotation, exposure, settings)
     else:
         fits = _among_points(seen, stars, settings)
-    # The fits of two areas may converge to the same light; only the first fit is kept.
+    # The fits of two areas may converge to the same object; only the first fit is kept.
     middles = np.array([fit.middle for fit, _ in fits]).reshape(-1, 2)
     away = np.linalg.norm(middles[:, None] - middles, axis=2)
     again = np.any(np.tril(away < _SAME, -1), axis=1)
@@ -346,7 +365,7 @@ def _among_streaks(
     exposure: float,
     settings: ObjectMeasurementSettings,
 ) -> list[tuple[FittedObject, float]]:
-    """Return the objects among streaks, each with the magnitude of one count."""
+    """Return the objects in an image whose stars are streaks, each with the magnitude of one count."""
     detection, search = seen.settings, settings.search
     if motion.rate is None:
         return []
@@ -354,7 +373,7 @@ def _among_streaks(
     report = detect(seen.pixels, solution.camera.ideal, rotation, exposure, streaks, search)
     if report is None or not report.objects:
         return []
-    # The magnitude of one count, from the identified streaks; NaN without any.
+    # The magnitude of one count comes from the identified streaks; it is NaN if no streak is identified.
     zero = float("nan")
     known = (solution.star >= 0) & (motion.flux > 0.0) if len(motion.flux) == len(solution.star) else None
     if known is not None and np.any(known):
@@ -375,7 +394,7 @@ def _among_streaks(
 def _among_points(
     seen: Survey, stars: CatalogueTrails, settings: ObjectMeasurementSettings
 ) -> list[tuple[FittedObject, float]]:
-    """Return objects apart from stars and in excess light beside stars, with the magnitude of one count."""
+    """Return the objects in an image whose stars are points, each with the magnitude of one count."""
     areas, noise = seen.areas, float(np.median(seen.sky.noise.values))
     ratio = areas.flux / (noise * np.sqrt(np.maximum(areas.pixels, 1)))
     strong = np.flatnonzero(ratio >= settings.significance)
@@ -385,7 +404,7 @@ def _among_points(
     nearest = away.argmin(axis=1)
     distance = away[np.arange(len(strong)), nearest]
     is_star = distance < settings.clearance + 0.5 * areas.length[strong]
-    # The median, because the brightest stars are saturated and the faintest are pairs.
+    # The median is used, because the brightest stars are saturated and the faintest may be pairs.
     own = is_star & (distance < 1.0)
     if not np.any(own):
         return []
@@ -412,12 +431,12 @@ def _among_points(
 
 
 def _centre(areas: Areas, area: int, ratio: float, settings: ObjectMeasurementSettings) -> FittedObject:
-    """Return an area that no fit explains as an object at the area's centre of light."""
+    """Return an object at the centroid of an area of light whose fit failed."""
     sigma = float(np.sqrt(1.0 + areas.length[area] ** 2 / 12.0)) / max(ratio, 1.0)
     error = np.hypot(settings.centre_sigma, sigma)
     return FittedObject(areas.centre[area], error**2 * np.eye(2), float(areas.flux[area]), 0.0, 1.0)
 
 
 def _faintness(flux: FloatArray) -> FloatArray:
-    """Return 2.5 log10 of counts (n,)."""
+    """Return 2.5 log10 of counts (n,), the difference between a star's magnitude and that of one count."""
     return np.asarray(2.5 * np.log10(np.maximum(flux, 1e-9)))

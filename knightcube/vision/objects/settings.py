@@ -1,4 +1,4 @@
-"""Settings of the search for objects among the stars and of its streaks, and the objects found in a frame."""
+"""Settings of the search for objects among streaks and points, and the objects measured in a frame."""
 
 from __future__ import annotations
 
@@ -10,32 +10,37 @@ from knightcube.astro.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class EndpointSettings:
-    """How streaks are separated and their ends located; the defaults suit the demonstration's camera.
+    """Settings of the segmentation of streaks and of the location of their ends.
+
+    The defaults suit the camera of the demonstration.
 
     Attributes:
-        threshold_sigmas: threshold of the 3 x 3 sum in standard deviations; 0 selects the image's mean, as in
-            the thesis.
+        threshold_sigmas: threshold of the sum of 3 x 3 pixels, in standard deviations of this sum; 0 selects
+            the image mean as threshold, as Sease does.
         least_area: minimum number of pixels in a region; a noise peak fills nine pixels of the 3 x 3 sum.
         most_streaks: maximum number of regions that are measured, strongest first.
-        saturation: counts at which a pixel saturates; None: the maximum of the integer type.
+        saturation: counts at which a pixel saturates; None for the maximum of the integer type.
         gain: electrons per count.
-        smoothing_sigma: px, Gaussian smoothing before the corner detector; 0: none.
-        derivative_sigma: px, of the Gaussian derivative.
-        window_sigma: px, of the window of the structure tensor.
-        harris_k: k of 3.8.
-        peak_relative: minimum cornerness of an endpoint relative to the largest of its streak. The Harris
-            response grows with the fourth power of the brightness, so that 0.005 allows a brightness ratio of
-            3.8 between the ends.
-        intensity_half_width: px, N of 3.15.
-        centre_of: image of which the centre of intensity is computed: the cornerness, or the frame as in the
-            thesis.
-        endpoint_bias: px, outward shift along the streak that compensates the detector, measured for a point
-            spread of 1 px.
-        endpoint_floor: px, error of an endpoint of a bright streak.
-        endpoint_noise: px, error of an endpoint per ratio of noise to counts per px of length.
-        border: px, distance from the frame's border within which streaks are rejected.
-        least_length: px, minimum median length of the streaks.
-        least_streaks: minimum number of streaks.
+        smoothing_sigma: standard deviation of the Gaussian that smooths the image before the corner detector,
+            px; 0 for no smoothing.
+        derivative_sigma: standard deviation of the Gaussian derivative, px.
+        window_sigma: standard deviation of the Gaussian window of the structure tensor, px.
+        harris_k: constant k of the Harris response (Sease, eq. (3.8)).
+        peak_relative: minimum cornerness of an endpoint, relative to the largest cornerness of the streak.
+            The Harris response grows with the fourth power of the brightness, so that 0.005 allows a
+            brightness ratio of 3.8 between the two ends.
+        intensity_half_width: half-width of the window of the centre of intensity, px (N in Sease, eq.
+            (3.15)).
+        centre_of: image whose centre of intensity locates an endpoint, either the cornerness ("response") or,
+            as Sease does, the frame ("image").
+        endpoint_bias: outward displacement of the endpoints that compensates the bias of the corner detector,
+            px; measured for a point spread function (PSF) of 1 px.
+        endpoint_floor: standard deviation of an endpoint of a bright streak, px.
+        endpoint_noise: increase of the standard deviation of an endpoint, px, per ratio of pixel noise to
+            counts per px of streak length.
+        border: distance from the frame's border within which streaks are rejected, px.
+        least_length: minimum median length of the streaks in a frame, px.
+        least_streaks: minimum number of streaks in a frame.
     """
 
     threshold_sigmas: float = 4.5
@@ -63,21 +68,23 @@ class ObjectSettings:
     """Thresholds and limits of the search for objects among streaks.
 
     Attributes:
-        bounds: standard deviations of centre, displacement and residual below which an indicator never fires
-            (the measured spread without an object).
-        strict: standard deviations within the image that must be exceeded too, 2.5 in the thesis.
-        psf_sigma: point spread of the camera, px.
+        bounds: thresholds of the indicators centre, displacement and residual, in expected standard
+            deviations; measured in images without an object.
+        strict: additional threshold of the indicators, in standard deviations over the streaks of the image;
+            2.5 as in Sease.
+        psf_sigma: standard deviation of the camera's point spread function (PSF), px.
         gain: electrons per count.
-        saturation: counts at which a pixel saturates; None: the maximum of the integer type.
-        most_streaks: maximum number of examined regions; a rate needs fewer.
-        most_points: maximum number of examined short regions.
-        most_merged: maximum number of regions that are searched after their stars are removed.
-        least_share: least light of an object beside stars, as a fraction of the light of its region: an error
-            of the rotation of 2 % leaves that much at the end of a bright star's streak.
-        most_corners: number of corners above which a region is not decided.
-        point_significance: least light of a short region, in standard deviations.
-        improvement: least gain in chi-square of an object over stars.
-        crossing_improvement: the same for an object that crosses stars, the best of many tested lines.
+        saturation: counts at which a pixel saturates; None for the maximum of the integer type.
+        most_streaks: maximum number of regions that are examined as streaks.
+        most_points: maximum number of short regions that are examined as points.
+        most_merged: maximum number of regions that are searched again after their stars are removed.
+        least_share: minimum flux of an object found beside stars, as a fraction of the flux of the region. An
+            error of 2 % in the rotation leaves this fraction at the end of a bright star's streak.
+        most_corners: number of corners of a region above which the region is not examined.
+        point_significance: minimum flux of a short region, in standard deviations.
+        improvement: minimum decrease of chi-square if an object is added to the stars.
+        crossing_improvement: minimum decrease of chi-square for an object that crosses stars; larger than
+            `improvement`, because many lines are tested.
         worst_fit: largest chi-square per pixel of an accepted object.
         streak_sigma: standard deviation per axis of the midpoint between the ends of an object, px.
     """
@@ -104,14 +111,15 @@ class ObjectMeasurementSettings:
     """Settings of the measurement of possible objects in an image with a known attitude.
 
     Attributes:
-        search: settings of the search among streaks.
-        faintest: V of the faintest object. The catalogue has nearly all stars of this magnitude, and half a
-            magnitude of fainter ones.
-        significance: least light of an area, in standard deviations.
-        clearance: least distance from the nearest catalogue star, px, in addition to half the area's length.
-        floor: least standard deviation per axis, px, for any brightness (campaign `object-passes`).
-        centre_sigma: least standard deviation of a centre of light, px, if the pixels could not be fitted.
-        most: maximum number of objects, the brightest.
+        search: settings of the search for objects among streaks.
+        faintest: V magnitude of the faintest object that is reported; the star catalogue must be complete to
+            fainter magnitudes.
+        significance: minimum flux of an area of light, in standard deviations.
+        clearance: minimum distance of an object from the nearest catalogue star, px, in addition to half the
+            length of the area of light.
+        floor: minimum standard deviation per axis of a position, px (from the campaign `object-passes`).
+        centre_sigma: minimum standard deviation per axis of a centroid, px, which is used if the fit fails.
+        most: maximum number of objects that are reported, the brightest first.
     """
 
     search: ObjectSettings = field(default_factory=ObjectSettings)
@@ -129,10 +137,10 @@ class MeasuredObjects:
 
     Attributes:
         points: positions at mid-exposure (n, 2), px.
-        directions: unit vectors (n, 3), ICRS, without the aberration of the stars.
-        covariance: covariance of the positions as directions (n, 3, 3), rad^2, ICRS axes.
-        magnitudes: V magnitudes relative to the stars of the image (n,); NaN if unknown.
-        attitude: covariance of the attitude (3, 3), rad^2, ICRS axes, which all objects share.
+        directions: unit vectors to the objects (n, 3), ICRS, corrected for stellar aberration.
+        covariance: covariances of the directions due to the errors of the positions (n, 3, 3), rad^2, ICRS.
+        magnitudes: V magnitudes of the objects relative to the stars of the image (n,); NaN if unknown.
+        attitude: covariance of the attitude (3, 3), rad^2, ICRS axes, an error that all objects share.
     """
 
     points: FloatArray

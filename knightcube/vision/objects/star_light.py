@@ -1,18 +1,20 @@
-"""Tests whether stars explain the light of a region, and searches a region after its stars are removed.
+"""Test whether stars explain the light of a region, and search of a region after its stars are removed.
 
-Explanation. Both hypotheses are sums of streaks of constant brightness with the camera's point spread: stars
-along the paths that the rotation gives them, and an object that moves uniformly from one end to the other, on
-a straight line either in the image or relative to the stars. If the camera rotates about the boresight, these
-two paths differ. Brightnesses come from non-negative least squares; the sum of squares decides. Overlapping,
-adjacent and successive streaks of two stars, and segments of a faint star's streak, are the light of stars.
-Light that is not on the path of any star, or that ends although a star would continue, is not explained by
-stars.
+The test compares two hypotheses by chi-square: that the light of the region comes from stars only, or from
+stars and one object. Stars and object are modelled as streaks of constant brightness with the camera's point
+spread function (PSF). Stars follow the paths that the camera's rotation determines. The object moves
+uniformly from one end to the other, on a line that is straight either in the image or relative to the stars.
+These two lines differ if the camera rotates about the boresight. The brightnesses come from non-negative
+least squares. Streaks of two stars that overlap or touch, and segments of a faint star's streak, are
+explained by stars. Light that is not on the path of any star, or that ends where a star would continue, is
+not explained by stars.
 
-Removal. The streak of a star has one brightness from end to end, which cannot exceed that of its faintest
-segment. The erosion of the region by the path of a star is therefore an upper bound of the light of a star;
-objects that cross the streaks, and points on them, nearly vanish in it. Stars are removed one by one, the
-brightest first. Their positions and brightnesses are fitted together, without the pixels that are too bright
-for them. The brightest remainder is then fitted as a point or a line.
+A star's streak has the same brightness from end to end. Therefore the brightness of a star is at most the
+minimum of the image along the star's path, which an erosion of the image by this path gives for every
+position. Objects that cross the streaks, and points on the streaks, nearly vanish in the eroded image. Stars
+are removed one by one, the brightest first. The positions and brightnesses of all stars found are fitted
+together, without pixels that are brighter than these stars. The brightest remainder is then fitted as a point
+or a line.
 """
 
 from __future__ import annotations
@@ -33,29 +35,28 @@ from knightcube.vision.camera.lens import Pinhole
 from knightcube.vision.frame import Background, label_pixels, line_of
 from knightcube.vision.objects.streak_ends import Regions, Segmented
 
-# Number of trial star paths per path length along a region, and largest length of a chain of stars in path
-# lengths.
+# Number of trial star paths per path length along a region.
+# The longest chain of stars in a region is given in path lengths.
 _PATHS_PER_LENGTH, _LONGEST_CHAIN = 8, 5.0
-# Spacing (px) of the Gaussians whose sum is a streak.
-# The ripple is 0.2 % for a point spread of 0.6 px.
+# Spacing (px) of the Gaussians whose sum models a streak.
+# This sum has a ripple of 0.2 % for a PSF of 0.6 px.
 _STEP_PX = 1.0
-# Distance from all paths, in sigmas of the point spread, beyond which light is ignored.
+# Distance from all paths beyond which pixels are ignored, in standard deviations of the PSF.
 _REACH = 3.0
-# Distance, in standard deviations, at which the light of a point is truncated.
-# A fraction of 6e-7 lies beyond.
+# Distance at which the Gaussian PSF is truncated, in standard deviations.
 _FARTHEST = 5.0
-# Relative error of the modelled shape of a bright streak, from its ends, point spread and uniformity.
+# Relative error of the modelled shape of a bright streak, due to errors of its ends, PSF and uniformity.
 SHAPE_ERROR = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """How well an object among the stars explains the pixels.
+    """Quality of the hypothesis that the pixels show stars and one object.
 
     Attributes:
         chi_square: chi-square of the best sum of star streaks and the object's streak.
         misfit, misfit_of_stars: chi-square per pixel along the object's streak, with and without the object.
-        flux: light of the object, counts.
+        flux: flux of the object, counts.
     """
 
     chi_square: float
@@ -65,27 +66,27 @@ class Explanation:
 
 
 class StarLight:
-    """The pixels around one region, and the stars that may illuminate them.
+    """The pixels around one region, and the star streaks that best explain them.
 
-    The pixels lie along all star paths and all lines between the corners. A star may begin or end at each
-    corner, and pass the midpoint of the corners anywhere on its path.
+    The pixels lie near all trial star paths and near all lines between the corners. A trial star path begins
+    or ends at a corner, or passes the midpoint of the corners.
 
     Args:
-        segmented: the frame.
-        corners: corners of the region (k, 2), px, k of 2 or more.
-        rotation: rotation of the camera over the exposure (3,), rad.
-        pinhole: the camera.
-        psf_sigma: point spread, px.
+        segmented: segmented frame.
+        corners: corners of the region (k, 2), px, with k of 2 or more.
+        rotation: rotation of the camera during the exposure (3,), rad, camera axes.
+        pinhole: camera that took the frame.
+        psf_sigma: standard deviation of the PSF, px.
         gain: electrons per count.
-        saturation: counts at which a pixel saturates; pixels within 5 % of it have no weight.
-        known: paths (m, 2), px, of stars that illuminate the pixels too.
+        saturation: counts at which a pixel saturates; pixels within 5 % of this value have no weight.
+        known: paths (m, 2), px, of other stars that illuminate the pixels.
 
     Attributes:
         chi_square: chi-square of the best sum of star streaks.
-        pixels: number of pixels.
+        pixels: number of pixels near the paths and lines.
 
     Raises:
-        FlightError: if the brightnesses cannot be solved for.
+        FlightError: if the least-squares solution of the brightnesses does not converge.
     """
 
     def __init__(
@@ -114,7 +115,10 @@ class StarLight:
         self._brightness, self.chi_square = _brightnesses(self._stars, self._target)
 
     def explain(self, ends: FloatArray) -> Explanation:
-        """Return how well an object between `ends` (2, 2), px, explains the pixels, on its better path."""
+        """Return how well stars and an object between `ends` (2, 2), px, explain the pixels.
+
+        Of the straight path and the path relative to the stars, the path with the smaller chi-square is used.
+        """
         found = []
         for path in (straight_path(ends), _path_among_stars(ends, self._rotation, self._pinhole)):
             line = self._weighted_image(path)
@@ -131,17 +135,17 @@ class StarLight:
         return min(found, key=lambda one: one.chi_square)
 
     def _weighted_image(self, path: FloatArray) -> FloatArray:
-        """Return the light (p,) of one count along `path` (m, 2), px, in the pixels, over its error."""
+        """Return the image (p,) of a streak of one count along `path` (m, 2), px, times the pixel weights."""
         (left, top), (right, bottom) = self._near.min(axis=0), self._near.max(axis=0)
         light = spread_over(path - (left, top), right - left + 1, bottom - top + 1, self._psf_sigma)
         return np.asarray(light[self._near[:, 1] - top, self._near[:, 0] - left] * self._weight)
 
 
 def _pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
-    """Return the reciprocal errors of pixels with `signal` counts above `background`; 0 if saturated.
+    """Return the reciprocal standard deviations of pixels with `signal` counts above `background`.
 
-    The error covers the noise, the photons (`gain` in electrons per count) and the uncertain shape of bright
-    streaks. Pixels within 5 % of `saturation` counts are saturated.
+    The standard deviation includes the noise of the background, photon noise (`gain` in electrons per count)
+    and the uncertain shape of bright streaks. Pixels above 95 % of `saturation` counts have the weight 0.
     """
     light = np.maximum(signal, 0.0)
     clipped = signal + background.typical_level >= 0.95 * saturation
@@ -150,7 +154,7 @@ def _pixel_weights(signal: FloatArray, background: Background, gain: float, satu
 
 
 def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:
-    """Return the non-negative brightness (k,) of each column of `images` (p, k), and the chi-square.
+    """Return the non-negative coefficients (k,) of `images` (p, k) that best sum to `target`, and chi-square.
 
     Raises FlightError if the solver does not converge.
     """
@@ -162,9 +166,9 @@ def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, f
 
 
 def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole: Pinhole) -> FloatArray:
-    """Return points (m, 2), px, along the path of a star that is at `direction` (3,) after a part of it.
+    """Return points (m, 2), px, along the path of a star during the exposure.
 
-    `start` is that part of the path, from 0 to 1.
+    The star is at `direction` (3,), camera axes, when it has covered the fraction `start` of the path.
     """
     whole = pinhole.project(_rotated(direction, rotation, np.linspace(-start, 1.0 - start, 17)))
     steps = _steps(float(np.sum(np.linalg.norm(np.diff(whole, axis=0), axis=-1))))
@@ -173,14 +177,14 @@ def star_path(direction: FloatArray, rotation: FloatArray, start: float, pinhole
 
 
 def straight_path(ends: FloatArray) -> FloatArray:
-    """Return evenly spaced points (m, 2), px, on the line in the image between two ends (2, 2)."""
+    """Return evenly spaced points (m, 2), px, on the straight line between two ends (2, 2), px."""
     steps = _steps(float(np.linalg.norm(ends[1] - ends[0])))
     parts = (np.arange(steps)[:, None] + 0.5) / steps
     return np.asarray(ends[0] + parts * (ends[1] - ends[0]))
 
 
 def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return points (m, 2), px, of uniform motion relative to the stars between two ends (2, 2).
+    """Return points (m, 2), px, of a uniform motion relative to the stars between two ends (2, 2), px.
 
     Of the two possible orders of the ends in time, the order with the slower motion is used.
     """
@@ -195,13 +199,17 @@ def _path_among_stars(ends: FloatArray, rotation: FloatArray, pinhole: Pinhole) 
 
 
 def at_mid_exposure(vectors: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Return the directions (2, 3) at mid-exposure of stars at `vectors` (2, 3) at start and end."""
+    """Return the directions (2, 3) of two stars at mid-exposure, from `vectors` (2, 3) at other times.
+
+    The first vector is the first star's direction at the start of the exposure, and the second vector is the
+    second star's direction at the end of the exposure.
+    """
     turns = attitude_matrix(from_rotation_vector(np.array([[0.5], [-0.5]]) * rotation))
     return np.asarray(np.einsum("mij,mj->mi", turns, vectors))
 
 
 def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> list[FloatArray]:
-    """Return the star paths to try: from and to each corner, and along the whole region."""
+    """Return trial star paths: paths that begin or end at each corner, and paths along the whole region."""
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
     one = star_path(pinhole.unit_vectors(middle[None])[0], rotation, 0.5, pinhole)
@@ -217,7 +225,7 @@ def _star_paths(corners: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> 
 
 
 def _rotated(direction: FloatArray, rotation: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return the directions (m, 3) of a fixed star after parts (m,) of the camera's rotation."""
+    """Return the directions (m, 3) of a star after fractions `parts` (m,) of the camera's rotation."""
     return np.asarray(attitude_matrix(from_rotation_vector(parts[:, None] * rotation)) @ direction)
 
 
@@ -226,14 +234,14 @@ def _steps(length: float) -> int:
 
 
 def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int) -> IntArray:
-    """Return the pixels (p, 2), x and y, within about `reach` px of any of the paths."""
+    """Return the pixels (x, y) within about `reach` px of any of the paths, as (p, 2)."""
     points = np.rint(np.concatenate(paths))
     r = int(np.ceil(reach))
     inside = np.all((points >= -r) & (points < (columns + r, rows + r)), axis=-1)
     x, y = np.meshgrid(np.arange(-r, r + 1), np.arange(-r, r + 1))
     disc = np.stack([x[x**2 + y**2 <= reach**2], y[x**2 + y**2 <= reach**2]], axis=-1)
     points = points[inside].astype(np.int64)
-    # A map of the part of the frame, with a margin, is faster than sorting.
+    # Marking the pixels in a Boolean map is faster than sorting and removing duplicates.
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
     marked = np.zeros((height, width), dtype=np.bool_)
@@ -246,9 +254,10 @@ def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int)
 
 
 def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
-    """Return the image (rows, columns) of one count, spread evenly over `path` (m, 2), px, and by a Gaussian.
+    """Return the image (rows, columns) of a streak of one count along `path` (m, 2), px.
 
-    `sigma` is the standard deviation of the Gaussian, px.
+    The count is distributed evenly over the points of the path, and each point is blurred by a Gaussian with
+    the standard deviation `sigma`, px.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     return np.asarray(y.T @ x / len(path))
@@ -257,9 +266,10 @@ def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> Floa
 def spread_with_slopes(
     path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
 ) -> list[FloatArray]:
-    """Return the image of `spread_over`, followed by its derivatives, 1/px, by each displacement in x and y.
+    """Return the image of `spread_over`, and its derivatives, 1/px, by displacements of the path.
 
-    Each row of `shares` (k, m) is a displacement: the fraction by which it moves each point of the path.
+    Each row of `shares` (k, m) defines one displacement by the fraction with which each point of the path
+    moves. For each displacement, the derivatives in x and in y are returned.
     """
     x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
     dx, dy = _within_pixels(columns, path[:, 0], sigma, True), _within_pixels(rows, path[:, 1], sigma, True)
@@ -270,9 +280,9 @@ def spread_with_slopes(
 
 
 def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = False) -> FloatArray:
-    """Return the parts (m, count) of normal densities around `centres` (m,) in each pixel along one axis.
+    """Return the integrals of normal densities centred on `centres` (m,), px, over each pixel, as (m, count).
 
-    With `slope`, return the derivatives of the parts by the centres, 1/px.
+    If `slope` is true, return the derivatives of these integrals with respect to the centres, 1/px.
     """
     reach = int(np.ceil(_FARTHEST * sigma))
     first = np.rint(centres).astype(np.int64) - reach
@@ -288,18 +298,16 @@ def _within_pixels(count: int, centres: FloatArray, sigma: float, slope: bool = 
     return placed[:, width : width + count]
 
 
-# Margin (px) around a region, wider than the point spread.
+# Margin (px) around a region, which is wider than the PSF.
 _ROOM = 8
 _MOST_STARS = 12
-# Thresholds of a star and of the remainder, in standard deviations of the smoothed image.
+# Thresholds of a star and of the remainder without stars, in standard deviations of the smoothed image.
 _STAR_SIGMAS, _LEFT_SIGMAS = 4.0, 6.0
-# Excess over the light of the stars, in standard deviations, above which a pixel is excluded from the fit of
-# the stars.
+# Excess of a pixel over the modelled stars, in standard deviations, above which the fit ignores the pixel.
 _NOT_THEIRS = 4.0
-# Largest step (px) of a fit, step (px) at which the fit has converged, and maximum number of steps.
+# Largest step (px) of a fit, step (px) below which the fit has converged, and maximum number of steps.
 _LARGEST_STEP, _CONVERGED, _FITS = 1.0, 0.02, 8
-# Minimum length (px) of a line.
-# A shorter remainder counts as a point.
+# Minimum length (px) of a line; a shorter remainder counts as a point.
 _LEAST_LINE_PX = 4.0
 # Widest gap (px) in a line.
 _WIDEST_GAP_PX = 12
@@ -307,17 +315,17 @@ _WIDEST_GAP_PX = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patch:
-    """A region with a margin.
+    """A rectangle of the frame around a region.
 
     Attributes:
         signal: counts above the background (rows, columns), including the light of other regions.
-        weight: reciprocal errors (rows, columns), 1/counts; 0 for saturated pixels.
-        noise: noise of a pixel without light, counts.
-        corner: position of the first pixel (2,), x and y, px.
+        weight: reciprocal standard deviations of the pixels (rows, columns), 1/counts; 0 if saturated.
+        noise: standard deviation of a background pixel, counts.
+        corner: position (x, y) of the first pixel of the patch in the frame (2,), px.
         mask: which pixels belong to the region (rows, columns).
-        beyond: assumed counts above and below, left and right of the patch: infinite outside of the frame,
-            where any star may continue.
-        psf_sigma: point spread, px.
+        beyond: assumed counts beyond the patch, as ((above, below), (left, right)); infinite outside the
+            frame, because streaks may continue there.
+        psf_sigma: standard deviation of the PSF, px.
     """
 
     signal: FloatArray
@@ -329,24 +337,24 @@ class Patch:
     psf_sigma: float
 
     def image_and_slopes(self, path: FloatArray, shares: FloatArray) -> list[FloatArray]:
-        """Return the image of one count along `path` (m, 2), px, and its slopes, by `spread_with_slopes`."""
+        """Return the results of `spread_with_slopes` in the patch for `path` (m, 2), px, in the frame."""
         rows, columns = self.signal.shape
         return spread_with_slopes(path - self.corner, shares, columns, rows, self.psf_sigma)
 
     def smoothed(self, light: FloatArray) -> FloatArray:
-        """Return `light` convolved with the point spread: the matched filter of a point."""
+        """Return `light` convolved with the PSF, which is the matched filter of a point."""
         return np.asarray(ndimage.gaussian_filter(light, self.psf_sigma, mode="constant"))
 
     @property
     def smoothed_noise(self) -> float:
-        """The noise of a smoothed pixel without light, counts."""
+        """The standard deviation of a background pixel after `smoothed`, counts."""
         return self.noise / (2.0 * float(np.sqrt(np.pi)) * self.psf_sigma)
 
 
 def cut_patch(
     segmented: Segmented, regions: Regions, index: int, psf_sigma: float, gain: float, saturation: float
 ) -> Patch:
-    """Return region number `index` with a margin. Pixels within 5 % of `saturation` have no weight."""
+    """Return the patch around region `index`. Pixels above 95 % of `saturation` counts have the weight 0."""
     rows, columns = segmented.signal.shape
     top, bottom, left, right = (int(edge) for edge in regions.boxes[index])
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
@@ -363,13 +371,13 @@ def cut_patch(
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2), px, of the stars in a patch, and the patch without them (rows, columns)."""
+    """Return the paths (m, 2), px, of stars in a patch, and the counts (rows, columns) without the stars."""
     middles: list[FloatArray] = []
     left = patch.signal
     rows, columns = patch.signal.shape
     centre = patch.corner + 0.5 * np.array([columns - 1, rows - 1])
     path = _path_of(centre, rotation, pinhole)
-    # Points of a star's path relative to its middle, both ends included.
+    # The offsets are points of a star's path relative to its middle, and include both ends.
     every = max(1, round(2.0 * patch.psf_sigma))
     offsets = path[np.unique(np.append(np.arange(0, len(path), every), len(path) - 1))] - centre
     while len(middles) < _MOST_STARS:
@@ -387,7 +395,7 @@ def _path_of(middle: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> Floa
 
 
 def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
-    """Return the largest possible brightness of a star centred on each pixel, as in the smoothed image."""
+    """Return the largest possible brightness, in the smoothed image, of a star centred on each pixel."""
     seen = patch.smoothed(left)
     rows, columns = seen.shape
     reach = int(np.ceil(np.abs(offsets).max())) + 1
@@ -403,7 +411,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
 def _fit_together(
     patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the middles (2,), px, of stars fitted together, and the patch without them (rows, columns)."""
+    """Return the path middles (2,), px, of stars fitted together, and the counts without these stars."""
 
     def images(middle: FloatArray) -> list[FloatArray]:
         path = _path_of(middle, rotation, pinhole)
@@ -430,13 +438,14 @@ def _fit_together(
 
 
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of the brightest remainder in the region; None if there is none.
+    """Return the ends (2, 2), px, of the brightest significant remainder in a region, or None.
 
-    Both ends of a point are equal. Residuals due to the uncertain shape of a bright star do not count.
+    For a point, the two ends are equal. Residuals within the shape error of a bright star are not
+    significant.
 
     Args:
-        patch: the region.
-        left: the patch without its stars (rows, columns).
+        patch: rectangle of the frame around the region.
+        left: counts of the patch without its stars (rows, columns).
     """
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))
@@ -448,7 +457,7 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     if flux.max(initial=0.0) <= 0.0:
         return None
     y, x = np.divmod(pixel[owner == int(np.argmax(flux))], seen.shape[1])
-    # The first guess is the uniform line with the moments of the bright pixels.
+    # The initial guess of the ends is the uniform line with the same moments as the bright pixels.
     points, weight = np.stack([x, y], axis=-1).astype(float), seen[y, x]
     points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
     spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
@@ -459,9 +468,9 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 
 
 def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
-    """Return the ends (2, 2), px, of a line that continues beyond gaps; None if it does not.
+    """Return the ends (2, 2), px, of a line that is extended across gaps; None if the line does not continue.
 
-    A star that crosses the line leaves a gap, because it is removed together with the light below it.
+    A star that crosses the line leaves a gap, because the star is removed together with the line's light.
     """
 
     def last_before_gap(lit: BoolArray) -> int:
@@ -489,7 +498,7 @@ def _continued(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray |
 
 
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the ends (2, 2), px, fitted to a remainder (rows, columns) from a guess, by Gauss-Newton."""
+    """Return the ends (2, 2), px, of a line fitted to the remainder `left` by Gauss-Newton from a guess."""
     is_point = bool(np.all(ends[0] == ends[1]))
     for _ in range(_FITS):
         path = straight_path(ends)

@@ -1,13 +1,14 @@
-"""Bright regions of a frame and the two ends of each streak among them (Sease 2013, chapter 3).
+"""Bright regions of a frame, and the two ends of each region that is a streak (Sease 2013, chapter 3).
 
-A frame is thresholded at the local background plus k standard deviations of its 3 x 3 sum, which is nearly
-the matched filter of a star one pixel wide. Within the box of each connected region the Harris response of
-the structure tensor is computed; a streak has exactly two peaks, each located by its centre of intensity. The
-equations are those of the thesis as corrected in the errata (3.5, 3.15, 3.17-3.18). Images are (rows,
-columns), points are (x, y) px.
+A pixel is bright if the sum of the 3 x 3 pixels around it, without background, exceeds a number of standard
+deviations. This sum is nearly the matched filter of a star image one pixel wide. The Harris response of the
+structure tensor is computed for each connected region of bright pixels. A streak has exactly two peaks of the
+Harris response, and each peak is located by its centre of intensity. The equations are those of Sease, with
+the corrections of the errata to eq. (3.5), (3.15), (3.17) and (3.18). Images have the shape (rows, columns),
+and points are (x, y) in px.
 
-The Gaussian kernels shift the peaks along the streak by a constant that depends on the point spread.
-`extend` compensates it.
+The Gaussian kernels displace the peaks along the streak by a constant that depends on the point spread
+function. The function `extend` compensates this displacement.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from knightcube.vision.frame import (
 )
 from knightcube.vision.objects.settings import EndpointSettings
 
-# Margin (px) around a region's box, which covers the window and the derivative kernel.
+# Margin (px) around the bounding box of a region, which covers the window and the derivative kernel.
 _PADDING = 8
-# Minimum ratio of a region's measured length to the minimum length of a streak, for a candidate.
+# Minimum length of a region that may be a streak, as a fraction of `EndpointSettings.least_length`.
 _LENGTH_MARGIN = 0.75
-# Fraction of a streak's counts per px of length that lies in its brightest row, for a point spread of 1 px.
+# Fraction of a streak's counts per px of length that lies in its brightest row, for a PSF of 1 px.
 _PEAK_FRACTION = 0.28
 
 
@@ -45,12 +46,12 @@ class Regions:
     """Connected regions of one frame.
 
     Attributes:
-        labels: (rows, columns) int32, the region's number at each pixel, 0 outside all regions.
-        label: (n,) the region's number in `labels`.
-        boxes: (n, 4) first row, last row + 1, first column, last column + 1.
-        area: (n,) pixels.
-        flux: (n,) counts above the background.
-        length: (n,) px, length of a uniform line with the region's second moments.
+        labels: label of the region at each pixel (rows, columns), int32; 0 outside all regions.
+        label: label of each region in `labels` (n,).
+        boxes: bounding boxes (n, 4) as first row, last row + 1, first column, last column + 1.
+        area: number of pixels in each region (n,).
+        flux: counts above the background in each region (n,).
+        length: length of the uniform line with the same second moments as each region (n,), px.
     """
 
     labels: Image
@@ -61,7 +62,7 @@ class Regions:
     length: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Regions:
-        """Return the `chosen` regions, given by a mask (n,) or by indices."""
+        """Return some of the regions, selected by a mask (n,) or by indices (`chosen`)."""
         return select(self, chosen, "labels")
 
     def __len__(self) -> int:
@@ -70,11 +71,11 @@ class Regions:
 
 @dataclass(frozen=True, slots=True)
 class Segmented:
-    """A frame cut into regions.
+    """A frame segmented into bright regions.
 
     Attributes:
-        signal: (rows, columns) float32 counts, background subtracted, hot pixels repaired.
-        background: level and noise.
+        signal: counts above the background with hot pixels repaired (rows, columns), float32.
+        background: background level and noise of the frame.
         regions: all regions above the threshold.
         candidates: regions that may be streaks, strongest first.
         hot_pixels: number of repaired pixels.
@@ -92,11 +93,12 @@ class Streaks:
     """Streaks of one frame, strongest first.
 
     Attributes:
-        endpoints: (n, 2, 2) streak, end, (x, y) px, without compensation and in arbitrary order.
-        sigma: (n,) px, expected error of an endpoint.
-        flux: (n,) counts.
-        candidate: (n,) index of each streak's region among the candidates.
-        crowded: index and corners (k, 2) px of each candidate with more than two corners.
+        endpoints: the two ends (x, y) of each streak in arbitrary order (n, 2, 2), px, not yet corrected by
+            `extend`.
+        sigma: expected standard deviation of the endpoints of each streak (n,), px.
+        flux: flux of each streak (n,), counts.
+        candidate: index of each streak among the candidate regions (n,).
+        crowded: index and corners (k, 2), px, of each candidate region with more than two corners.
     """
 
     endpoints: FloatArray
@@ -107,7 +109,7 @@ class Streaks:
 
     @property
     def lengths(self) -> FloatArray:
-        """The distances (n,) px between the two ends."""
+        """The distances between the two ends of the streaks (n,), px."""
         return np.asarray(np.linalg.norm(self.endpoints[:, 1] - self.endpoints[:, 0], axis=-1))
 
     def __len__(self) -> int:
@@ -115,7 +117,7 @@ class Streaks:
 
 
 def segment_frame(pixels: Image, settings: EndpointSettings) -> Segmented:
-    """Return the regions of a frame (rows, columns), and the candidates for streaks among them."""
+    """Return the bright regions of a frame (rows, columns), and those regions that may be streaks."""
     background = estimate_background(pixels)
     noise = background.map(background.noise)
     signal = pixels.astype(np.float32)
@@ -142,7 +144,7 @@ def threshold_local(signal: Image, noise: Image, sigmas: float) -> BoolArray:
 
 
 def threshold_mean(pixels: Image) -> BoolArray:
-    """Return where `pixels` exceed the mean of the image: the thesis's threshold, for noiseless frames."""
+    """Return where `pixels` exceed the mean of the image, the threshold of Sease for noiseless frames."""
     return np.asarray(pixels > pixels.mean())
 
 
@@ -153,7 +155,7 @@ def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
     labels = np.zeros(mask.shape, dtype=np.int32)
     labels.reshape(-1)[pixel] = number + 1
     row, column = np.divmod(pixel, mask.shape[1])
-    # A region above the image's mean may still lie below the background, where it has no moments.
+    # Pixels above the image mean may be below the background; their negative counts are set to zero.
     light = np.maximum(signal[row, column], 0.0).astype(np.float64)
     found = moments(number, column, row, light, count)
     area = np.bincount(number, minlength=count)
@@ -166,7 +168,7 @@ def find_regions(mask: BoolArray, signal: Image, least_area: int) -> Regions:
 
 
 def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
-    """Return which regions (n,) come within `border` px of the frame's border, which may hide their ends."""
+    """Return which regions (n,) lie within `border` px of the frame's border, which may cut off ends."""
     top, bottom, left, right = regions.boxes.T
     return np.asarray(
         (top < border) | (left < border) | (bottom > shape[0] - border) | (right > shape[1] - border)
@@ -174,7 +176,7 @@ def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolAr
 
 
 def expected_sigma(regions: Regions, background: Background, settings: EndpointSettings) -> FloatArray:
-    """Return the expected errors (n,) px of the endpoints, from each region's counts and the noise."""
+    """Return the expected standard deviation of the endpoints of each region (n,), px."""
     density = regions.flux / (regions.length + 3.0)
     variance = background.typical_noise**2 + _PEAK_FRACTION * density / settings.gain
     return np.asarray(
@@ -187,9 +189,10 @@ def measure_streaks(
     settings: EndpointSettings,
     cornerness: Callable[[FloatArray, EndpointSettings], FloatArray] | None = None,
 ) -> Streaks:
-    """Return the candidates whose cornerness has exactly two peaks, as streaks.
+    """Return the streaks, which are the candidate regions whose cornerness has exactly two peaks.
 
-    `cornerness` is another corner detector than Harris's; it maps an image and the settings to a response.
+    `cornerness` replaces the Harris corner detector: a function of an image and the settings that returns the
+    response at each pixel.
     """
     respond = harris_cornerness if cornerness is None else cornerness
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)
@@ -214,9 +217,9 @@ def measure_streaks(
 
 
 def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Return image and mask of a candidate with a margin, and the (x, y) px of their first pixel.
+    """Return image and mask of a candidate region with a margin, and the (x, y) of the first pixel, px.
 
-    Other regions are zero in the image.
+    Pixels of other regions are zero in the image.
     """
     rows, columns = segmented.signal.shape
     top, bottom, left, right = segmented.candidates.boxes[index]
@@ -229,7 +232,7 @@ def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, Fl
 
 
 class StructureTensor(NamedTuple):
-    """The three distinct elements of the windowed structure tensor at every pixel, each (rows, columns)."""
+    """The three distinct elements of the structure tensor at every pixel, each (rows, columns)."""
 
     xx: FloatArray
     xy: FloatArray
@@ -237,20 +240,21 @@ class StructureTensor(NamedTuple):
 
 
 def harris_cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
-    """Return the Harris response of an image (rows, columns) after the smoothing of the settings."""
+    """Return the Harris response of an image (rows, columns), smoothed according to the settings."""
     return harris_response(tensor_of(image, settings), settings.harris_k)
 
 
 def tensor_of(image: FloatArray, settings: EndpointSettings) -> StructureTensor:
-    """Return the structure tensor of an image after the smoothing of the settings."""
+    """Return the structure tensor of an image that is smoothed according to the settings."""
     image = smoothed(image, settings.smoothing_sigma)
     return structure_tensor(image, settings.derivative_sigma, settings.window_sigma)
 
 
 def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float) -> StructureTensor:
-    """Return the products of the gradient, summed under a Gaussian window of `window_sigma` px (3.5).
+    """Return the structure tensor: gradient products summed under a Gaussian window of `window_sigma` px.
 
-    Without the window, which the printed equation lacks, the tensor has rank 1 and one eigenvalue is zero.
+    Source: Sease, eq. (3.5), with a window that the printed equation lacks. Without the window, the tensor
+    has rank 1 and one eigenvalue is zero.
     """
     gx, gy = gradient(image, derivative_sigma)
     window = gaussian_kernel(window_sigma, kernel_radius(window_sigma))
@@ -258,20 +262,23 @@ def structure_tensor(image: Image, derivative_sigma: float, window_sigma: float)
 
 
 def harris_response(tensor: StructureTensor, k: float = 0.15) -> FloatArray:
-    """Return det(A) - k trace(A)^2, positive where both eigenvalues are large (3.7, 3.8)."""
+    """Return the Harris response det(A) - k trace(A)^2 of a structure tensor A (Sease, eq. (3.8))."""
     trace = tensor.xx + tensor.yy
     return np.asarray(tensor.xx * tensor.yy - tensor.xy**2 - k * trace**2)
 
 
 def gradient(image: Image, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return the Gaussian derivatives along x and y, counts per px; pixels at the border are repeated."""
+    """Return the Gaussian derivatives of an image along x and y, counts per px.
+
+    Beyond the border, the border pixels are repeated.
+    """
     radius = kernel_radius(sigma)
     smooth, slope = gaussian_kernel(sigma, radius), gaussian_derivative_kernel(sigma, radius)
     return _separable(image, smooth, slope), _separable(image, slope, smooth)
 
 
 def smoothed(image: Image, sigma: float) -> FloatArray:
-    """Return the image smoothed by a Gaussian of `sigma` px (3.3), unchanged if `sigma` is zero."""
+    """Return an image smoothed by a Gaussian of `sigma` px, unchanged if `sigma` is 0 (Sease, eq. (3.3))."""
     if sigma <= 0.0:
         return np.asarray(image, dtype=np.float64)
     kernel = gaussian_kernel(sigma, kernel_radius(sigma))
@@ -279,22 +286,22 @@ def smoothed(image: Image, sigma: float) -> FloatArray:
 
 
 def gaussian_kernel(sigma: float, radius: int) -> FloatArray:
-    """Return the sampled normal density (2 radius + 1,), one factor of 3.3."""
+    """Return the sampled normal density (2 radius + 1,), one factor of the Gaussian in Sease, eq. (3.3)."""
     x = np.arange(-radius, radius + 1)
     return np.asarray(np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2.0 * np.pi) * sigma))
 
 
 def gaussian_derivative_kernel(sigma: float, radius: int) -> FloatArray:
-    """Return the kernel (2 radius + 1,) whose correlation is d/dx of the image smoothed by `sigma` px.
+    """Return the correlation kernel (2 radius + 1,) of the derivative of an image smoothed by `sigma` px.
 
-    Its outer product with `gaussian_kernel` is the mirrored kernel of 3.4, which is written for convolution.
+    The kernel is a factor of the mirrored kernel of Sease, eq. (3.4), which is written for convolution.
     """
     x = np.arange(-radius, radius + 1)
     return np.asarray(x / sigma**2 * gaussian_kernel(sigma, radius))
 
 
 def kernel_radius(sigma: float) -> int:
-    """Return the half width (px) of a kernel of `sigma` px: three sigma, at least one."""
+    """Return the half-width (px) of a Gaussian kernel: three times `sigma` (px), and at least 1 px."""
     return max(1, int(np.ceil(3.0 * sigma)))
 
 
@@ -305,7 +312,7 @@ def _separable(image: Image, down: FloatArray, across: FloatArray) -> FloatArray
 
 
 def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntArray:
-    """Return the pixels (n, 2) of `mask`, as (x, y), that exceed all eight neighbours.
+    """Return the pixels (x, y) in `mask` whose response exceeds that of all eight neighbours (n, 2).
 
     Pixels at the border of the image, and pixels below `relative` times the largest response in the mask, are
     excluded.
@@ -326,9 +333,9 @@ def local_maxima(response: FloatArray, mask: BoolArray, relative: float) -> IntA
 def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> FloatArray:
     """Return the intensity-weighted centre (x, y) px of the (2 half_width + 1)^2 pixels around `pixel`.
 
-    The centre is that of Sease 3.15 and 3.16, with the coordinate as a factor in the sums, which the printed
-    equation lacks. Negative pixels have no weight. A window that the border cuts is narrowed on both sides,
-    so that it stays centred on `pixel` (x, y).
+    Source: Sease, eq. (3.15) and (3.16), with the coordinate as a factor in the sums, which the printed
+    equation lacks. Negative pixels have no weight. A window that would extend beyond the border is narrowed
+    on both sides, so that it stays centred on `pixel` (x, y).
     """
     x, y = int(pixel[0]), int(pixel[1])
     rows, columns = image.shape
@@ -344,30 +351,33 @@ def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> 
 def find_corners(
     response: FloatArray, mask: BoolArray, relative: float, half_width: int, intensity: FloatArray
 ) -> FloatArray:
-    """Return the corners (n, 2) px of a region: its peaks of cornerness, at the centres of `intensity`.
+    """Return the corners (x, y) of a region (n, 2), px, which are the peaks of its cornerness (`response`).
 
-    `intensity` is the response itself, or the image as in the thesis, whose centres lie up to 2 px inside the
-    streak. A streak has two corners; other numbers indicate noise, crossing streaks or another object.
+    Each corner is placed at the centre of intensity of the image `intensity`, which is the cornerness or, as
+    in Sease, the frame. With the frame, the corners lie up to 2 px inside the streak. A streak has two
+    corners; other numbers of corners indicate noise, crossing streaks or another object.
     """
     peaks = local_maxima(response, mask, relative)
     return np.array([centre_of_intensity(intensity, peak, half_width) for peak in peaks]).reshape(-1, 2)
 
 
 def extend(endpoints: FloatArray, outward: FloatArray, bias: float) -> FloatArray:
-    """Return `endpoints` (..., 2) moved by `bias` px along the directions `outward` (..., 2)."""
+    """Return `endpoints` (..., 2), px, moved by `bias` px along the directions `outward` (..., 2)."""
     return np.asarray(endpoints + bias * outward / np.linalg.norm(outward, axis=-1, keepdims=True))
 
 
 def chord_outward(endpoints: FloatArray) -> FloatArray:
-    """Return the directions (n, 2, 2) out of each streak (n, 2, 2) at its two ends, along the chord."""
+    """Return the outward directions along the chord at both ends of each streak (n, 2, 2)."""
     chord = endpoints[:, 1] - endpoints[:, 0]
     return np.stack([-chord, chord], axis=1)
 
 
 def centre_of_rotation(endpoints: FloatArray) -> FloatArray:
-    """Return the pixel (2,) nearest to the bisectors of streaks (n, 2, 2) px (3.17, 3.18 corrected).
+    """Return the centre of rotation (2,), px: the point nearest to the perpendicular bisectors of streaks.
 
-    The centre recedes to infinity as the axis becomes normal to the boresight; it is NaN for parallel chords.
+    The streaks are given by their ends (n, 2, 2), px. As the rotation axis becomes normal to the boresight,
+    the centre recedes to infinity; for parallel chords it is NaN. Source: Sease, eq. (3.17) and (3.18) as
+    corrected in the errata.
     """
     chord = endpoints[:, 1] - endpoints[:, 0]
     chord = chord / np.linalg.norm(chord, axis=-1, keepdims=True)

@@ -351,7 +351,7 @@ def test_a_frame_without_streaks_has_no_report() -> None:
     assert detect(noise, _FRAME_CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, ObjectSettings()) is None
     found = detect_objects(noise, _FRAME_CAMERA.pinhole, _ROTATION, 1.0)
     assert not found
-    assert found.reason == "fewer than 4 streaks stand out of the noise"
+    assert found.reason == "fewer than 4 significant streaks"
     assert found.directions.shape == (0, 3)
     assert found.covariance.shape == (0, 3, 3)
 
