@@ -4,11 +4,12 @@
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
-The names exported here are the public interface. The modules below `knightcube` may be imported too, but may
-change with any release. Nothing in this package needs a clock, a configuration file, a device or a socket.
+The names exported here are the public interface. The modules below `knightcube` can also be imported, but
+they may change with any release. This package needs neither a clock nor a configuration file, a device or a
+socket.
 
-A name is imported at its first use, so `import knightcube` takes no time. A new name needs one line in each
-of the two lists below: the first is for type checkers and editors, the second for the interpreter.
+Each name is imported at its first use, so that `import knightcube` takes almost no time. A new name must be
+added to both lists below: the first is for type checkers and editors, the second for the interpreter.
 """
 
 from __future__ import annotations
@@ -71,14 +72,14 @@ _MODULE_OF = {
 __all__ = list(_MODULE_OF)
 
 _EXTRA_OF = {"erfa": "orbit", "nlopt": "vmc", "pygeomag": "orbit", "sgp4": "orbit"}
-"""Optional packages, and the extra of this distribution that installs each."""
+"""Optional packages, each with the extra of this distribution that installs it."""
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, imported now.
+    """Return a public name of the package, which is imported now.
 
-    Raises AttributeError for another name. Raises ImportError if an optional package is missing, with the
-    command that installs it.
+    Raises AttributeError for an unknown name. Raises ImportError, with the command that installs the package,
+    if an optional package is missing.
     """
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -96,5 +97,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the module, those not yet imported included."""
+    """Return the names of the module, including those that are not imported yet."""
     return sorted({*globals(), *_MODULE_OF})

@@ -1,22 +1,22 @@
-"""The exceptions of the library and the flight application; each carries its facts as attributes."""
+"""Exceptions of the library and the flight application. Each exception has its details as attributes."""
 
 from __future__ import annotations
 
 
 class FlightError(Exception):
-    """The base of all errors of the library and the flight application."""
+    """Base class of all errors of the library and the flight application."""
 
 
 class UsageError(FlightError):
-    """A user's mistake: reported in one line, exit status 2, never a traceback."""
+    """A mistake of the user, reported in one line with exit status 2 and without a traceback."""
 
 
 class InputError(UsageError):
-    """A file, or a value in one, that cannot be used.
+    """A file, or a value in a file, that cannot be used.
 
     Attributes:
-        where: the file or the dotted name of the value.
-        problem: the fault and its remedy.
+        where: file, or dotted name of the value.
+        problem: description of the fault and its remedy.
     """
 
     def __init__(self, where: str, problem: str) -> None:
@@ -26,4 +26,4 @@ class InputError(UsageError):
 
 
 class PlanningError(FlightError):
-    """No path was found; the message says why."""
+    """Error raised if no path was found. The message says why."""

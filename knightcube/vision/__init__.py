@@ -1,1 +1,1 @@
-"""What the cameras show: streaks, objects, stars, the horizon and the Sun."""
+"""Images from the satellite's cameras: star streaks, objects, stars, the horizon and the Sun."""

@@ -1,17 +1,17 @@
-"""Properties of a frame that the methods for points and for streaks share.
+"""Properties of a frame that are needed for frames of points and frames of streaks.
 
-Background. Level and noise are clipped moments of a sub-sample of each block of pixels, so that streaks, a
-slow gradient of stray light and hot pixels hardly change them. The thesis thresholds at the mean of the
-image, which half of all pixels exceed once there is noise (errata, chapter 3). The sum over 3 x 3 pixels is
-nearly the matched filter of a star that is one pixel wide.
+Background. The level and noise of the background are clipped moments of a sub-sample of each block of pixels.
+Streaks, slow gradients of stray light and hot pixels hardly change them. The thesis uses the mean of the
+image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The sum over 3 x 3
+pixels is close to the matched filter of a star that is one pixel wide.
 
-Hot pixels are bright pixels with dark neighbours, which no optics could produce: a star's image wider than
-sigma 0.5 px gives the four neighbours of its brightest pixel at least 15 % of the light of that pixel.
-Methods that need an image without gaps replace hot pixels, and only certain ones. A fit to pixels excludes
-hot pixels instead, which does no harm if one of them was part of a star.
+Hot pixels are bright pixels with dark neighbours, which no optics can produce. If a star's image has a
+standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
+intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only the certain
+ones. A fit to pixels excludes hot pixels instead, which does little harm if one of them was part of a star.
 
-A frame without a scene is dead (one value everywhere) or overexposed. The step between counts is 257 if 8-bit
-counts were written as 16 bits, and 16 if 12-bit counts were.
+A frame without a scene is dead (all pixels are equal) or overexposed. The step between counts is 257 if 8-bit
+counts were stored as 16 bits, and 16 if 12-bit counts were.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ import numpy as np
 from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
 
 _CLIP, _CLIPPED_SIGMA = 3.0, 0.98658
-"""Clipping limit (sigmas), and the standard deviation of a normal variable clipped there."""
+"""Clipping limit in standard deviations, and the standard deviation of a normal variable after clipping."""
 MAD_TO_SIGMA = 1.4826
 """Ratio of the standard deviation of a normal variable to its median absolute deviation."""
 _ROUNDING_VARIANCE = 1.0 / 12.0
-"""Variance (count^2) due to rounding to whole counts: the least noise."""
+"""Variance (count^2) from rounding to whole counts, which is the minimum noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """Level and noise of blocks of pixels, counts, on a regular grid over a frame of `shape`."""
+    """Background level and noise (counts) of blocks of pixels on a regular grid over a frame of `shape`."""
 
     level: FloatArray
     noise: FloatArray
@@ -50,7 +50,7 @@ class Background:
         return float(np.median(self.noise))
 
     def map(self, grid: FloatArray) -> Image:
-        """Return the block values `grid` interpolated bilinearly to every pixel: float32 of `shape`."""
+        """Return the block values `grid` interpolated bilinearly to every pixel, as float32 of `shape`."""
         down, across = (
             interpolation_weights(pixels, blocks).astype(np.float32)
             for pixels, blocks in zip(self.shape, grid.shape, strict=True)
@@ -59,11 +59,11 @@ class Background:
 
 
 def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Background:
-    """Return level and noise of `pixels` (rows, columns) in blocks of about `block` x `block` pixels.
+    """Return background level and noise of `pixels` (rows, columns) in blocks of `block` x `block` pixels.
 
-    Every `stride`-th pixel of every `stride`-th row is used: 256 per block with the defaults, which give the
-    level to 0.06 and the noise to 0.05 of the noise. A block that a bright object fills gets the noise of its
-    neighbours (3 x 3 median).
+    Every `stride`-th pixel of every `stride`-th row is used. With the defaults, the 256 samples per block
+    give the level to 6 % and the noise to 5 % of the noise. A block that is filled by a bright object gets
+    the median noise of the surrounding 3 x 3 blocks.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -75,7 +75,7 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     values = sample.reshape(down, across, -1).astype(np.float64)
     median = np.median(values, axis=-1, keepdims=True)
     spread = MAD_TO_SIGMA * np.median(np.abs(values - median), axis=-1, keepdims=True)
-    # Coarse quantisation can make the median deviation zero. A limit of 1.5 counts keeps both neighbours.
+    # Coarse quantisation can make the median deviation zero. A limit of 1.5 counts keeps adjacent counts.
     kept = np.abs(values - median) <= _CLIP * np.maximum(spread, 0.5)
     count = kept.sum(axis=-1)
     level = np.where(kept, values, 0.0).sum(axis=-1) / count
@@ -85,9 +85,10 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
 
 
 def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
-    """Return the block (n,) with the last centre before `pixel` (n,), and the fraction (n,) towards the next.
+    """Return the last block centre (n,) before `pixel` (n,), and the fraction (n,) towards the next centre.
 
-    A side of `pixels` is divided into equal `blocks`. Positions beyond the outermost centres are moved there.
+    A side of `pixels` is divided into `blocks` of equal length. Positions beyond the outermost block centres
+    are moved to these centres.
     """
     width = pixels // blocks
     place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
@@ -96,7 +97,7 @@ def place_among_blocks(pixel: FloatArray, pixels: int, blocks: int) -> tuple[Int
 
 
 def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
-    """Return the weights (pixels, blocks) of linear interpolation between block centres, constant beyond."""
+    """Return the weights (pixels, blocks) of linear interpolation between block centres."""
     first, share = place_among_blocks(np.arange(pixels, dtype=float), pixels, blocks)
     weights = np.zeros((pixels, blocks))
     weights[np.arange(pixels), first] += 1.0 - share
@@ -105,15 +106,15 @@ def interpolation_weights(pixels: int, blocks: int) -> FloatArray:
 
 
 _STRETCH = 32_768
-"""Number of pixels that are summed at once: they fit into the cache of the processor."""
+"""Number of pixels that are summed at once, small enough for the cache of the processor."""
 
 
 def box_sum(image: Image) -> Image:
-    """Return the sums over 3 x 3 pixels around each pixel (rows, columns); the outermost are zero."""
+    """Return the sums over 3 x 3 pixels around each pixel (rows, columns), with zeros along the border."""
     columns, flat = image.shape[1], np.ascontiguousarray(image).reshape(-1)
     total = np.empty(image.shape, dtype=image.dtype)
     sums = total.reshape(-1)
-    # Successive rows run into each other, which affects the outermost pixels only.
+    # The flat array joins successive rows, which affects only the pixels at the border.
     for start in range(columns + 1, flat.size - columns - 1, _STRETCH):
         stop = min(start + _STRETCH, flat.size - columns - 1)
         down = flat[start - columns - 1 : stop - columns + 1] + flat[start - 1 : stop + 1]
@@ -127,14 +128,15 @@ def box_sum(image: Image) -> Image:
 
 
 def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Image) -> Image:
-    """Return flat `sums` over 3 x 3 pixels of a frame of `shape` after light is subtracted from the frame.
+    """Return flat 3 x 3 `sums` of a frame of `shape` after subtraction of counts from some of its pixels.
 
-    `pixels` (m,) are the flat numbers of different pixels, and `taken` (m,) is the light subtracted there.
+    `pixels` (m,) are the flat indices of the changed pixels, each given once, and `taken` (m,) are the counts
+    to subtract.
     """
     out, (rows, columns) = sums.copy(), shape
     for down in (-columns, 0, columns):
         for beside in (-1, 0, 1):
-            # Sums that cross the edge of the frame belong to outermost pixels, which are zero.
+            # Sums that cross the edge of the frame belong to pixels at the border, which are set to zero.
             out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
     framed = out.reshape(rows, columns)
     framed[[0, -1]] = 0
@@ -148,10 +150,11 @@ class Moments:
 
     Attributes:
         flux: light (n,), counts.
-        centre: centre of light (n, 2), x and y, px.
-        length: length of the uniform line with the second moments of the region (n,), px; about 0 if round.
-        thickness: rms width across the line (n,), px.
-        direction: angle from the rows to the line (n,), rad.
+        centre: centroid of each region (n, 2), x and y, px.
+        length: length of the uniform line with the second moments of each region (n,), px. It is about 0 for
+            a round region.
+        thickness: rms width of each region across its line (n,), px.
+        direction: angle from the pixel rows to the line of each region (n,), rad.
     """
 
     flux: FloatArray
@@ -162,24 +165,25 @@ class Moments:
 
 
 def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the true pixels of a mask, faster than `nonzero` if they are few."""
+    """Return rows and columns of the true pixels of a mask, faster than `nonzero` for few true pixels."""
     row, column = np.divmod(np.flatnonzero(mask), mask.shape[1])
     return row, column
 
 
 def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return the region number (m,) of each flat `pixel` (m,), ascending, and the number of regions.
+    """Return the region number (m,) of each flat index in `pixel` (m,), ascending, and the region count.
 
-    Regions are 8-connected and numbered in the order of their first pixels. Runs of pixels along rows are
-    connected, because there are many times fewer of them than pixels. Each run points to a lower one of its
-    group, over fewer and fewer links (Shiloach and Vishkin 1982). scipy.sparse would need 12 MiB more.
+    Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
+    pixels along rows, because there are far fewer runs than pixels. Each run is linked to an earlier run of
+    its region, and the links are shortened until all runs of a region share one root (Shiloach and Vishkin
+    1982). The module scipy.sparse would need 12 MiB more.
     """
-    # One empty column is added, so that no run continues in the next row.
+    # An empty column is added, so that no run continues in the next row.
     pixel, columns = pixel + pixel // columns, columns + 1
     first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
     length = np.diff(first, append=len(pixel))
     start, stop = pixel[first], pixel[first] + length
-    # A run touches each run of the next row that lies between one column before it and one column after it.
+    # A run touches each run of the next row between one column before and one column after it.
     low = np.searchsorted(stop, start + columns)
     count = np.searchsorted(start, stop + columns, side="right") - low
     one = np.repeat(np.arange(len(first)), count)
@@ -200,9 +204,9 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
 
 
 def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
-    """Return the moments of `count` regions of pixels (m,), each with the number of its region and its light.
+    """Return the moments of `count` regions from region number, position and counts of pixels (m,).
 
-    The moments of a region without light are zero.
+    The moments of a region with zero flux are zero.
     """
     flux = np.bincount(owner, light, count).astype(np.float64)
     whole = np.where(flux > 0.0, flux, np.inf)
@@ -212,7 +216,7 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
     yy = np.bincount(owner, light * dy * dy, count) / whole
     xy = np.bincount(owner, light * dx * dy, count) / whole
     # The point spread increases both principal moments by the same amount.
-    # The difference of the moments is therefore that of a line of length L, L^2/12.
+    # The difference of the principal moments is therefore that of a line of length L, which is L^2/12.
     spread = np.hypot(xx - yy, 2.0 * xy)
     return Moments(
         flux,
@@ -224,9 +228,10 @@ def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray,
 
 
 def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
-    """Return the ends (2, 2), px, of the uniform line around `centre` (2,) with given second moments.
+    """Return the ends (2, 2), px, of the uniform line with a given `centre` (2,) and `covariance` (2, 2).
 
-    Both ends are the centre if the line is not longer than `least_length` px. The moments (2, 2) are in px^2.
+    Both ends are equal to the centre if the line is not longer than `least_length` px. The second moments
+    `covariance` are in px^2.
     """
     (across, along), axes = np.linalg.eigh(covariance)
     length = float(np.sqrt(12.0 * max(along - across, 0.0)))
@@ -235,20 +240,26 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 
 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
-"""Limit of the neighbours of a hot pixel: a fraction of its light plus standard deviations of the noise, at
-most another fraction, which the neighbours of a faint star reach."""
+"""Limits for the neighbours of a hot pixel.
+
+A neighbour must be below a fraction of the hot pixel plus standard deviations of the noise, and below a
+maximum fraction.
+"""
 _PAIR, _PAIR_NOISE = 20.0, 1.0
-"""Least brightness of two adjacent hot pixels, and the noise in the limit of the third brightest pixel, in
-standard deviations."""
+"""Limits for two adjacent hot pixels, in standard deviations.
+
+The first limit is the minimum brightness of both pixels. The second limit is the noise margin of the third
+brightest pixel.
+"""
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
-"""Least brightness of a hot pixel that is replaced, and of one that is excluded, in standard deviations."""
+"""Minimum brightness (standard deviations) of a hot pixel that is replaced, and of one that is excluded."""
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
 def repair_hot_pixels(signal: Image, noise: Image) -> int:
-    """Replace the hot pixels of `signal` (rows, columns) by the median of their neighbours; return how many.
+    """Replace hot pixels of `signal` (rows, columns) by their neighbours' median, and return their number.
 
-    Only pixels well above their `noise` (rows, columns) are examined.
+    Only pixels well above the `noise` (rows, columns) are tested.
     """
     row, column = positions(signal > _REPAIR_SIGMAS * noise)
     row, column, around = _hot(signal, row, column, noise[row, column])
@@ -257,9 +268,9 @@ def repair_hot_pixels(signal: Image, noise: Image) -> int:
 
 
 def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of the hot pixels of `signal` that stand well above their noise.
+    """Return rows and columns of the hot pixels of `signal` that are well above the noise.
 
-    `variance` (rows, columns) is the squared noise.
+    `variance` (rows, columns) is the noise variance of each pixel.
     """
     row, column = positions(signal > np.float32(_HOT_SIGMAS * np.sqrt(variance.min())))
     noise = np.sqrt(variance[row, column])
@@ -269,9 +280,9 @@ def find_hot_pixels(signal: Image, variance: Image) -> tuple[IntArray, IntArray]
 
 
 def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return which windows (n,) of nine pixels hold nothing but one or two hot pixels.
+    """Return whether each of n windows of nine pixels contains only one or two hot pixels and noise.
 
-    `light` (9, n) are the pixels, and `noise` (n,) is the noise of a pixel.
+    `light` (9, n) holds the pixels of each window, and `noise` (n,) is the noise of a pixel.
     """
     third, second, highest = np.partition(light, (6, 7, 8), axis=0)[6:]
     alone = second < np.minimum(_SHARPNESS * highest + _NOISE * noise, _MOST * highest)
@@ -282,28 +293,31 @@ def are_hot(light: FloatArray, noise: FloatArray) -> BoolArray:
 def _hot(
     signal: Image, row: IntArray, column: IntArray, noise: FloatArray
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows and columns of the hot ones of pixels (m,), and the eight pixels (8, k) around each."""
+    """Return rows and columns of the hot pixels among m pixels, and the eight neighbours (8, k) of each."""
     inside = (row > 0) & (row < signal.shape[0] - 1) & (column > 0) & (column < signal.shape[1] - 1)
     row, column, noise = row[inside], column[inside], noise[inside]
     around = np.stack([signal[row + dr, column + dc] for dr, dc in _AROUND])
     own = signal[row, column]
-    # Each of two adjacent hot pixels is examined; a pixel with two brighter neighbours is not hot.
+    # Two adjacent hot pixels are both tested, but a pixel with two brighter neighbours is not hot.
     hot = are_hot(np.concatenate([around, own[None]]), noise) & (np.count_nonzero(around > own, axis=0) <= 1)
     return row[hot], column[hot], around[:, hot]
 
 
 _DEAD_FRACTION = 1e-4
-"""Fraction of pixels that differ from one value in a dead frame, due to hot pixels."""
+"""Largest fraction of differing pixels (hot pixels) in a dead frame."""
 _PLATEAU = 6
-"""Least number of pixels with the highest count that show where the converter saturates, in a frame of
-streaks."""
+"""Minimum number of saturated pixels in a frame of streaks from which saturation is recognised."""
 _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
-"""Least number of such pixels in a frame of points, their least ratio to the number of pixels just below, and
-the range of these, as a fraction of the range of counts."""
+"""Limits for saturation in a frame of points.
+
+The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
+of this number to the number of pixels just below. The third limit is the range of counts that is just below,
+as a fraction of all counts.
+"""
 
 
 class FrameState(Enum):
-    """Whether a frame holds a scene, or why not."""
+    """Whether a frame contains a scene, and the reason if it does not."""
 
     USABLE = "usable"
     BLACK = "black"
@@ -311,13 +325,14 @@ class FrameState(Enum):
 
 
 def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> FrameState:
-    """Return whether a frame (rows, columns) is usable, dead (one value everywhere) or overexposed.
+    """Return whether a frame (rows, columns) is usable, dead (all pixels are equal) or overexposed.
 
-    It is overexposed if at least `saturated_fraction` of its pixels reach `saturation` counts.
+    A frame is overexposed if at least a fraction `saturated_fraction` of its pixels reaches `saturation`
+    counts.
     """
     if np.count_nonzero(at_least(pixels, saturation)) >= saturated_fraction * pixels.size:
         return FrameState.SATURATED
-    # A comparison in the frame's own type takes a quarter of the time.
+    # A comparison in the integer type of the frame is four times as fast.
     usual = np.median(pixels[::8, ::8]).astype(pixels.dtype)
     if np.count_nonzero(pixels != usual) <= _DEAD_FRACTION * pixels.size:
         return FrameState.BLACK
@@ -325,29 +340,30 @@ def frame_state(pixels: Image, saturation: float, saturated_fraction: float) -> 
 
 
 def saturation_level(pixels: Image, given: float | None) -> float:
-    """Return the count at which pixels saturate: `given`, the integer type's maximum, or infinity."""
+    """Return the saturation count: `given`, otherwise the maximum of the integer type or infinity."""
     if given is not None:
         return given
     return float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "ui" else np.inf
 
 
 def saturation_count(pixels: Image) -> float:
-    """Return the count at which pixels saturate: the highest if several pixels share it, else the type's.
+    """Return the saturation count: the highest count if several pixels have it, else the type's maximum.
 
-    This serves frames of streaks, whose bright stars spread over many pixels.
+    This function is for frames of streaks, in which bright stars cover many pixels.
     """
     highest = pixels.max()
-    # A frame of one value everywhere is dead, unless the value is the maximum of its type.
+    # A frame with only one value is dead, unless the value is the maximum of its type.
     if pixels.min() < highest and np.count_nonzero(pixels == highest) >= _PLATEAU:
         return float(highest)
     return saturation_level(pixels, None)
 
 
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
-    """Return the count at which pixels saturate: `given`, a plateau of bright `counts` (m,), or the maximum.
+    """Return the saturation count: `given`, the highest of `counts` (m,) if many share it, or the maximum.
 
-    This serves frames of points from any camera. The highest counts of a dim frame are noise, of which the
-    highest is the rarest; a plateau holds more pixels than the counts just below it.
+    This function is for frames of points from any camera. In a dim frame, the highest counts are noise and
+    become rarer with their height. At saturation, more pixels have the highest count than the counts just
+    below.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)
@@ -361,22 +377,22 @@ def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None)
 
 
 def at_least(pixels: Image, level: float) -> BoolArray:
-    """Return which `pixels` reach `level` counts; integers are compared in their own type."""
+    """Return which `pixels` reach `level` counts. Integers are compared in their own type."""
     if not np.issubdtype(pixels.dtype, np.integer) or not 0.0 <= level <= np.iinfo(pixels.dtype).max:
         return np.asarray(pixels >= level)
     return np.asarray(pixels >= pixels.dtype.type(np.ceil(level)))
 
 
 _STRIDE = 16
-"""Distance of the pixels from which the step is estimated."""
+"""Distance (px) between the sampled pixels from which the step between counts is estimated."""
 _MOST_BETWEEN = 0.01
-"""Largest fraction of repaired pixels, whose counts may lie between the steps."""
+"""Largest fraction of pixels with counts between the steps, which a repair of hot pixels can cause."""
 
 
 def in_steps(pixels: Image) -> tuple[Image, int, int]:
-    """Return unsigned `pixels` (rows, columns) in steps of their counts, the step, and the count of step 0.
+    """Return `pixels` (rows, columns) divided by the step between their counts, the step, and the offset.
 
-    Pixels whose counts have no common step are returned unchanged, with 1 and 0.
+    Unsigned pixels without a common step are returned unchanged, with the step 1 and the offset 0.
     """
     values = np.unique(pixels[::_STRIDE, ::_STRIDE]).astype(np.int64)
     step = int(np.gcd.reduce(values - values[0]))

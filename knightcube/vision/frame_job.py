@@ -1,16 +1,18 @@
 """Attitude and rate from one frame: the decision tree of the vision worker and of `flight solve`.
 
-1. The motion over the exposure is estimated. In flight this is done for every frame, because each reports its
-   rate. For any other image it is done only if a survey of its bright areas, which is faster, shows streaks.
-   If these give no attitude (a fence or a striped wall looks like streaks too), the points of the image are
-   tried.
-2. Stars at rest are searched near their predicted positions if there is a prior attitude. Without one, or if
-   that fails, they are searched in the whole frame.
-3. Streaks give the positions of their stars at mid-exposure, which are identified like points. A wrong focal
-   length, or the stars that are known by then, lead to a second fit of the streaks.
+1. In flight, the motion over the exposure is estimated for every frame, because each frame reports a rate.
+   For any other image, the motion is only estimated if a fast survey of the bright areas shows streaks. If
+   the streaks do not give an attitude (a fence or a striped wall looks like streaks too), the points of the
+   image are identified.
 
-The control process creates the job and receives its result. The estimators, and scipy with them, take tens of
-MB that it does not need. They are imported when they are used.
+2. Stars at rest are searched near their predicted positions if there is a prior attitude. Without a prior
+   attitude, or if this search does not succeed, stars are searched in the whole frame.
+
+3. The positions of streaked stars at mid-exposure are identified like points. The streaks are fitted a second
+   time with a corrected focal length or with the directions of the identified stars.
+
+The control process creates the job and receives the result. The streak estimators and scipy, which occupy
+tens of MB, are imported at their first use, because the control process does not need them.
 """
 
 from __future__ import annotations
@@ -49,22 +51,22 @@ from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, S
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 # Relative error of the focal length above which the motion is fitted again.
 _SCALE_TOLERANCE = 0.01
-# Motion (px) over the exposure below which a star is a point.
+# Motion (px) over the exposure below which a star is measured as a point.
 _POINT_PX = 1.0
-# Predicted streak length (px) below which stars are measured as points if the frame gives no motion.
-# In a crowded sky, merged regions look like streaks.
+# Predicted streak length (px) below which stars are measured as points if no motion can be fitted.
+# In a crowded sky, merged regions can look like streaks.
 _SHORT_PX = 4.0
-# Uncertainty (px) of a trail up to which it is part of the model of a star's light.
+# Largest uncertainty (px) of a predicted trail that is included in the model of a star's image.
 _KNOWN_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """Settings of the identification of stars.
+    """Settings of the star identification.
 
     Attributes:
-        solve: settings of the steps.
-        scale: lowest and highest factor of the focal length; (1, 1) for a calibrated lens.
+        solve: settings of star detection, identification and attitude.
+        scale: lowest and highest factor on the focal length, (1, 1) for a calibrated lens.
         index: file of the sky index; None: the default index.
     """
 
@@ -74,7 +76,7 @@ class TrackerSettings:
 
 
 class StreakEstimator(Protocol):
-    """Alternative estimator of streaks, for comparison; it can be pickled."""
+    """Interface of an alternative estimator of streaks, which must support pickling."""
 
     def motion(
         self,
@@ -85,7 +87,7 @@ class StreakEstimator(Protocol):
         prior_sigma: float,
         previous_checksum: int | None,
     ) -> FrameMotion:
-        """Return the motion over the exposure (s), with arguments as `estimate_motion` has them."""
+        """Return the motion over the exposure (s). The arguments are those of `estimate_motion`."""
 
     def solve(
         self,
@@ -96,24 +98,24 @@ class StreakEstimator(Protocol):
         settings: SolveSettings,
         prior: AttitudePrior | None,
     ) -> tuple[FrameSolution, FrameMotion]:
-        """Return the attitude at mid-exposure by the streaks of a motion `found`, and the refined motion."""
+        """Return the attitude at mid-exposure from the streaks of motion `found`, and a refined motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameJob:
-    """A frame with its camera, priors and settings.
+    """A frame with its camera, prior estimates and settings.
 
     Attributes:
-        pixels: the frame (rows, columns).
+        pixels: counts of the frame (rows, columns).
         camera: the camera.
         exposure: exposure time, s.
-        estimator: settings of the maximum-likelihood estimator, or another estimator of streaks.
-        tracker: settings of the identification of stars; None: stars are not identified.
-        rate_prior, attitude_prior: predictions; None: unknown.
-        previous_checksum: checksum of the previous frame; identical pixels mean a frozen camera.
-        motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
-        objects: settings of the measurement of objects; None: objects are not measured.
-        kept: folder in which the frame is kept; None: it is not kept.
+        estimator: settings of the maximum-likelihood estimator, or an alternative estimator of streaks.
+        tracker: settings of the star identification. If `tracker` is None, stars are not identified.
+        rate_prior, attitude_prior: predicted rate and attitude; None: unknown.
+        previous_checksum: checksum of the previous frame. Identical checksums indicate a frozen camera.
+        motion_first: whether the motion is always estimated, and not only if a survey shows streaks.
+        objects: settings of the measurement of objects. If `objects` is None, objects are not measured.
+        kept: folder in which the frame is stored; None: it is not kept.
     """
 
     pixels: Image
@@ -134,9 +136,10 @@ class FrameFound:
     """The result of a frame.
 
     Attributes:
-        motion: motion over the exposure.
+        motion: motion of the camera over the exposure.
         solution: attitude at mid-exposure; None if stars were not identified.
-        objects: possible objects; None if they were not measured, or the attitude is unknown.
+        objects: points that may be objects other than stars; None if objects were not measured or the
+            attitude is unknown.
     """
 
     motion: FrameMotion
@@ -145,7 +148,7 @@ class FrameFound:
 
 
 def run(job: FrameJob) -> FrameFound:
-    """Return attitude and rate of a frame. The worker process imports this function by its name."""
+    """Return attitude and rate from a frame. The worker process imports this function by its name."""
     tracker = job.tracker
     if tracker is None:
         found = FrameFound(_motion(job), None)
@@ -166,7 +169,7 @@ def run(job: FrameJob) -> FrameFound:
 
 
 def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
-    """Return the results of a frame as plain values, camera axes, for its file."""
+    """Return the results of a frame in camera axes as plain values for the metadata file."""
     motion, solution = found.motion, found.solution
     rate = motion.rate if motion.status is StreakStatus.RATE else None
     fix = None if solution is None else solution.fix
@@ -184,12 +187,12 @@ def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
 
 
 def _places(points: FloatArray) -> list[list[float]]:
-    """Return points (n, 2), px, rounded to tenths of a pixel."""
+    """Return points (n, 2), px, rounded to tenths of a pixel, as nested lists."""
     return [[round(x, 1), round(y, 1)] for x, y in points.tolist()]
 
 
 def prepare() -> None:
-    """Import the estimator; a worker does so before its first job."""
+    """Import the streak estimator, so that the first job of a worker starts without delay."""
     from knightcube.vision.streaks import estimate  # noqa: F401, PLC0415
 
 
@@ -203,20 +206,21 @@ def solve_frame(
     attitude_prior: AttitudePrior | None = None,
     rate_prior: RatePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude of any image (rows, columns), and its rate if it shows streaks.
+    """Return the attitude from an image (rows, columns), and the rate if the image shows streaks.
 
     Args:
-        pixels: the image (rows, columns), counts.
-        camera: the assumed camera, of the size of the image.
-        scale: lowest and highest factor of the tangents; (1, 1) for a calibrated camera.
+        pixels: counts of the image (rows, columns).
+        camera: assumed camera, of the size of the image.
+        scale: lowest and highest factor on the tangents of field angles, (1, 1) for a calibrated camera.
         exposure: exposure time, s.
         sky: the guide stars.
-        settings: settings of the steps.
-        attitude_prior: predicted attitude, near which stars are searched first.
-        rate_prior: predicted rate. It gives the direction of time, which one frame does not show.
+        settings: settings of star detection, identification and attitude.
+        attitude_prior: predicted attitude. Stars are first searched near their predicted positions.
+        rate_prior: predicted rate. The predicted rate determines the sign of the rotation, which a single
+            frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    # The positions of the stars are needed, for which a poorly known rate is sufficient.
+    # Only the positions of the stars are needed, so that a poorly determined rate is accepted.
     estimator = replace(settings.likelihood, worst_uncertainty=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
@@ -227,10 +231,10 @@ def solve_frame(
 
 
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
-    """Return attitude and rate of a frame by the decision tree."""
+    """Return attitude and rate from a frame by the decision tree in the module docstring."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    # Few short streaks can be fitted, and their direction is uncertain; all stars have predicted positions.
+    # A fit of a few short streaks is uncertain, but all stars have predicted positions.
     trails, prior = _short_trails(job), job.attitude_prior
     if prior is not None and (rests or (trails is not None and _predicted_within(job, _SHORT_PX))):
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, trails)
@@ -247,7 +251,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: FrameMotion) -> FrameFound:
-    """Return the attitude of a frame of streaks, by the method of their estimator."""
+    """Return the attitude from a frame of streaks, by the method of the estimator."""
     if isinstance(motion, MotionResult):
         return _from_streaks(job, tracker, sky, motion)
     assert not isinstance(job.estimator, LikelihoodSettings)  # it makes a MotionResult
@@ -258,14 +262,14 @@ def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion:
 
 
 def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
-    """Return attitude and rate of an image; a survey decides whether it shows points or streaks."""
+    """Return attitude and rate from an image that a survey has classified as points or streaks."""
     seen = survey(job.pixels, tracker.solve.detection)
     found: FrameFound | None = None
     if seen.shape.kind is FrameKind.STREAKS:
         found = _from_motion(job, tracker, sky, _motion(job))
         if found.solution is None or found.solution.status is SolveStatus.SOLVED:
             return found
-    # A fence or a striped wall looks like streaks; the sky beside it shows points.
+    # A fence or a striped wall looks like streaks, but the sky beside it shows points.
     points = _from_points(job, tracker, sky, seen)
     if found is not None and points.status is not SolveStatus.SOLVED:
         return found
@@ -278,17 +282,17 @@ def _from_points(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, seen: S
 
 
 def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:
-    """Return the attitude of a frame of streaks and its motion, after a second fit if possible."""
+    """Return attitude and motion from a frame of streaks, after a second fit if possible."""
     settings, prior = tracker.solve, job.attitude_prior
     solution = solve_motion(motion, job.camera, tracker.scale, sky, settings, prior)
     if solution.status is not SolveStatus.SOLVED:
         return FrameFound(motion, solution)
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
-        assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
+        assert isinstance(again, MotionResult)  # The estimator is that of `motion`.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        # For a single image the refit takes half as long again for a small gain.
+        # For a single image, the second fit would add half the computing time for a small gain.
         return FrameFound(motion, solution)
     from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
@@ -298,7 +302,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
 
 
 def _motion(job: FrameJob) -> FrameMotion:
-    """Return the motion over the exposure, by the estimator of the job."""
+    """Return the motion over the exposure from the estimator of the job."""
     from knightcube.vision.streaks.estimate import estimate_motion  # noqa: PLC0415
 
     prior = job.rate_prior
@@ -311,18 +315,18 @@ def _motion(job: FrameJob) -> FrameMotion:
 
 
 def _no_motion(job: FrameJob) -> MotionResult:
-    """Return the result without a motion, for a frame of points."""
+    """Return a result without a motion, for a frame of points."""
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
 
 
 def _shows_no_motion(job: FrameJob, motion: FrameMotion) -> bool:
-    """Return whether stars are at rest, or move too little, by the priors, for a frame to show motion."""
+    """Return whether the stars are at rest, or move too little according to the priors to form streaks."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
 
 
 def _short_trails(job: FrameJob) -> ShortTrails | None:
-    """Return the motion of stars over the exposure; None unless it is known to a fraction of a pixel."""
+    """Return the predicted motion of the stars over the exposure, or None if it is too uncertain."""
     prior, estimator = job.rate_prior, job.estimator
     if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
         return None
@@ -334,7 +338,7 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:
-    """Return whether the priors predict streaks shorter than `length`, px; an unknown rate is small."""
+    """Return whether the priors predict streaks shorter than `length` px. An unknown rate counts as zero."""
     if job.attitude_prior is None:
         return False
     if job.rate_prior is None:

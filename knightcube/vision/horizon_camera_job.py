@@ -1,9 +1,9 @@
-"""Sun and nadir in body axes from the images of the horizon cameras: the job of the worker process `wide`.
+"""Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The solar strings choose the camera to read first, and give the Sun if no camera finds it. Nadir is fitted to
-the limbs of all images at once. If no image shows a limb, the Earth may fill one camera while the others are
-dark: the brightness of all images then gives a coarse nadir. The methods are imported when they are used,
-because the control process does not need them.
+The solar strings determine which camera is read first. They also give the Sun direction if no camera finds
+the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a limb, the Earth
+may fill one camera while the others are dark. The brightness of all images then gives a coarse nadir
+direction. The estimators are imported when they are used, because the control process does not need them.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResp
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Counts of a pixel that the sunlit Earth exceeds and its stray light beside it does not."""
+"""Pixel count that the sunlit Earth exceeds, and its stray light does not."""
 LIT_SIGMA = 0.3
-"""Largest standard deviation (rad) of a rough attitude that gives the direction of the Sun."""
+"""Largest standard deviation (rad) of an attitude that is used to predict the Sun direction."""
 EARTHLIGHT_SIGMA = 0.1
-"""Largest standard deviation (rad) of a rough attitude that predicts which strings the Earth lights."""
+"""Largest standard deviation (rad) of an attitude that predicts which solar strings the Earth illuminates."""
 JUDGING_SIGMA = 0.005
-"""Largest standard deviation (rad) of an attitude that predicts the content of the images."""
+"""Largest standard deviation (rad) of an attitude that is used to check the content of the images."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonCameraJob:
-    """Images of one instant and prior knowledge.
+    """Images of all horizon cameras at one instant, and prior knowledge.
 
     Attributes:
-        frames: images (rows, columns), by the numbers of their cameras.
+        frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: the solar strings and their currents (n,), A; None without a recent reading.
-        response: response of the cameras to light; None: linear.
+        strings: model of the solar strings and their currents (n,), A. It is None without a recent reading.
+        response: response of the cameras to intensity; None: linear.
     """
 
     frames: Mapping[int, Image]
@@ -52,7 +52,8 @@ class HorizonCameraJob:
 class MeasuredDirection:
     """A direction (3,) in body axes, its covariance (3, 3), rad^2, and the cameras that measured it.
 
-    Without a camera it is the Sun of the strings, or a nadir from the brightness of all images.
+    If `cameras` is empty, the direction is the Sun from the solar strings, or the nadir from the brightness
+    of all images.
     """
 
     direction: FloatArray
@@ -61,7 +62,7 @@ class MeasuredDirection:
 
     @property
     def sigma(self) -> float:
-        """The root of the mean variance over the two axes, rad."""
+        """The standard deviation per axis, rad: the root of the mean variance over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.covariance)))
 
 
@@ -70,9 +71,9 @@ class HorizonCameraResult:
     """The result of a job.
 
     Attributes:
-        sun, nadir: the measured directions; None if there is none.
-        false: reasons why images contradict an accurate attitude, by the numbers of their cameras; None
-            without such an attitude.
+        sun, nadir: measured directions; None if there is none.
+        false: reasons why images contradict an accurate attitude, by camera index. It is None without an
+            accurate attitude.
     """
 
     sun: MeasuredDirection | None
@@ -127,7 +128,10 @@ def _nadir(
 
 
 def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
-    """Return why images contradict an accurate attitude; None without such an attitude."""
+    """Return why images contradict an accurate attitude, by camera index.
+
+    The result is None without an accurate attitude.
+    """
     from knightcube.vision.horizon.illumination import image_brightness, why_false  # noqa: PLC0415
     from knightcube.vision.horizon.limb import MEAN_RADIUS  # noqa: PLC0415 - see the top
 
@@ -142,7 +146,7 @@ def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the nadir (3,), body axes, that a rough attitude predicts; None if it is too uncertain."""
+    """Return the nadir (3,), body axes, predicted by a rough attitude; None if it is too uncertain."""
     rough, position = knowledge.attitude, knowledge.position
     if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None
@@ -150,7 +154,7 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
 
 
 def _expected_sun(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the Sun's direction (3,), body axes, that a rough attitude predicts; None if too uncertain."""
+    """Return the Sun direction (3,), body axes, predicted by a rough attitude; None if too uncertain."""
     rough = knowledge.attitude
     if rough is None or rough.sigma > LIT_SIGMA or knowledge.sun is None:
         return None

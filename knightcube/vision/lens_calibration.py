@@ -1,14 +1,14 @@
-"""Calibration of a camera's lens from solved frames: focal length, optical axis and radial distortion.
+"""Calibration of a camera lens from solved frames: focal length, optical axis and radial distortion.
 
-The fit is weighted least squares in pixels over all frames at once, with the attitude of each frame unknown.
-Wrong matches are first weighted down with Cauchy weights, scaled by the spread of the residuals, and then
-rejected beyond five sigma. The attitudes, three small rotations per frame, are eliminated frame by frame
-with the Schur complement, so that a 5 x 5 system is solved for any number of frames.
+The fit is a weighted least-squares fit in pixels to all frames at once, with an unknown attitude for each
+frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. They are
+then rejected if they exceed five standard deviations. The attitudes are eliminated frame by frame with the
+Schur complement, as three small rotations each. The remaining system is 5 x 5 for any number of frames.
 
-The data may not determine some parameters: in a narrow field a shift of the axis looks like a rotation of
-the camera, and a single frame hardly separates the two. Each parameter therefore has a prior around the
-assumed lens: the initial focal length, an axis in the image centre, no distortion. A parameter whose standard
-deviation is not below half of its prior is named in `undetermined`.
+The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a
+rotation of the camera, and a single frame hardly separates the two. Each parameter therefore has a prior
+around an ideal lens with the initial focal length, the optical axis in the image centre and no distortion.
+Parameters whose standard deviation exceeds half of the prior standard deviation are listed in `undetermined`.
 """
 
 from __future__ import annotations
@@ -35,54 +35,54 @@ from knightcube.vision.startracker.solve import FrameSolution, SolveSettings
 
 PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2")
 MIN_STARS = 24
-"""Smallest number of used matches for a calibration: three per parameter of the lens and of an attitude."""
+"""Minimum number of accepted matches: three per parameter of the lens and of one attitude."""
 _ROBUST_STEPS = 20
 _MAX_STEPS = 50
 _MAX_SELECTIONS = 10
 _CONVERGED = 1e-6
-"""Predicted decrease of the chi-square at which the fit has converged."""
+"""Predicted decrease of chi-square at which the fit is converged."""
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 """Relative rounding error of a length in a frame."""
 _CUT = 5.0
-"""Residual, in sigmas, above which a match is rejected."""
+"""Residual, in standard deviations, above which a match is rejected."""
 _CAUCHY = 2.385
-"""Cauchy's constant for 95 % efficiency without wrong matches."""
+"""Tuning constant of the Cauchy weights, for 95 % efficiency without outliers."""
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
 """Median length of a residual of unit variance per axis (Rayleigh distribution)."""
 _DETERMINED = 0.5
-"""Fraction of its prior's standard deviation below which a parameter counts as determined."""
+"""Ratio to the prior standard deviation below which a parameter counts as determined."""
 _MAX_EXCESS = 3.0
-"""Excess of the chi-square, in its standard deviations, above which the given sigmas count as too small."""
+"""Excess of chi-square, in its standard deviations, above which position errors count as too small."""
 _MIN_SPREAD = 1e-12
-"""Smallest relative eigenvalue of a frame's attitude information."""
+"""Minimum eigenvalue of a frame's attitude information, relative to its trace."""
 _MIN_INDEPENDENCE = 1e-10
-"""Smallest eigenvalue of the lens information, normalised to a unit diagonal."""
+"""Minimum eigenvalue of the lens information, normalised to a unit diagonal."""
 _MIN_COSINE = 0.05
-"""Cosine of the angle to the optical axis below which a star cannot be in the image."""
+"""Minimum cosine of the angle between a star in the image and the optical axis."""
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
-"""Prior standard deviation (px for the centre) that holds an omitted term, in the order of omission."""
+"""Prior standard deviations that fix omitted terms (px for the centre), in the order of omission."""
 _ROUNDS = 3
-"""Number of times that the images are solved: with a better lens more stars in the corners match."""
+"""Number of passes over the images. A better lens lets more stars in the corners match."""
 _MIN_SIGMA_PX = 0.02
-"""Smallest standard deviation of a star's position (px), for the errors that its covariance lacks."""
+"""Minimum standard deviation (px) of a star position, for errors that the covariance does not include."""
 _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
-"""Settings for which a mirrored image is not solved: a lens does not mirror."""
+"""Settings that do not accept mirrored images, because a lens does not mirror."""
 _MIN_USED = 0.5
-"""Smallest used fraction of a frame's matches for a frame of the common lens."""
+"""Minimum fraction of accepted matches of a frame that belongs to the common lens."""
 
 
 class CalibrationError(FlightError):
-    """Frames that do not determine a lens."""
+    """Error raised for frames that do not determine a lens."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFrame:
-    """Stars identified in one frame, of which a few may be wrong.
+    """Stars identified in one frame, a few of them possibly wrong.
 
     Attributes:
-        points: measured positions (n, 2), px.
-        sigma: standard deviations (n,) of the positions along one axis, px.
-        directions: unit vectors (n, 3) of the stars in any reference frame.
+        points: measured star positions (n, 2), px.
+        sigma: standard deviations (n,) of the star positions along one axis, px.
+        directions: unit vectors (n, 3) to the stars in any reference frame.
     """
 
     points: FloatArray
@@ -92,7 +92,7 @@ class MatchedFrame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensFit:
-    """Parameters (5,) of a lens and attitudes (m, 4) of the frames, from reference to camera."""
+    """Lens parameters (5,) and attitudes (m, 4) of the frames, from reference axes to camera axes."""
 
     parameters: FloatArray
     attitudes: FloatArray
@@ -103,9 +103,9 @@ class FitStep:
     """Result of one Gauss-Newton step.
 
     Attributes:
-        fit: lens and attitudes after the step.
-        decrease: decrease of the chi-square that the linear model predicts.
-        information: information (5, 5) of the stars about the lens, with unknown attitudes.
+        fit: lens parameters and attitudes after the step.
+        decrease: decrease of chi-square that the linear model predicts.
+        information: information matrix (5, 5) of the lens parameters from the stars, with unknown attitudes.
     """
 
     fit: LensFit
@@ -114,12 +114,12 @@ class FitStep:
 
 
 def parameters_of(lens: Lens) -> FloatArray:
-    """Return the parameters (5,) of a lens."""
+    """Return the parameters (5,) of a lens in the order of PARAMETERS."""
     return np.array([lens.focal_length, *lens.centre, lens.k1, lens.k2])
 
 
 def residuals(frame: MatchedFrame, fit: LensFit, number: int) -> FloatArray:
-    """Return measured minus predicted positions (n, 2), in sigmas, of the frame with that number.
+    """Return measured minus predicted positions (n, 2) of frame `number`, in standard deviations.
 
     The residual of a star beside or behind the camera is infinite.
     """
@@ -139,16 +139,17 @@ def step(
     prior: FloatArray,
     expected: FloatArray,
 ) -> FitStep:
-    """Return the fit after one Gauss-Newton step.
+    """Return lens and attitudes after one Gauss-Newton step.
 
     Args:
         frames: the frames.
-        fit: lens and attitudes before the step.
-        weights: factors (n,) of the squared residuals of each frame.
-        prior: information (5,) about the difference of each parameter from `expected`.
-        expected: parameters (5,) of the prior.
+        fit: lens parameters and attitudes before the step.
+        weights: factors (n,) on the squared residuals of each frame.
+        prior: prior information (5,) on each parameter, as inverse variances.
+        expected: prior means (5,) of the parameters.
 
-    Raises CalibrationError if a frame does not determine its attitude or the data do not determine the lens.
+    Raises CalibrationError if a frame does not determine its attitude, or if the data do not determine the
+    lens.
     """
     information, gradient = np.zeros((len(PARAMETERS), len(PARAMETERS))), np.zeros(len(PARAMETERS))
     turns, decrease = [], 0.0
@@ -161,7 +162,7 @@ def step(
         free, coupling = inverse @ (turn.T @ misfit), inverse @ (turn.T @ lens)
         turns.append((free, coupling))
         decrease += float(free @ (turn.T @ misfit))
-        beyond = lens - turn @ coupling  # the effect of the lens that no rotation can have
+        beyond = lens - turn @ coupling  # lens effect that no rotation can compensate
         information += beyond.T @ beyond
         gradient += beyond.T @ misfit
     gradient += prior * (expected - fit.parameters)
@@ -184,10 +185,10 @@ def step(
 def _linearised(
     frame: MatchedFrame, fit: LensFit, number: int, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weighted derivatives by the lens (2n, 5) and by the rotation (2n, 3), and residuals (2n,).
+    """Return the weighted derivatives by lens (2n, 5) and rotation (2n, 3), and the residuals (2n,).
 
-    A direction with tangent u in the camera is imaged at f u s(|u|^2); a rotation moves a direction v by
-    v x rotation.
+    A direction with the tangents u is imaged at f u s(|u|^2). A small rotation moves a direction v by v x
+    rotation.
     """
     misfit = residuals(frame, fit, number)
     usable = (weight > 0.0) & np.isfinite(misfit[:, 0])
@@ -219,12 +220,14 @@ def _linearised(
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """Prior standard deviations around the assumed lens; infinity means no prior.
+    """Prior standard deviations around the assumed lens. Infinity stands for no prior.
 
     Attributes:
-        focal_length: relative; the default allows any lens whose field of view is roughly known.
-        centre: along one axis, px; the default allows a sensor positioned by hand.
-        k1, k2: the defaults allow any lens except a fisheye.
+        focal_length: relative error of the focal length. The default allows any lens with a roughly known
+            field of view.
+        centre: error of the optical axis in the image, per axis, px. The default allows a sensor that was
+            positioned by hand.
+        k1, k2: errors of the radial distortion coefficients. The defaults allow any lens except a fisheye.
     """
 
     focal_length: float = 0.1
@@ -233,7 +236,7 @@ class LensPrior:
     k2: float = 3.0
 
     def information(self, lens: Lens) -> FloatArray:
-        """Return the information (5,) about each of PARAMETERS.
+        """Return the prior information (5,) on PARAMETERS, as inverse variances.
 
         Raises CalibrationError unless all standard deviations are positive.
         """
@@ -245,19 +248,20 @@ class LensPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A lens and its uncertainty.
+    """A calibrated lens and its uncertainty.
 
     Attributes:
-        lens: the calibrated camera.
-        covariance: covariance (5, 5) of PARAMETERS, prior included. If the residuals are larger than their
-            sigmas allow, it is multiplied by the chi-square per degree of freedom.
-        undetermined: those of PARAMETERS that are determined by the prior, not by the stars.
-        attitudes: attitudes (m, 4) of the frames, from reference to camera.
-        used: which matches (n,) of each frame were not rejected.
+        lens: calibrated camera model.
+        covariance: covariance (5, 5) of PARAMETERS, including the prior. If the residuals exceed their
+            standard deviations significantly, the covariance is multiplied by chi-square per degree of
+            freedom.
+        undetermined: names of the PARAMETERS that are determined by the prior instead of the stars.
+        attitudes: attitudes (m, 4) of the frames, from reference axes to camera axes.
+        used: masks (n,) of the accepted matches of each frame.
         chi_square: chi-square of the residuals and the prior.
-        degrees: degrees of freedom.
-        rms_before: rms distance of the used matches from their stars with the assumed lens, px.
-        rms_after: the same with the calibrated lens, px.
+        degrees: number of degrees of freedom.
+        rms_before: rms residual of the accepted matches with the assumed lens, px.
+        rms_after: rms residual of the accepted matches with the calibrated lens, px.
     """
 
     lens: Lens
@@ -272,7 +276,7 @@ class Calibration:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviation of each parameter, in px for the first three."""
+        """The standard deviation of each parameter, in px for the first three."""
         return dict(zip(PARAMETERS, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
@@ -282,18 +286,18 @@ class Calibration:
 
     @property
     def rejected_count(self) -> int:
-        """Number of rejected matches."""
+        """The number of rejected matches."""
         return sum(map(len, self.used)) - self.stars
 
 
 def calibrate(
     frames: Sequence[MatchedFrame], initial: CameraModel, prior: LensPrior | None = None
 ) -> Calibration:
-    """Return the lens that fits all frames best, starting from `initial`.
+    """Return the lens that fits all frames best, starting from the camera `initial`.
 
-    The prior, by default `LensPrior()`, is around the pinhole with the initial focal length. Raises
+    The prior, by default `LensPrior()`, is centred on a pinhole with the initial focal length. Raises
     CalibrationError for malformed frames, for matches that do not determine a lens, and if the fit does not
-    converge or does not result in a valid lens.
+    converge to a valid lens.
     """
     _refuse_malformed(frames)
     begun = Lens.of(initial)
@@ -316,7 +320,7 @@ def calibrate(
 
 
 def _refuse_malformed(frames: Sequence[MatchedFrame]) -> None:
-    """Raise CalibrationError for no frames and for arrays of wrong shapes or with values not finite."""
+    """Raise CalibrationError if there are no frames, or for arrays with wrong shapes or non-finite values."""
     if not frames:
         raise CalibrationError("no frames: give at least one")
     for number, frame in enumerate(frames):
@@ -338,7 +342,7 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
             quaternion = solve(in_camera, frame.directions, sigma / np.sqrt(weight)).quaternion
             fit = LensFit(parameters_of(lens), quaternion[None])
             (weight,) = _cauchy_weights(_lengths([frame], fit))
-            # No weight becomes zero: a match may agree later although the first attitude was poor.
+            # Weights stay positive, so that a match rejected by a poor initial attitude can recover.
             weight = np.maximum(weight, 1e-6)
     except AttitudeError as error:
         raise CalibrationError(f"frame {number}: {error}") from error
@@ -346,12 +350,12 @@ def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:
 
 
 def _lengths(frames: Sequence[MatchedFrame], fit: LensFit) -> list[FloatArray]:
-    """Return the lengths (n,) of the residuals of each frame, in sigmas."""
+    """Return the lengths (n,) of the residuals of each frame, in standard deviations."""
     return [np.linalg.norm(residuals(frame, fit, number), axis=1) for number, frame in enumerate(frames)]
 
 
 def _spread(lengths: Sequence[FloatArray]) -> float:
-    """Return the standard deviation of the residuals along one axis from their median, at least one sigma.
+    """Return the residuals' standard deviation per axis, from their median. It is at least one.
 
     Raises CalibrationError if the median star is behind the camera.
     """
@@ -378,8 +382,8 @@ def _converged(
     information: FloatArray,
     expected: FloatArray,
 ) -> FitStep:
-    """Return the last step of the fit to the matches `used`."""
-    least = 0.0  # the chi-square of pure rounding errors, below which tiny sigmas cannot bring the fit
+    """Return the last step of the converged fit to the accepted matches `used`."""
+    least = 0.0  # chi-square of rounding errors, which limits the fit for tiny sigmas
     for frame, chosen in zip(frames, used, strict=True):
         length = fit.parameters[0] + np.linalg.norm(frame.points[chosen], axis=1)
         least += 2.0 * float(np.sum((_ROUNDING * length / frame.sigma[chosen]) ** 2))
@@ -400,7 +404,7 @@ def _result(
     prior: FloatArray,
     expected: FloatArray,
 ) -> Calibration:
-    """Return the calibration after the last step."""
+    """Return the calibration from the last step of the fit."""
     focal_length, x, y, k1, k2 = last.fit.parameters.tolist()
     try:
         lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2)
@@ -430,7 +434,7 @@ def _result(
 
 
 def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) -> float:
-    """Return the rms distance, px, of the used matches from their stars with each frame's best attitude."""
+    """Return the rms residual (px) of the accepted matches with each frame's best attitude."""
     squares = []
     for frame, chosen in zip(frames, used, strict=True):
         points, stars, sigma = frame.points[chosen], frame.directions[chosen], frame.sigma[chosen]
@@ -443,12 +447,12 @@ def _rms(frames: Sequence[MatchedFrame], lens: Lens, used: Sequence[BoolArray]) 
 
 @dataclass(frozen=True, slots=True)
 class OmittedTerm:
-    """A term that the stars do not determine.
+    """A lens term that the stars do not determine.
 
     Attributes:
-        values: last fitted values; one for k1 and k2, x and y for the centre.
-        sigmas: their standard deviations.
-        assumed: values of the calibrated lens instead.
+        values: last fitted values: one for k1 and k2, or x and y for the centre.
+        sigmas: standard deviations of the fitted values.
+        assumed: values that the calibrated lens has instead.
     """
 
     values: tuple[float, ...]
@@ -458,13 +462,13 @@ class OmittedTerm:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeterminedLens:
-    """A calibration with only those terms that the stars determine.
+    """A calibration that includes only the lens terms determined by the stars.
 
     Attributes:
-        calibration: the calibration; omitted terms have their assumed values and almost no uncertainty.
-        omitted: omitted terms by "k1", "k2", "centre".
-        accuracy: accuracy of the lens by the keys of a configuration's `camera.accuracy`, without the keys
-            that the stars do not determine.
+        calibration: calibration in which omitted terms have their assumed values and almost no uncertainty.
+        omitted: omitted terms by their names "k1", "k2" and "centre".
+        accuracy: accuracy of the lens by the keys of `camera.accuracy` in a configuration, without keys that
+            the stars do not determine.
     """
 
     calibration: Calibration
@@ -473,10 +477,11 @@ class DeterminedLens:
 
 
 def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -> DeterminedLens:
-    """Return the lens of the frames with only the determined terms, starting from `initial`.
+    """Return the lens of the frames with only the determined terms, starting from the camera `initial`.
 
-    Terms are omitted one at a time, k2 first, if they are undetermined or if a distortion is smaller than its
-    standard deviation. The other terms are then fitted again. Raises CalibrationError.
+    Terms are omitted one at a time, starting with k2, if they are undetermined or if a distortion coefficient
+    is smaller than its standard deviation. The remaining terms are fitted again after each omission. Raises
+    CalibrationError.
     """
     prior = LensPrior()
     whole = found = calibrate(frames, initial, prior)
@@ -489,7 +494,7 @@ def calibrate_determined(frames: Sequence[MatchedFrame], initial: CameraModel) -
         else:
             omitted[term] = OmittedTerm((getattr(lens, term),), (sigma[term],), (0.0,))
         prior = replace(prior, **{term: _HELD[term]})
-        # The fit starts at the assumed values, which the held terms do not leave.
+        # The fit starts at the assumed values, and the small prior deviations keep the omitted terms there.
         assumed: dict[str, Any] = {
             name: gone.assumed if name == "centre" else gone.assumed[0] for name, gone in omitted.items()
         }
@@ -514,9 +519,10 @@ def lens_accuracy(
 ) -> dict[str, float]:
     """Return the accuracy of a lens by the keys of `camera.accuracy`.
 
-    The accuracy of focal length and centre is that of the fit `found` without the omitted terms; the change
-    of the focal length from the fit of all terms, `whole`, is added to its error. The distortion is the
-    relative displacement of an image corner: its uncertainty with all terms and the difference of the fits.
+    The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
+    change of the focal length relative to the fit `whole` with all terms is added to its error. The accuracy
+    of the distortion is the relative displacement of an image corner. It includes the uncertainty with all
+    terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -536,18 +542,19 @@ def lens_accuracy(
 def calibrate_one_lens(
     frames: Sequence[MatchedFrame], initial: CameraModel, focal_lengths: FloatArray, sigmas: FloatArray
 ) -> tuple[DeterminedLens, dict[int, str]]:
-    """Return the lens of the frames that agree on one, and the reasons to exclude others, by their numbers.
+    """Return the common lens of the frames, and the reasons for excluding frames, by frame index.
 
-    A frame with another focus or zoom, or with a wrong solution, is excluded if its focal length differs from
-    the median by more than 5 sigma and 1 %, or if the fit rejects more than half of its matches.
+    A frame with another focus or zoom, or with a wrong solution, is excluded. The criteria are a focal length
+    that differs from the median by more than 5 standard deviations and 1 %, or a fit that rejects more than
+    half of the frame's matches.
 
     Args:
         frames: the frames.
-        initial: the camera from which the fit starts.
-        focal_lengths: focal length (m,) of each frame alone, px.
-        sigmas: their standard deviations (m,), px.
+        initial: camera from which the fit starts.
+        focal_lengths: focal length (m,) from each frame alone, px.
+        sigmas: standard deviations (m,) of the focal lengths, px.
 
-    Raises CalibrationError as `calibrate`.
+    Raises CalibrationError for the same reasons as `calibrate`.
     """
     usual = float(np.median(focal_lengths))
     different = np.abs(focal_lengths - usual) > np.maximum(5.0 * sigmas, 0.01 * usual)
@@ -567,11 +574,11 @@ def calibrate_one_lens(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationImage:
-    """One image of a calibration.
+    """One image of a lens calibration.
 
     Attributes:
-        solution: the stars and the attitude of the image, or why it is not solved.
-        excluded: reason to exclude a solved image; empty otherwise.
+        solution: identified stars and attitude of the image, or the reason why it is not solved.
+        excluded: reason for excluding a solved image. It is empty for an image that is used.
     """
 
     solution: FrameSolution
@@ -579,7 +586,7 @@ class CalibrationImage:
 
     @property
     def reason(self) -> str:
-        """The reason why the image is not used; empty if it is used."""
+        """The reason why the image is not used. It is empty for an image that is used."""
         return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 
 
@@ -589,7 +596,7 @@ class LensCalibration:
 
     Attributes:
         determined: lens, standard deviations, omitted terms and accuracy; None if no image was solved.
-        images: the images in the given order, each with its solution or the reason to exclude it.
+        images: images in the given order, each with its solution or the reason for excluding it.
     """
 
     determined: DeterminedLens | None
@@ -601,7 +608,7 @@ class LensCalibration:
 
     @property
     def lens(self) -> Lens | None:
-        """The calibrated lens, for `StarTracker(camera=...)`; None if no image was solved."""
+        """The calibrated lens, for use as `StarTracker(camera=...)`; None if no image was solved."""
         return None if self.determined is None else self.determined.calibration.lens
 
 
@@ -613,17 +620,19 @@ def calibrate_lens(
 ) -> LensCalibration:
     """Return the lens of a camera from images of the night sky: focal length, axis and radial distortion.
 
-    All images must be of one camera at one focus. Images that do not fit are excluded. Ten images with stars
-    in the corners are worth more than a hundred without. Terms that the stars do not determine are omitted.
+    All images must be taken by one camera at one focus setting. Images that do not fit are excluded. Ten
+    images with stars in the corners give a better calibration than a hundred without. Lens terms that the
+    stars do not determine are omitted.
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape.
-        fov_deg: approximate field of view across the columns, deg; None: any from 4 to 60 deg.
-        progress: called before each image with the round and the number of the image, both from 1.
+        fov_deg: approximate field of view across the columns, deg. If it is None, fields from 4 to 60 deg are
+            tried.
+        progress: function that is called before each image with the pass and the image number, both from 1.
 
     Raises:
-        UsageError: without images, or for images of different shapes.
-        InputError: for a field of view that is not between 1 and 120 deg.
+        UsageError: if there are no images, or images of different shapes.
+        InputError: if the field of view is not between 1 and 120 deg.
         CalibrationError: if the solved images do not determine a lens.
     """
     if len({image.shape for image in images}) != 1:
@@ -656,7 +665,7 @@ def calibrate_lens(
 
 
 def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
-    """Return the identified stars of a solution."""
+    """Return the identified stars of a solution as a matched frame."""
     matched = solution.matched
     variance = 0.5 * np.trace(solution.covariance[matched], axis1=1, axis2=2) + _MIN_SIGMA_PX**2
     directions = sky.stars.direction[solution.star[matched]]

@@ -1,18 +1,20 @@
-"""The Sun's direction and the attitude from the currents of solar cells (Meller et al., chapter 2).
+"""Sun direction and attitude from the currents of solar cells (Meller et al., chapter 2).
 
-A solar string is a series connection of solar cells on one face of the body; it has one current. That current
-is proportional to the cosine of the Sun's angle from the string's normal, and zero if the Sun is behind. The
-Earth illuminates the strings as well, up to a third as strongly as the Sun, from half the sky: with the share
-(1 + n e)/2 on a string of normal n, where e is nadir. This correlates the strings' errors, in one known
-pattern if nadir is known, otherwise in the mean pattern over all directions. The covariance includes either
-pattern.
+A solar string is a series connection of solar cells on one face of the body, so that all its cells carry the
+same current. The current of a string is proportional to the cosine of the angle between the Sun and the
+string's normal, and zero if the Sun is behind the string. The Earth also illuminates the strings, at most a
+third as strongly as the Sun. A string with the normal n receives the fraction (1 + n.e)/2 of the light from
+the half sky around nadir e. Earth light correlates the errors of the strings. The correlation pattern is
+known if nadir is known, otherwise the mean pattern over all nadir directions is used. The covariance of the
+Sun direction includes this pattern.
 
-`FieldAndStrings` gives the attitude from the magnetic field and the strings, while any one string may fail in
-any way. The field does not determine the rotation about itself. All rotations about the field are tried at
-once, and each predicts the light of Sun and Earth on the strings. A rotation is possible if all strings
-except at most one agree with it, with the same exception in each reading. Between readings, the gyro
-propagates the rotations. The covariance covers all rotations that are possible (solution separation, as
-receivers check satellite navigation: Brown 1992, Navigation 39).
+The class `FieldAndStrings` computes the attitude from the magnetic field and the solar strings, even if any
+one string fails in any way. The magnetic field does not determine the rotation about the field direction. All
+rotations about the field direction are therefore tried, and each predicts the illumination of the strings by
+Sun and Earth. A rotation is possible if all strings except at most one agree with it, and if the exception is
+the same string in each reading. Between readings, the gyro propagates the rotations. The covariance covers
+all possible rotations (solution separation as in receivers of satellite navigation, Brown 1992, Navigation
+39).
 """
 
 from __future__ import annotations
@@ -30,36 +32,40 @@ from knightcube.errors import UsageError
 
 _MOST_STEPS = 15
 _SOFT = 0.05
-"""Range of the cosine in which a string's current rises smoothly from zero. Its slope there is needed for a
-Sun normal to a face."""
+"""Range of the cosine of incidence in which a string's current rises smoothly from zero.
+
+A slope at zero is needed if the Sun is normal to a face, because the adjacent faces then have zero current.
+"""
 _RARE = 3.09
-"""Standard deviations that one reading in a thousand exceeds."""
+"""Number of standard deviations that one reading in a thousand exceeds."""
 
 
 class CoarseSunStatus(Enum):
-    """The outcome of the strings' solution."""
+    """Outcome of the Sun direction from solar strings."""
 
     FOUND = "found"
     DARK = "dark"
-    """No string has a current: eclipse, or failed strings."""
+    """No string has a significant current, because of an eclipse or failed strings."""
     UNCERTAIN = "uncertain"
-    """No Sun explains these currents, with any light of the Earth. A dead string often looks like a dark
-    face."""
+    """No Sun direction explains the currents for any amount of Earth light.
+
+    A dead string often looks like a string on a dark face.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolarStringModel:
-    """The solar strings of a satellite; the default are the six faces of a cube.
+    """The solar strings of a satellite, by default one on each face of a cube.
 
     Attributes:
-        normals: outward unit vectors (n, 3) in body axes.
-        peaks: currents in full sunlight at normal incidence (n,), A.
-        sigma: standard deviation of a reading, relative to its peak: calibration, and departures from the
-            cosine law.
-        albedo: brightness of an Earth that fills half the sky, relative to the Sun; the mean over day and
+        normals: outward unit vectors (n, 3) of the strings, in body axes.
+        peaks: currents (n,) in full sunlight at normal incidence, A.
+        sigma: standard deviation of a reading relative to its peak, from calibration errors and departures
+            from the cosine law.
+        albedo: brightness of an Earth that fills half the sky, relative to the Sun, as a mean over day and
             night.
-        albedo_sigma: standard deviation of the albedo, due to clouds and the elevation of the Sun.
-        dark: fraction of the peak below which a reading is darkness.
+        albedo_sigma: standard deviation of the albedo, from clouds and the elevation of the Sun.
+        dark: fraction of the peak current below which a string counts as dark.
 
     Raises:
         UsageError: if a value is out of range.
@@ -89,14 +95,14 @@ class SolarStringModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseSun:
-    """The Sun's direction from the strings.
+    """Sun direction from the solar strings.
 
     Attributes:
         status: the outcome.
-        direction: unit vector (3,) in body axes; None unless the status is FOUND.
-        basis: two unit vectors (2, 3) normal to the direction and to each other.
-        tangent_covariance: covariance (2, 2) of the direction's error along `basis`, rad^2.
-        reason: why there is no direction.
+        direction: unit vector (3,) to the Sun in body axes; None unless the status is FOUND.
+        basis: two unit vectors (2, 3) that are normal to the direction and to each other.
+        tangent_covariance: covariance (2, 2) of the direction error along `basis`, rad^2.
+        reason: reason why no direction was found.
     """
 
     status: CoarseSunStatus
@@ -107,18 +113,18 @@ class CoarseSun:
 
     @property
     def sigma(self) -> float:
-        """The root of the mean variance over the two axes, rad; infinite without a direction."""
+        """The standard deviation per axis, rad. It is infinite without a direction."""
         covariance = self.tangent_covariance
         return float("inf") if covariance is None else float(np.sqrt(0.5 * np.trace(covariance)))
 
 
 def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArray | None = None) -> CoarseSun:
-    """Return the Sun's direction in body axes from the currents of the strings.
+    """Return the Sun direction in body axes from the currents of the solar strings.
 
     Args:
-        currents: currents (n,), A.
+        currents: currents (n,) of the strings, A.
         strings: the strings.
-        nadir: unit vector (3,) in body axes, if it is known; an error of ten degrees is harmless.
+        nadir: unit vector (3,) to nadir in body axes, if known. An error of ten degrees has little effect.
 
     Raises:
         ValueError: if the currents are not n finite numbers.
@@ -132,7 +138,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     earth, covariance = _earthlight(strings, nadir)
     information = np.linalg.inv(covariance)
     readings = shares - earth
-    # The first guess is the direction of the normals, weighted with their currents.
+    # The initial guess is the mean of the normals, weighted by the currents of the strings.
     normals = strings.normals
     total = np.linalg.pinv(normals.T @ normals) @ normals.T @ np.maximum(shares, 0.0)
     length = float(np.linalg.norm(total))
@@ -146,7 +152,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # The step is limited to half a radian: far from the solution the slopes mislead.
+        # The step is limited to half a radian, because the linear model is poor far from the solution.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
@@ -154,7 +160,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # The chi-square that is exceeded once in a thousand times (Wilson and Hilferty 1931).
+    # This is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"the currents fit no Sun: chi-square {square:.0f} of {freedom}"
@@ -165,21 +171,21 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
 def _sunlight(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return string currents relative to the peak current, and their derivatives, at cosines of incidence.
 
-    `cosines` (...) are the cosines of the angles between the Sun and the string's normals. The current is 0
-    if the Sun is behind the string.
+    `cosines` (...) are the cosines of the angles between the Sun and the normals of the strings. The current
+    is 0 if the Sun is behind the string.
     """
     root = np.sqrt(cosines**2 + _SOFT**2)
     return 0.5 * (cosines + root), 0.5 * (1.0 + cosines / root)
 
 
 def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Return the mean share (n,) of the Earth in the readings, and the covariance (n, n) of the readings."""
+    """Return the mean fraction (n,) of Earth light in the readings, and the readings' covariance (n, n)."""
     normals, square = strings.normals, strings.albedo_sigma**2
     own = strings.sigma**2 * np.eye(len(normals))
     if nadir is not None:
         pattern = 0.5 * (1.0 + normals @ nadir)
         return strings.albedo * pattern, own + square * np.outer(pattern, pattern)
-    # Over all directions e, (1 + n e)/2 has the mean 1/2, and the product of two has the mean 1/4 + n n'/12.
+    # Averaged over directions e, (1 + n.e)/2 is 1/2, and the product for normals n and m is 1/4 + n.m/12.
     even = np.full(len(normals), 0.5)
     second = 0.25 + normals @ normals.T / 12.0
     covariance = (strings.albedo**2 + square) * second - strings.albedo**2 * np.outer(even, even)
@@ -187,17 +193,17 @@ def _earthlight(strings: SolarStringModel, nadir: FloatArray | None) -> tuple[Fl
 
 
 _TURNS = 180
-"""Number of rotations about the field that are tried, two degrees apart."""
+"""Number of rotations about the field direction that are tried, two degrees apart."""
 _IMPROBABLE = 1e-4
-"""Probability of the currents below which a rotation is impossible."""
+"""Probability of the measured currents below which a rotation is rejected."""
 _MEMORY = 120.0
-"""Time (s) for which a rejected rotation stays rejected, limited by the drift of the gyro."""
+"""Time (s) for which a rotation stays rejected, limited by the drift of the gyro."""
 _MOST_VIOLATION = 3.0
-"""Largest violation of the bound that is remembered, as a multiple of the bound."""
+"""Upper limit of the accumulated violation, as a multiple of the bound."""
 _CERTAIN = 5.0
 """Distance from the result to the farthest possible rotation, in standard deviations of the result."""
 _COMMON = 0.02
-"""Relative error that all strings have in common: the Sun's distance, temperature."""
+"""Relative error that is common to all strings, such as the distance of the Sun and the temperature."""
 _STEP = 2.0 * math.pi / _TURNS
 _ANGLES = _STEP * np.arange(_TURNS)
 
@@ -207,8 +213,8 @@ class KnownDirections:
     """Magnetic field, Sun and nadir in inertial axes, and the brightness of the Earth.
 
     Attributes:
-        field: magnetic field (3,), T.
-        sun, nadir: unit vectors (3,).
+        field: magnetic field vector (3,), T.
+        sun, nadir: unit vectors (3,) to the Sun and to nadir.
         light: brightness of an Earth that fills half the sky, relative to the Sun.
         light_sigma: standard deviation of `light`.
     """
@@ -222,13 +228,13 @@ class KnownDirections:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StringFix:
-    """An attitude from field and strings.
+    """An attitude from the magnetic field and the solar strings.
 
     Attributes:
-        quaternion: attitude (4,).
-        covariance: covariance (3, 3) of small rotations, rad^2, body axes.
-        axis: direction of the field (3,), body axes.
-        about: standard deviation of the rotation about the field, rad.
+        quaternion: attitude (4,) from inertial to body axes.
+        covariance: covariance (3, 3) of the attitude error in body axes, rad^2.
+        axis: unit vector (3,) along the magnetic field in body axes.
+        about: standard deviation of the rotation about the field direction, rad.
     """
 
     quaternion: FloatArray
@@ -238,10 +244,10 @@ class StringFix:
 
 
 class FieldAndStrings:
-    """The rotations about the field that are possible.
+    """Attitude estimator that keeps track of the possible rotations about the magnetic field.
 
     Attributes:
-        wrong: the fault that the newest reading shows; empty if all strings agree.
+        wrong: fault that the last reading shows. It is empty if all strings agree.
     """
 
     def __init__(self, strings: SolarStringModel) -> None:
@@ -253,12 +259,12 @@ class FieldAndStrings:
         self.wrong = ""
 
     def forget(self) -> None:
-        """Make all rotations possible again, after the body has rotated without a gyro."""
+        """Make all rotations possible again, after the body has rotated without gyro data."""
         self._base = None
         self._against[:] = 0.0
 
     def turn(self, rotation: FloatArray, seconds: float) -> None:
-        """Propagate the rotations over a `rotation` (4,) of the body in `seconds`."""
+        """Propagate the possible rotations over a `rotation` (4,) of the body that took `seconds`."""
         if self._base is not None:
             self._base = multiply(rotation, self._base)
         self._against = np.maximum(self._against - _MOST_VIOLATION * seconds / _MEMORY, 0.0)
@@ -266,14 +272,17 @@ class FieldAndStrings:
     def accept(
         self, currents: FloatArray, field: FloatArray, sigma: float, sky: KnownDirections, blur: float = 0.0
     ) -> StringFix | None:
-        """Return the attitude from one reading; None if no rotation is possible, or more than half a circle.
+        """Return the attitude from one reading, or None if the possible rotations do not determine it.
+
+        The result is None if no rotation is possible, or if the possible rotations span more than half a
+        circle.
 
         Args:
-            currents: currents of the strings (n,), A.
-            field: magnetic field at the same time (3,), T, body axes.
-            sigma: standard deviation of each component of the field, T.
+            currents: currents (n,) of the strings, A.
+            field: magnetic field (3,) at the time of the reading, body axes, T.
+            sigma: standard deviation of each component of the magnetic field, T.
             sky: known directions in inertial axes.
-            blur: rotation of the body during the reading, rad.
+            blur: rotation angle of the body during the reading, rad.
         """
         strength = float(np.linalg.norm(sky.field))
         axis, across = field / np.linalg.norm(field), sigma / strength
@@ -285,7 +294,7 @@ class FieldAndStrings:
             return None
         base = self._aligned(axis, sky.field / strength)
         whole, without = self._misfits(attitude_matrix(base), shares, axis, math.hypot(across, blur), sky)
-        # Each rotation accumulates the excess over what is probable, for each string that may have failed.
+        # Each rotation accumulates its excess chi-square separately for each string that may have failed.
         one, fewer, all_ = self._bounds
         least = without.min(axis=1)
         against = np.maximum(without / fewer, (without - least[:, None]) / one)
@@ -310,11 +319,11 @@ class FieldAndStrings:
         return StringFix(attitude, about**2 * along + across**2 * (np.eye(3) - along), axis, about)
 
     def _aligned(self, axis: FloatArray, known: FloatArray) -> FloatArray:
-        """Return the base (4,) after the shortest rotation of the `known` field to the direction `axis`."""
+        """Return the base (4,) after the shortest rotation that aligns the `known` field with `axis`."""
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # For opposite directions, a half turn about any normal axis is applied first.
+            # For opposite directions, the base is first rotated by half a turn about any normal of `axis`.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))
@@ -324,7 +333,10 @@ class FieldAndStrings:
     def _misfits(
         self, base: FloatArray, shares: FloatArray, axis: FloatArray, tilt: float, sky: KnownDirections
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the chi-squares of the shares (n,) for t rotations: of all (t,), and without each (n, t)."""
+        """Return the chi-squares of the relative currents `shares` (n,) for t rotations.
+
+        The first array (t,) uses all strings, and each row of the second array (n, t) omits one string.
+        """
         strings = self._strings
         sunlight, slopes = _sunlight(_rotated_about(base @ sky.sun, axis) @ strings.normals.T)
         earthlight = 0.5 * (1.0 + _rotated_about(base @ sky.nadir, axis) @ strings.normals.T)
@@ -341,7 +353,7 @@ class FieldAndStrings:
 
 
 def _rotated_about(vector: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return a fixed direction (3,) in the axes of a body after each rotation about its `axis` (t, 3)."""
+    """Return a fixed direction (3,) in the axes of a body after each of t rotations about `axis` (t, 3)."""
     along = float(vector @ axis) * axis
     return np.asarray(
         along + np.outer(np.cos(_ANGLES), vector - along) - np.outer(np.sin(_ANGLES), np.cross(axis, vector))

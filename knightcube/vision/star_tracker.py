@@ -1,9 +1,9 @@
-"""The star tracker as one class, which returns the attitude from an image, or the reason for a failure.
+"""Star tracker as a single class, which returns the attitude from an image, or the reason for a failure.
 
     solution = StarTracker(fov_deg=11.4).solve(image)
 
-It combines the steps of `knightcube.vision.startracker` with those for streaked stars by the decision tree of
-`knightcube.vision.frame_job`.
+The class combines the steps of `knightcube.vision.startracker` with those for streaked stars, by the decision
+tree of `knightcube.vision.frame_job`.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ from knightcube.vision.startracker.solve import AttitudePrior, FrameSolution, Ra
 from knightcube.vision.streaks.streak_result import StreakStatus
 
 UNKNOWN_FOV_DEG = 4.0, 60.0
-"""Range of the fields of view (deg) that is searched when none is given."""
+"""Range of the field of view (deg) that is searched if the field of view is unknown."""
 FOV_TOLERANCE = 0.05
-"""Default uncertainty of a given field of view, as a fraction of it."""
+"""Default uncertainty of a given field of view, relative to the field of view."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedStars:
-    """The catalogue stars that were identified in an image, the brightest in the image first.
+    """Catalogue stars that were identified in an image, in the order of their brightness in the image.
 
     Attributes:
-        hip: Hipparcos numbers (m,). For a group of stars that the image cannot resolve, it is the number of
-            the brightest star.
-        magnitude: Johnson V magnitudes (m,); the joint magnitude of unresolved stars.
-        directions: unit vectors (m, 3), ICRS, at the epoch of the image.
-        points: measured positions (m, 2), px, x and y; of a streaked star the position at mid-exposure.
+        hip: Hipparcos numbers (m,) of the stars. A group of stars that the image does not resolve has the
+            number of its brightest star.
+        magnitude: Johnson V magnitudes (m,). Unresolved stars have their joint magnitude.
+        directions: unit vectors (m, 3) to the stars, ICRS, at the epoch of the image.
+        points: measured positions (m, 2), x and y, px. The position of a streaked star is that at
+            mid-exposure.
         residuals: measured minus predicted positions (m, 2), px.
     """
 
@@ -57,37 +58,36 @@ class MatchedStars:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarSolution:
-    """The attitude of a camera from one image of the sky, or the reason why there is none.
+    """The attitude of a camera from one image of the sky, or the reason why the image was not solved.
 
-    A solution is true (`if solution:`) when the image was solved. Otherwise angles, quaternion and covariance
+    A solution is true (`if solution:`) if the image was solved. Otherwise angles, quaternion and covariance
     are NaN, `stars` is empty, and `reason` says why.
 
     Attributes:
-        status: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
-        reason: why the image was not solved, in one sentence; empty when it was.
-        right_ascension: of the boresight, ICRS, rad, 0 to 2 pi.
-        declination: of the boresight, ICRS, rad.
-        roll: position angle of the upward direction of the image (-y), from north through east, rad, 0 to
-            2 pi.
-        quaternion: attitude (4,) at mid-exposure, scalar last. It rotates ICRS into the camera frame:
-            boresight +z, x to the right along the rows of pixels, y down.
-        covariance: of the attitude error (3, 3), rad^2, as a small rotation about the axes of the camera.
-        stars: the identified stars.
-        field_of_view: angle across the columns, edge to edge, without distortion, rad, fitted to the stars
-            unless the camera is calibrated.
-        field_of_view_sigma: its standard deviation, rad; 0 for a calibrated camera.
-        log10_false_alarm: log10 of an upper bound of the probability that randomly placed points would have
-            been solved.
-        mirrored: whether the image shows the sky as a mirror does; the attitude is then that of the image
-            with left and right exchanged about the optical axis.
-        rate: angular velocity (3,) of the camera with respect to inertial space, camera axes, rad/s, if the
-            stars are streaks and the exposure was given; else None.
-        rate_covariance: its covariance (3, 3), rad^2/s^2; else None.
-        rate_sign_known: whether the sign of `rate` is known: a single image shows it only together with a
-            predicted rate.
+        status: outcome: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
+        reason: one-sentence reason why the image was not solved. It is empty for a solved image.
+        right_ascension: right ascension of the boresight, ICRS, from 0 to 2 pi, rad.
+        declination: declination of the boresight, ICRS, rad.
+        roll: position angle of the image's upward direction (-y), from north through east, from 0 to 2 pi,
+            rad.
+        quaternion: attitude (4,) at mid-exposure, scalar last. The quaternion rotates ICRS into camera axes:
+            z along the boresight, x to the right along the pixel rows, y down.
+        covariance: covariance (3, 3) of the attitude error as a small rotation in camera axes, rad^2.
+        stars: identified catalogue stars.
+        field_of_view: angle between the outer edges of the first and last column, without distortion, rad. It
+            is fitted to the stars unless the camera is calibrated.
+        field_of_view_sigma: standard deviation of the field of view, rad. It is 0 for a calibrated camera.
+        log10_false_alarm: log10 of an upper limit of the probability that randomly placed points are solved.
+        mirrored: whether the image is a mirror image of the sky. The attitude is then that of the image with
+            left and right exchanged.
+        rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. It is
+            None unless the stars are streaks and the exposure was given.
+        rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
+        rate_sign_known: whether the sign of `rate` is known. A single image shows the sign only together with
+            a predicted rate.
         sky_map: conversion between pixels and ICRS directions; None unless solved.
-        frame: all results of the star tracker, which include the points that are not catalogue stars.
-        index: the sky index at the epoch of the image; The star numbers in `frame.star` refer to it.
+        frame: all results of the star tracker, including the points that are not catalogue stars.
+        index: sky index at the epoch of the image. The star indices in `frame.star` refer to this sky index.
     """
 
     status: str
@@ -130,23 +130,27 @@ class StarSolution:
 
     @property
     def field_of_view_deg(self) -> float:
-        """The angle across the columns, edge to edge, deg."""
+        """The angle between the outer edges of the first and last column, deg."""
         return math.degrees(self.field_of_view)
 
 
 class StarTracker:
-    """Determines the attitude of a camera from single images of the sky, with or without a prior.
+    """Determines the attitude of a camera from single images of the sky, with or without a prior attitude.
 
-    It identifies the stars against the Hipparcos catalogue to V 8.5 and fits the attitude to their positions
-    in the image. Streaked stars give the angular velocity too. An instance can be used for any number of
-    images. The sky index is made at the first use, in some seconds, and kept in the cache folder of the user.
+    The star tracker identifies the stars against the Hipparcos catalogue to V 8.5 and fits the attitude to
+    their positions in the image. Streaked stars also give the angular velocity. One instance can solve any
+    number of images. The sky index is built in a few seconds at the first use and stored in the user's cache
+    folder.
 
     Args:
-        fov_deg: field of view across the columns, edge to edge, deg, 1 to 120. None: any from 4 to 60 deg.
-        fov_error_deg: largest error of the field of view, deg. None: 5 % of `fov_deg`; a `camera` is exact.
-        camera: a calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`) instead of `fov_deg`.
+        fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If it
+            is None, fields from 4 to 60 deg are tried.
+        fov_error_deg: largest error of the field of view, deg. If it is None, the error is 5 % of `fov_deg`,
+            or zero for a given `camera`.
+        camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`), given instead of
+            `fov_deg`.
         settings: tolerances and methods of detection, identification and attitude. None: the defaults.
-        index: a sky index, or the file of one. None: the default index.
+        index: a sky index, or the path of a sky index file. None: the default index.
 
     Raises:
         InputError: if a field of view is out of range or is given together with a camera, or if the index
@@ -185,23 +189,25 @@ class StarTracker:
         rate: FloatArray | None = None,
         rate_sigma: float = 0.0,
     ) -> StarSolution:
-        """Return the attitude at mid-exposure of an image, or the reason why it has none.
+        """Return the attitude at mid-exposure of an image, or the reason why it was not solved.
 
         Args:
-            image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger. A
-                larger value is brighter. Colour images must be converted to grey values first.
-            exposure: exposure time, s; needed only for the rate of streaked stars.
-            utc: date of the image, UTC if it has no time zone. It is used for proper motion and for the
-                aberration by the velocity of the Earth, 20.5" at most. None: the epoch of the index and no
-                aberration.
-            attitude: predicted attitude (4,), ICRS to camera. Stars are searched near their predicted
-                positions first, which is faster, and in the whole sky if that fails.
-            attitude_sigma: standard deviation of the prediction about each axis, rad.
-            rate: predicted angular velocity (3,), camera axes, rad/s. It decides the sign of a measured rate.
-            rate_sigma: standard deviation of each component, rad/s.
+            image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
+                Larger values are brighter. Colour images must be converted to grey values first.
+            exposure: exposure time, s. It is only needed for the rate of streaked stars.
+            utc: date of the image, which is UTC if it has no time zone. The date is used for proper motion
+                and for aberration by the Earth's velocity, which is at most 20.5". If it is None, the epoch
+                of the index is used, without aberration.
+            attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
+                predicted positions, which is faster. If this does not succeed, the whole sky is searched.
+            attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
+            rate: predicted angular velocity (3,) in camera axes, rad/s. The predicted rate determines the
+                sign of a measured rate.
+            rate_sigma: standard deviation of each component of the predicted rate, rad/s.
 
         Raises:
-            ValueError: if the image is not two-dimensional, smaller than 16 x 16 pixels, or not finite.
+            ValueError: if the image is not two-dimensional, is smaller than 16 x 16 pixels, or has non-finite
+                values.
             InputError: if the image does not have the size of the camera.
         """
         image = np.asarray(image)
@@ -226,7 +232,7 @@ class StarTracker:
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and the range of factors of its tangents."""
+        """Return the camera for an image of `shape`, and the range of factors on its field-angle tangents."""
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
@@ -241,19 +247,19 @@ class StarTracker:
 
 
 def field_of_view(camera: CameraModel) -> float:
-    """Return the angle across the columns of a camera, edge to edge, without its distortion, rad."""
+    """Return the field of view (rad) across the columns of a camera, between outer edges, undistorted."""
     return 2.0 * math.atan(0.5 * camera.columns / camera.focal_length)
 
 
 def camera_of_field(
     fov_deg: float | None, error_deg: float | None, shape: tuple[int, ...]
 ) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a pinhole camera for a field of view, and the range of factors by which its tangents may be off.
+    """Return a pinhole camera for a field of view, and the range of factors on its field-angle tangents.
 
     Args:
-        fov_deg: field of view across the columns, deg; None: any of `UNKNOWN_FOV_DEG`.
+        fov_deg: field of view across the columns, deg. If it is None, the range `UNKNOWN_FOV_DEG` is used.
         error_deg: largest error of `fov_deg`, deg; None: 5 % of it.
-        shape: rows and columns of the image.
+        shape: number of rows and columns of the image.
 
     Raises InputError if the field of view is not between 1 and 120 deg.
     """
@@ -269,7 +275,7 @@ def camera_of_field(
 
 
 def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None:
-    """Raise InputError for a field of view outside of 1 to 120 deg, or a negative error."""
+    """Raise InputError if the field of view is outside of 1 to 120 deg or the error is negative."""
     if fov_deg is not None and not 1.0 <= fov_deg <= 120.0:
         raise InputError("field of view", f"{fov_deg:g}: give 1 to 120 degrees across the columns")
     if error_deg is not None and not 0.0 <= error_deg < 120.0:
@@ -279,7 +285,7 @@ def _check_field_of_view(fov_deg: float | None, error_deg: float | None) -> None
 def _solution(
     frame: FrameSolution, sky: SkyIndex, velocity: FloatArray | None, exposure_known: bool
 ) -> StarSolution:
-    """Return the public solution of a frame."""
+    """Return the public solution from the results of a frame."""
     fix, matched, motion = frame.fix, frame.matched, frame.motion
     pointing = Pointing(math.nan, math.nan, math.nan) if fix is None else Pointing.of(fix.quaternion)
     if fix is None:

@@ -1,16 +1,17 @@
-"""The Sun's direction from an image, or from the images of several cameras and the solar strings.
+"""Sun direction from one image, or from the images of several cameras and the solar strings.
 
     solution = find_sun(image, camera)
 
-A few rows are read, and bright patches on them are candidates. The rim of a candidate is traced along spokes,
-and a circle on the sphere is fitted to it. The centre of the circle is the Sun's centre, even if the disc is
-saturated, has glare, or is partly cut off by the edge of the image. The circle starts from a consensus among
-triples of rim points and is refined by geometric least squares (Gauss-Newton). Tukey's biweight of each
-point's distance from the circle (Huber 1981, Robust Statistics, chapter 7) excludes a cloud beside the disc
-or a hot pixel on its rim.
+Every few rows of the image are read, and bright patches on these rows are candidates. The rim of a candidate
+is traced along spokes, and a circle on the sphere is fitted to the rim points. The centre of the circle is
+the centre of the Sun, even if the disc is saturated, has glare, or is truncated by the edge of the image. The
+circle is first the consensus of triples of rim points, and is then refined by geometric least squares
+(Gauss-Newton). Tukey's biweight of each point's distance from the circle (Huber 1981, Robust Statistics,
+chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
 
-`sun_of_cameras` reads the cameras in the order that the coarse Sun of the solar strings gives (Meller et al.,
-chapter 2). If no camera finds the Sun, the coarse direction is returned with its own covariance.
+The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
+solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
+its own covariance.
 """
 
 from __future__ import annotations
@@ -32,23 +33,26 @@ from knightcube.vision.solar_cells import CoarseSun, CoarseSunStatus
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SunSettings:
-    """Settings that distinguish the Sun from other bright objects, and its assumed errors.
+    """Settings that distinguish the Sun from other bright objects, and assumed errors of the Sun direction.
 
-    At one exposure the Sun's bright disc, glare included, has one radius. Give that radius within about a
-    fifth: within wide bounds a cloud may be mistaken for the Sun. The defaults are for a logarithmic camera
-    like the Fuga 15d; `LINEAR` is for a linear one whose white clouds come near to saturation.
+    At a given exposure, the bright disc of the Sun with its glare has a fixed radius. The limits should
+    enclose that radius within about a fifth. With wider limits, a cloud may be mistaken for the Sun. The
+    default values fit a logarithmic camera like the Fuga 15d; `LINEAR` fits a linear camera in which white
+    clouds are close to saturation.
 
     Attributes:
-        level: counts that the Sun's image exceeds. For a logarithmic camera well above the brightest cloud,
-            so that only the disc remains; for a linear one a little below saturation.
+        level: threshold of the Sun's image, counts. For a logarithmic camera, the threshold is well above the
+            brightest cloud, so that only the disc remains. For a linear camera, it is slightly below
+            saturation.
         stride: distance between the rows that are read first, px.
-        least_radius: radius below which a patch is a hot pixel, rad. The disc itself has 0.0047 rad.
-        greatest_radius: radius above which a patch is a cloud or the Earth, rad.
+        least_radius: radius below which a patch counts as a hot pixel, rad. The Sun itself has a radius of
+            0.0047 rad.
+        greatest_radius: radius above which a patch counts as a cloud or the Earth, rad.
         tolerance: largest rms distance of the rim from a circle, px.
-        least_agreement: least fraction of the rim within the image that must lie on the circle.
-        least_arc: least arc of the rim that must be visible, rad.
-        rim_sigma: least error of a rim point, px, whatever the residuals of the fit.
-        floor_sigma: least error of the centre per axis, px, due to the pattern of the pixels.
+        least_agreement: minimum fraction of the rim within the image that must lie on the circle.
+        least_arc: minimum visible arc of the rim, rad.
+        rim_sigma: minimum standard deviation of a rim point, px.
+        floor_sigma: minimum standard deviation of the centre per axis, from the finite pixel size, px.
 
     Raises:
         UsageError: if a value is out of range.
@@ -82,36 +86,36 @@ class SunSettings:
 
 
 LINEAR = SunSettings(least_radius=math.radians(1.3), greatest_radius=math.radians(2.0))
-"""Settings for a linear 8-bit camera: a white matt surface has 200 counts, the optics scatter 1 % of the
-light."""
+"""Settings for a linear 8-bit camera, with 200 counts for matt white and 1 % of scattered light."""
 
 
 class SunStatus(Enum):
-    """The outcome of the search for the Sun."""
+    """Outcome of the search for the Sun."""
 
     FOUND = "found"
     PARTIAL = "partial"
-    """The Sun is found, but the edge of the image cuts its disc, which increases the covariance."""
+    """The Sun is found, but the edge of the image truncates its disc, which increases the covariance."""
     NO_SUN = "no-sun"
-    """No part of the image is bright enough."""
+    """No part of the image is bright enough for the Sun."""
     NOT_THE_SUN = "not-the-sun"
-    """A patch is bright enough, but too small, too large or not round; see `reason`."""
+    """A patch is bright enough, but too small, too large or not round. The attribute `reason` says which."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunMeasurement:
-    """The direction to the Sun's centre from one image.
+    """The direction to the centre of the Sun from one image.
 
     Attributes:
-        direction: unit vector (3,) in camera axes.
-        basis: two unit vectors (2, 3) normal to the direction and to each other.
-        tangent_covariance: covariance (2, 2) of the direction's error along `basis`, rad^2, without the error
-            of the lens calibration.
-        point: position of the centre (2,), px; NaN if the lens does not image it.
-        radius: radius of the bright disc, glare included, rad.
+        direction: unit vector (3,) to the Sun in camera axes.
+        basis: two unit vectors (2, 3) that are normal to the direction and to each other.
+        tangent_covariance: covariance (2, 2) of the direction error along `basis`, without the error of the
+            lens calibration, rad^2.
+        point: position of the Sun's centre (2,) in the image, px. It is NaN if the centre is outside the
+            range of the lens.
+        radius: radius of the bright disc with its glare, rad.
         residual: rms distance of the used rim points from the circle, px.
-        arc: used arc of the rim, rad.
-        cut: whether the edge of the image cuts the bright disc.
+        arc: arc of the rim that was used in the fit, rad.
+        cut: whether the edge of the image truncates the bright disc.
     """
 
     direction: FloatArray
@@ -125,24 +129,24 @@ class SunMeasurement:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (3, 3) of the direction's error, rad^2, of rank 2: zero along the direction."""
+        """The covariance (3, 3) of the direction error, rad^2, of rank 2 and zero along the direction."""
         return np.asarray(self.basis.T @ self.tangent_covariance @ self.basis)
 
     @property
     def sigma(self) -> float:
-        """The root of the mean variance over the two axes, rad."""
+        """The standard deviation per axis, rad: the root of the mean variance over both axes."""
         return float(np.sqrt(0.5 * np.trace(self.tangent_covariance)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunSolution:
-    """The outcome of one image. It is true (`if solution:`) if the Sun was found.
+    """The outcome of one image. A solution is true (`if solution:`) if the Sun was found.
 
     Attributes:
         status: the outcome.
-        reason: why there is no Sun, in a few words; empty with a Sun.
-        sun: the measurement; None unless the status is FOUND or PARTIAL.
-        pixels_read: number of pixels read.
+        reason: short reason why no Sun was found. It is empty if the Sun was found.
+        sun: the measurement; It is None unless the status is FOUND or PARTIAL.
+        pixels_read: number of pixels that were read.
     """
 
     status: SunStatus
@@ -156,43 +160,43 @@ class SunSolution:
 
 
 _MOST_PATCHES = 4
-"""Largest number of patches that are examined, the largest first."""
+"""Maximum number of patches that are examined, starting with the largest."""
 _LEAST_PATCH = 3
-"""Least number of pixels of a patch on the rows that are read: a chord of the Sun's disc, not a hot pixel."""
+"""Minimum number of pixels of a patch on the rows that are read, to exclude hot pixels."""
 _SPOKES = 48
 """Number of spokes along which a rim is traced."""
 _STEP = 0.5
-"""Distance between samples along a spoke (px)."""
+"""Distance (px) between samples along a spoke."""
 _ROUNDS = 3
-"""Largest number of tracings of the rim, each from the centre of the previous circle."""
+"""Maximum number of tracings of the rim, each from the centre of the previous circle."""
 _NEAR = 0.5
-"""Distance (px) of the fitted centre from the origin of the spokes that ends the tracing."""
+"""Distance (px) between fitted centre and origin of the spokes at which the tracing stops."""
 
 
 def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = None) -> SunSolution:
-    """Return the Sun's direction in camera axes from an image, or the reason why there is none.
+    """Return the Sun direction in camera axes from an image, or the reason why no Sun was found.
 
     Args:
-        image: pixel values (rows, columns) of any integer or floating type; a larger value is brighter.
-        camera: the camera, `Pinhole` or `Lens` of `knightcube.vision.camera.lens`, of the image's size.
-        settings: settings of the search; None: `LINEAR`, for a linear camera of 8 bits.
+        image: pixel values (rows, columns) of any integer or floating type. Larger values are brighter.
+        camera: camera model (`Pinhole` or `Lens` of `knightcube.vision.camera.lens`) of the image's size.
+        settings: settings of the search. If it is None, `LINEAR` for a linear 8-bit camera is used.
 
     Raises:
-        ValueError: if the image does not have the size of the camera, or has pixels that are not finite.
+        ValueError: if the image does not have the size of the camera, or has non-finite pixels.
     """
     settings = LINEAR if settings is None else settings
     check_image(image, camera)
-    # Towards its corners a pinhole camera stretches a disc by the squared secant of the angle.
+    # Towards the corners, a pinhole camera stretches a disc by the squared secant of the field angle.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch
-    # A disc that the edge of the image cuts must show at least half its width, or its rim is too short.
+    # A truncated disc must show at least half its width, because its rim would otherwise be too short.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
     patches, wide = _bright_patches(image, settings, narrowest, 2.0 * reach)
     read = camera.columns * len(range(settings.stride // 2, camera.rows, settings.stride))
     reasons = ["a patch larger than the Sun and its glare"] if wide else []
     found: list[SunMeasurement] = []
     for middle, half in patches:
-        # Twice the radius and a margin, for a centre outside of the image.
+        # Twice the radius and a margin are searched, because the centre may lie outside the image.
         near = min(2.5 * half + 6.0, 2.0 * reach)
         first = max(int(np.floor(middle[1] - near)), 0)
         strip = image[first : min(int(np.ceil(middle[1] + near)), camera.rows - 1) + 1]
@@ -207,7 +211,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
         if reasons:
             return SunSolution(SunStatus.NOT_THE_SUN, reasons[0], None, read)
         return SunSolution(SunStatus.NO_SUN, f"nothing reaches {settings.level:g} counts", None, read)
-    # Of several round patches, the largest is taken as the Sun.
+    # If several patches are round, the largest counts as the Sun.
     sun = max(found, key=lambda one: one.radius)
     return SunSolution(SunStatus.PARTIAL if sun.cut else SunStatus.FOUND, "", sun, read)
 
@@ -215,16 +219,16 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
 def _bright_patches(
     image: Image, settings: SunSettings, narrowest: float, widest: float
 ) -> tuple[list[tuple[FloatArray, float]], bool]:
-    """Return the bright patches on every `stride`th row, the largest first: middle (2,), px, half extent, px.
+    """Return centre (2,), px, and half extent, px, of the bright patches, the largest first.
 
-    Patches narrower than `narrowest` px or wider than `widest` px are excluded. The second value states
-    whether a patch was excluded because of its width.
+    Only every `stride`th row is read. Patches narrower than `narrowest` px or wider than `widest` px are
+    excluded. The second value states whether a patch was excluded as too wide.
     """
     stride = settings.stride
     bright = image[stride // 2 :: stride] >= settings.level
     if not bright.any():
         return [], False
-    # Only the box around all bright pixels is labelled, because labelling takes time per pixel.
+    # Only the box around all bright pixels is labelled, because labelling takes time for every pixel.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
     labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])
@@ -248,14 +252,14 @@ def _bright_patches(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rim:
-    """Rim points around a direction, in its tangent plane.
+    """Points on the rim of a bright patch, in the tangent plane of a direction.
 
     Attributes:
-        axis: unit vector (3,) in camera axes, at which the spokes start.
-        basis: axes of the plane (2, 3).
-        points: positions (n, 2), rad, in the azimuthal equidistant projection about the axis.
-        cut: number of spokes that left the image before the rim.
-        endless: number of spokes without a rim within reach.
+        axis: unit vector (3,) in camera axes, from which the spokes start.
+        basis: two unit vectors (2, 3) that span the tangent plane.
+        points: positions (n, 2) in the azimuthal equidistant projection about the axis, rad.
+        cut: number of spokes that leave the image before the rim.
+        endless: number of spokes without a rim within the searched distance.
     """
 
     axis: FloatArray
@@ -267,7 +271,7 @@ class _Rim:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Disc:
-    """A bright disc: its rim, the circle through it, and px per rad (2, 2) along the rim's basis."""
+    """A bright disc: its rim, the circle through the rim, and px per rad (2, 2) along the rim's basis."""
 
     rim: _Rim
     circle: Circle
@@ -282,23 +286,23 @@ class _Disc:
 
     @property
     def pixels_per_radian(self) -> float:
-        """The mean scale over all directions."""
+        """The image scale (px/rad), as a mean over all directions."""
         return float(np.sqrt(abs(np.linalg.det(self.scale))))
 
 
 def _disc(
     strip: Image, first: int, middle: FloatArray, reach: float, camera: CameraModel, settings: SunSettings
 ) -> _Disc | None:
-    """Return the disc of a bright patch around `middle` (2,), px, with its rim within `reach` rad.
+    """Return the disc of a bright patch around `middle` (2,), px, with its rim within `reach` rad, or None.
 
-    `strip` are the rows of the image from number `first`.
+    `strip` holds the rows of the image from row `first`.
     """
     axis = camera.unit_vectors(middle[None, :])[0]
     disc = None
     step = 1e-4
     for _ in range(_ROUNDS):
         rim = _trace(strip, first, camera, axis, settings.level, reach)
-        # The scale is that of the boresight if the lens does not image the surroundings of the axis.
+        # The scale of the boresight is used if the surroundings of the axis are outside the lens's range.
         ends = camera.project(np.concatenate([axis + step * rim.basis, axis - step * rim.basis]))
         scale = (ends[:2] - ends[2:]).T / (2.0 * step)
         scale = scale if np.all(np.isfinite(scale)) else camera.focal_length * np.eye(2)
@@ -309,7 +313,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # The tracing is not repeated for a disc of a wrong radius.
+        # The tracing is not repeated if the radius of the disc is wrong.
         wrong = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if wrong or aside * disc.pixels_per_radian < _NEAR:
             break
@@ -320,7 +324,7 @@ def _disc(
 def _trace(
     strip: Image, first_row: int, camera: CameraModel, axis: FloatArray, level: float, reach: float
 ) -> _Rim:
-    """Return the rim around `axis` (3,) within `reach` rad, in `strip`, the rows from `first_row`."""
+    """Return the rim within `reach` rad around `axis` (3,) in `strip`, the rows from `first_row`."""
     basis = tangent_basis(axis)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
     ways = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -329,7 +333,7 @@ def _trace(
     rays = np.cos(arcs)[:, None] * axis + np.sin(arcs)[:, None] * (ways @ basis)[:, None, :]
     counts = sample(strip, first_row, camera.project(rays.reshape(-1, 3))).reshape(_SPOKES, -1)
     inner, outer = counts[:, :-1], counts[:, 1:]
-    # Outside the image the counts are NaN, so that both comparisons are false.
+    # Outside the image, the counts are NaN, so that both comparisons are false.
     falls = (inner >= level) & (outer < level)
     crosses = falls.any(axis=1)
     at = falls.argmax(axis=1)[crosses]
@@ -341,7 +345,7 @@ def _trace(
 
 
 def sample(strip: Image, first_row: int, points: FloatArray) -> FloatArray:
-    """Return the counts (n,) at `points` (n, 2), px, bilinear between pixels; NaN outside of the strip."""
+    """Return the counts (n,) at `points` (n, 2), px, by bilinear interpolation; NaN outside of the strip."""
     rows, columns = strip.shape
     x, y = points[:, 0], points[:, 1] - first_row
     inside = (x >= 0.0) & (x <= columns - 1.0) & (y >= 0.0) & (y <= rows - 1.0)
@@ -371,7 +375,7 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if used * 2.0 * np.pi / _SPOKES < settings.least_arc:
         return f"too short an arc of a rim, {used * 360 // _SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
-    # Where the lens stretches a disc, the round blur is anisotropic on the sphere.
+    # If the lens stretches the disc, a round blur in the image is elongated on the sphere.
     widest, narrowest = np.linalg.svd(disc.scale, compute_uv=False)
     if residual > settings.tolerance * math.sqrt(float(widest / narrowest)):
         return f"a rim {residual:.2f} px rms off a circle"
@@ -379,13 +383,13 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
 
 
 def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> SunMeasurement:
-    """Return the measurement of an accepted disc."""
+    """Return the measured Sun direction from an accepted disc."""
     circle, scale = disc.circle, disc.pixels_per_radian
     rim_sigma = max(circle.residual, settings.rim_sigma / scale)
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The basis of the rim, tilted to the fitted centre.
+    # The basis of the rim is tilted to the fitted centre.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(
@@ -401,30 +405,32 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
 
 
 _LEAST_POINTS = 6
-"""Least number of points of a circle."""
+"""Minimum number of points for the fit of a circle."""
 _CIRCLE_STEPS = 10
 _LAST_STEP = 1e-2
-"""Step that ends the iteration, as a fraction of a point's error."""
+"""Step at which the iteration stops, relative to the error of a point."""
 _MOST_CORRELATED = 0.9
 """Largest assumed correlation between the errors of neighbouring points."""
 _TUKEY = 4.685
-"""Cut-off of the biweight, in scales: 95 % efficient for Gaussian errors."""
+"""Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the best consensus from which a smaller circle is preferred, because stray light enlarges the
-disc."""
+"""Fraction of the best consensus from which a smaller circle is preferred.
+
+Stray light enlarges discs, so that a smaller circle is more likely the Sun.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circle:
-    """A circle in a plane; lengths have the unit of the points.
+    """A circle in a plane, with lengths in the unit of the points.
 
     Attributes:
         centre: centre (2,).
         radius: radius, positive.
-        used: which points determine the circle (n,).
+        used: mask (n,) of the points that determine the circle.
         residual: rms distance of the used points from the circle.
-        shape: covariance (2, 2) of the centre for unit variance of each point, with the measured correlation
-            of neighbouring errors.
+        shape: covariance (2, 2) of the centre for unit variance of each point, including the measured
+            correlation of neighbouring points.
     """
 
     centre: FloatArray
@@ -435,9 +441,9 @@ class Circle:
 
 
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle through `points` (n, 2), in their order around it; None if there is none.
+    """Return the circle through `points` (n, 2), which are in order around it; None if there is none.
 
-    `scale` is the error of a good point, in the unit of the points.
+    `scale` is the standard deviation of a good point, in the unit of the points.
     """
     solution = _consensus(points, 2.5 * scale) if len(points) >= _LEAST_POINTS else None
     if solution is None:
@@ -462,14 +468,14 @@ def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     square = float(np.mean(left**2))
     if not (solution[2] > 0.0 and 0.0 < square < np.inf):
         return None
-    # Correlated errors of a first-order process increase the variance of the mean by (1 + r)/(1 - r).
+    # Correlated errors of a first-order process increase the variance of a mean by (1 + r)/(1 - r).
     correlation = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_CORRELATED)
     shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + correlation) / (1.0 - correlation))
     return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))
 
 
 def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the distances (n,) of the points outside of a circle (x, y, radius), and their slopes (n, 3)."""
+    """Return distances (n,) of points from a circle (x, y, radius), positive outside, and slopes (n, 3)."""
     offset = points - solution[:2]
     length = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), 1e-12)
     slopes = np.concatenate([-offset / length[:, None], np.full((len(points), 1), -1.0)], axis=1)
@@ -477,9 +483,9 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) through three points with the most other points within `gate` of it.
+    """Return the circle (x, y, radius) through three of the points that has most points within `gate`.
 
-    The triples are evenly spaced along the rim, between an eighth and a third of it apart.
+    The points of a triple are evenly spaced, by an eighth to a third of the rim.
     """
     count = len(points)
     place = np.arange(0, count, 3)
@@ -488,7 +494,7 @@ def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
         for apart in sorted({max(count // part, 1) for part in (3, 4, 6, 8)})
     ]
     first, second, third = np.moveaxis(points[np.concatenate(triples)], 1, 0)
-    # The circumcentre relative to the first point is where the bisectors of two chords meet.
+    # The circumcentre relative to the first point is the intersection of the bisectors of two chords.
     b, c = second - first, third - first
     cross = 2.0 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
     sound = np.abs(cross) > 1e-9 * np.sum(b * b + c * c, axis=1)
@@ -506,24 +512,24 @@ def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
 
 
 _SIGMAS = 3.0
-"""Standard deviations of the coarse Sun within which a camera may have the Sun in its field."""
+"""Number of standard deviations of the coarse Sun direction within which the Sun is expected."""
 _RING = 12
-"""Number of directions that are tested at each distance from the coarse Sun."""
+"""Number of directions that are tested at each angular distance from the coarse Sun direction."""
 _CONTRADICTED = 5.0
-"""Largest distance between a camera's Sun and the coarse Sun, in standard deviations of the coarse Sun."""
+"""Largest distance of the measured from the coarse Sun direction, in standard deviations of the latter."""
 _CUT = np.radians(0.05)
-"""Systematic error per axis (rad) of a disc that the edge of the image cuts."""
+"""Systematic error per axis (rad) of a disc that the edge of the image truncates."""
 
 
 @dataclass(frozen=True, slots=True)
 class CameraChoice:
-    """A camera and whether it may have the Sun in its field.
+    """A camera, and whether it may have the Sun in its field of view.
 
     Attributes:
         index: index of the camera among all cameras.
-        likely: whether the coarse Sun itself is in its field.
-        possible: whether the Sun is in its field within three standard deviations.
-        angle: angle between its boresight and the coarse Sun, rad.
+        likely: whether the coarse Sun direction is in the field of view.
+        possible: whether the Sun may be in the field of view, within three standard deviations.
+        angle: angle between the boresight and the coarse Sun direction, rad.
     """
 
     index: int
@@ -533,11 +539,11 @@ class CameraChoice:
 
 
 def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[CameraChoice]:
-    """Return the cameras in the order in which they are read for the Sun; no camera if it is dark.
+    """Return the cameras in the order in which they are read for the Sun, or no camera if it is dark.
 
-    Cameras with the coarse Sun in their field come first, followed by cameras that may have the Sun in their
-    field. Each group is sorted by the angle of the coarse Sun from the boresight. If the coarse Sun is
-    uncertain, all cameras are possible, in their given order.
+    Cameras with the coarse Sun direction in their field of view come first, followed by cameras that may have
+    the Sun in their field of view. Each of these groups is sorted by the angle between boresight and coarse
+    Sun direction. If there is no coarse Sun direction, all cameras are possible, in their given order.
     """
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
         if sun.status is CoarseSunStatus.DARK:
@@ -563,11 +569,11 @@ class SunOfCameras:
     """The Sun in body axes.
 
     Attributes:
-        direction: unit vector (3,); None if neither a camera nor the strings have found the Sun.
-        covariance: covariance (3, 3) of the direction's error, rad^2, zero along the direction.
+        direction: unit vector (3,) to the Sun; None if neither a camera nor the solar strings found the Sun.
+        covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
         camera: index of the camera that found the Sun; None if the solar strings gave the direction.
-        each: solutions of the cameras, in the order in which they were read.
-        reason: reason why no camera has found the Sun; empty if a camera has found it.
+        each: solutions by camera index, in the order in which the cameras were read.
+        reason: reason why no camera found the Sun. It is empty if a camera found the Sun.
     """
 
     direction: FloatArray | None
@@ -585,17 +591,17 @@ def sun_of_cameras(
 ) -> SunOfCameras:
     """Return the Sun in body axes from the first camera that finds it, or else from the solar strings.
 
-    A camera is not read if, according to the solar strings, it cannot have the Sun in its field. A Sun that
-    contradicts the strings is rejected.
+    A camera is not read if the solar strings exclude that the Sun is in its field of view. A measured Sun
+    that contradicts the solar strings is rejected.
 
     Args:
-        images: images (rows, columns) of one instant, by the numbers of their cameras.
+        images: images (rows, columns) of one instant, by camera index.
         cameras: all cameras of the body.
-        strings: the coarse Sun of the solar strings.
-        settings: settings of the search.
+        strings: coarse Sun direction from the solar strings.
+        settings: settings of the search for the Sun.
 
     Raises:
-        ValueError: as `find_sun`.
+        ValueError: for the same reasons as `find_sun`.
     """
     order = cameras_by_sun(strings, cameras)
     each: dict[int, SunSolution] = {}
@@ -626,7 +632,7 @@ def sun_of_cameras(
 
 
 def _contradicts(direction: FloatArray, strings: CoarseSun) -> bool:
-    """Return whether a direction differs from the Sun of the solar strings by more than their errors."""
+    """Return whether a direction differs significantly from the Sun direction of the solar strings."""
     if strings.direction is None or strings.basis is None or strings.tangent_covariance is None:
         return False
     if float(direction @ strings.direction) <= 0.0:
