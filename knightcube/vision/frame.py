@@ -151,8 +151,8 @@ class Moments:
     Attributes:
         flux: light (n,), counts.
         centre: centroid of each region (n, 2), x and y, px.
-        length: length of the uniform line with the second moments of each region (n,), px. It is about 0 for
-            a round region.
+        length: length of the uniform line with the second moments of each region (n,), px. The length is
+            about 0 for a round region.
         thickness: rms width of each region across its line (n,), px.
         direction: angle from the pixel rows to the line of each region (n,), rad.
     """
@@ -349,7 +349,7 @@ def saturation_level(pixels: Image, given: float | None) -> float:
 def saturation_count(pixels: Image) -> float:
     """Return the saturation count: the highest count if several pixels have it, else the type's maximum.
 
-    This function is for frames of streaks, in which bright stars cover many pixels.
+    Use this function for frames of streaks, in which bright stars cover many pixels.
     """
     highest = pixels.max()
     # A frame with only one value is dead, unless the value is the maximum of its type.
@@ -361,7 +361,7 @@ def saturation_count(pixels: Image) -> float:
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
     """Return the saturation count: `given`, the highest of `counts` (m,) if many share it, or the maximum.
 
-    This function is for frames of points from any camera. In a dim frame, the highest counts are noise and
+    Use this function for frames of points from any camera. In a dim frame, the highest counts are noise and
     become rarer with their height. At saturation, more pixels have the highest count than the counts just
     below.
     """

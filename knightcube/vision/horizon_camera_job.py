@@ -1,9 +1,10 @@
 """Job of the worker process `wide`: Sun and nadir in body axes from the images of the horizon cameras.
 
-The solar strings determine which camera is read first. They also give the Sun direction if no camera finds
-the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a limb, the Earth
-may fill one camera while the others are dark. The brightness of all images then gives a coarse nadir
-direction. The estimators are imported when they are used, because the control process does not need them.
+The solar strings determine which camera is read first. The solar strings also give the Sun direction if no
+camera finds the Sun. The nadir direction is fitted to the limbs in all images at once. If no image shows a
+limb, the Earth may fill one camera while the others are dark. The brightness of all images then gives a
+coarse nadir direction. The estimators are imported when they are used, because the control process does not
+need them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ class HorizonCameraJob:
         frames: images (rows, columns) by the index of their camera.
         cameras: all cameras.
         knowledge: prior knowledge, with directions and attitude in body axes.
-        strings: model of the solar strings and their currents (n,), A. It is None without a recent reading.
+        strings: model of the solar strings and their currents (n,), A. Without a recent reading, `strings` is
+            None.
         response: response of the cameras to intensity; None: linear.
     """
 
@@ -72,8 +74,8 @@ class HorizonCameraResult:
 
     Attributes:
         sun, nadir: measured directions; None if there is none.
-        false: reasons why images contradict an accurate attitude, by camera index. It is None without an
-            accurate attitude.
+        false: reasons why images contradict an accurate attitude, by camera index. Without an accurate
+            attitude, `false` is None.
     """
 
     sun: MeasuredDirection | None

@@ -1,9 +1,10 @@
 """Calibration of a camera lens from solved frames: focal length, optical axis and radial distortion.
 
 The fit is a weighted least-squares fit in pixels to all frames at once, with an unknown attitude for each
-frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. They are
-then rejected if they exceed five standard deviations. The attitudes are eliminated frame by frame with the
-Schur complement, as three small rotations each. The remaining system is 5 x 5 for any number of frames.
+frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. Matches
+with residuals above five standard deviations are then rejected. The attitudes are eliminated frame by frame
+with the Schur complement, as three small rotations each. The remaining system is 5 x 5 for any number of
+frames.
 
 The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a
 rotation of the camera, and a single frame hardly separates the two. Each parameter therefore has a prior
@@ -521,8 +522,8 @@ def lens_accuracy(
 
     The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
     change of the focal length relative to the fit `whole` with all terms is added to its error. The accuracy
-    of the distortion is the relative displacement of an image corner. It includes the uncertainty with all
-    terms and the difference between the two fits.
+    of the distortion is the relative displacement of an image corner. This displacement includes the
+    uncertainty with all terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -578,7 +579,7 @@ class CalibrationImage:
 
     Attributes:
         solution: identified stars and attitude of the image, or the reason why it is not solved.
-        excluded: reason for excluding a solved image. It is empty for an image that is used.
+        excluded: reason for excluding a solved image. For an image that is used, `excluded` is empty.
     """
 
     solution: FrameSolution
@@ -586,13 +587,13 @@ class CalibrationImage:
 
     @property
     def reason(self) -> str:
-        """The reason why the image is not used. It is empty for an image that is used."""
+        """The reason why the image is not used. The reason is empty for an image that is used."""
         return self.excluded or ("" if self.solution.fix is not None else self.solution.reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensCalibration:
-    """The outcome of `calibrate_lens`. It is true (`if found:`) if a lens was determined.
+    """The outcome of `calibrate_lens`. A `LensCalibration` is true (`if found:`) if a lens was determined.
 
     Attributes:
         determined: lens, standard deviations, omitted terms and accuracy; None if no image was solved.
@@ -626,8 +627,8 @@ def calibrate_lens(
 
     Args:
         images: arrays (rows, columns) of counts, all of one shape.
-        fov_deg: approximate field of view across the columns, deg. If it is None, fields from 4 to 60 deg are
-            tried.
+        fov_deg: approximate field of view across the columns, deg. If `fov_deg` is None, fields from 4 to 60
+            deg are tried.
         progress: function that is called before each image with the pass and the image number, both from 1.
 
     Raises:

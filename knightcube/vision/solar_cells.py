@@ -113,7 +113,7 @@ class CoarseSun:
 
     @property
     def sigma(self) -> float:
-        """The standard deviation per axis, rad. It is infinite without a direction."""
+        """The standard deviation per axis, rad. The deviation is infinite without a direction."""
         covariance = self.tangent_covariance
         return float("inf") if covariance is None else float(np.sqrt(0.5 * np.trace(covariance)))
 
@@ -160,7 +160,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
             break
     left = readings - _sunlight(normals @ direction)[0]
     square, freedom = float(left @ information @ left), len(shares) - 2
-    # This is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
+    # The limit is the chi-square that one reading in a thousand exceeds (Wilson and Hilferty 1931).
     ninth = 2.0 / (9.0 * freedom)
     if square > float(freedom * (1.0 - ninth + _RARE * np.sqrt(ninth)) ** 3):
         reason = f"the currents fit no Sun: chi-square {square:.0f} of {freedom}"
@@ -247,7 +247,7 @@ class FieldAndStrings:
     """Attitude estimator that keeps track of the possible rotations about the magnetic field.
 
     Attributes:
-        wrong: fault that the last reading shows. It is empty if all strings agree.
+        wrong: fault that the last reading shows. The text is empty if all strings agree.
     """
 
     def __init__(self, strings: SolarStringModel) -> None:

@@ -65,7 +65,7 @@ class StarSolution:
 
     Attributes:
         status: outcome: "solved", "no-stars", "too-few-stars", "no-match" or "ambiguous".
-        reason: one-sentence reason why the image was not solved. It is empty for a solved image.
+        reason: one-sentence reason why the image was not solved. The reason is empty for a solved image.
         right_ascension: right ascension of the boresight, ICRS, from 0 to 2 pi, rad.
         declination: declination of the boresight, ICRS, rad.
         roll: position angle of the image's upward direction (-y), from north through east, from 0 to 2 pi,
@@ -74,14 +74,15 @@ class StarSolution:
             z along the boresight, x to the right along the pixel rows, y down.
         covariance: covariance (3, 3) of the attitude error as a small rotation in camera axes, rad^2.
         stars: identified catalogue stars.
-        field_of_view: angle between the outer edges of the first and last column, without distortion, rad. It
-            is fitted to the stars unless the camera is calibrated.
-        field_of_view_sigma: standard deviation of the field of view, rad. It is 0 for a calibrated camera.
+        field_of_view: angle between the outer edges of the first and last column, without distortion, rad.
+            The field of view is fitted to the stars unless the camera is calibrated.
+        field_of_view_sigma: standard deviation of the field of view, rad. The deviation is 0 for a calibrated
+            camera.
         log10_false_alarm: log10 of an upper limit of the probability that randomly placed points are solved.
         mirrored: whether the image is a mirror image of the sky. The attitude is then that of the image with
             left and right exchanged.
-        rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. It is
-            None unless the stars are streaks and the exposure was given.
+        rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
+            is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
         rate_sign_known: whether the sign of `rate` is known. A single image shows the sign only together with
             a predicted rate.
@@ -143,10 +144,10 @@ class StarTracker:
     folder.
 
     Args:
-        fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If it
-            is None, fields from 4 to 60 deg are tried.
-        fov_error_deg: largest error of the field of view, deg. If it is None, the error is 5 % of `fov_deg`,
-            or zero for a given `camera`.
+        fov_deg: field of view between the outer edges of the first and last column, from 1 to 120 deg. If
+            `fov_deg` is None, fields from 4 to 60 deg are tried.
+        fov_error_deg: largest error of the field of view, deg. If `fov_error_deg` is None, the error is 5 %
+            of `fov_deg`, or zero for a given `camera`.
         camera: calibrated camera (`Pinhole` or `Lens` of `knightcube.vision.camera`), given instead of
             `fov_deg`.
         settings: tolerances and methods of detection, identification and attitude. None: the defaults.
@@ -194,10 +195,10 @@ class StarTracker:
         Args:
             image: pixel values (rows, columns) of any integer or floating type, 16 x 16 pixels or larger.
                 Larger values are brighter. Colour images must be converted to grey values first.
-            exposure: exposure time, s. It is only needed for the rate of streaked stars.
+            exposure: exposure time, s. The exposure time is only needed for the rate of streaked stars.
             utc: date of the image, which is UTC if it has no time zone. The date is used for proper motion
-                and for aberration by the Earth's velocity, which is at most 20.5". If it is None, the epoch
-                of the index is used, without aberration.
+                and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
+                epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
                 predicted positions, which is faster. If this does not succeed, the whole sky is searched.
             attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
@@ -257,7 +258,8 @@ def camera_of_field(
     """Return a pinhole camera for a field of view, and the range of factors on its field-angle tangents.
 
     Args:
-        fov_deg: field of view across the columns, deg. If it is None, the range `UNKNOWN_FOV_DEG` is used.
+        fov_deg: field of view across the columns, deg. If `fov_deg` is None, the range `UNKNOWN_FOV_DEG` is
+            used.
         error_deg: largest error of `fov_deg`, deg; None: 5 % of it.
         shape: number of rows and columns of the image.
 

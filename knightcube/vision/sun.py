@@ -110,8 +110,8 @@ class SunMeasurement:
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
         tangent_covariance: covariance (2, 2) of the direction error along `basis`, without the error of the
             lens calibration, rad^2.
-        point: position of the Sun's centre (2,) in the image, px. It is NaN if the centre is outside the
-            range of the lens.
+        point: position of the Sun's centre (2,) in the image, px. The position is NaN if the centre is
+            outside the range of the lens.
         radius: radius of the bright disc with its glare, rad.
         residual: rms distance of the used rim points from the circle, px.
         arc: arc of the rim that was used in the fit, rad.
@@ -144,8 +144,8 @@ class SunSolution:
 
     Attributes:
         status: the outcome.
-        reason: short reason why no Sun was found. It is empty if the Sun was found.
-        sun: the measurement; It is None unless the status is FOUND or PARTIAL.
+        reason: short reason why no Sun was found. The reason is empty if the Sun was found.
+        sun: the measurement; The measurement is None unless the status is FOUND or PARTIAL.
         pixels_read: number of pixels that were read.
     """
 
@@ -179,7 +179,7 @@ def find_sun(image: Image, camera: CameraModel, settings: SunSettings | None = N
     Args:
         image: pixel values (rows, columns) of any integer or floating type. Larger values are brighter.
         camera: camera model (`Pinhole` or `Lens` of `knightcube.vision.camera.lens`) of the image's size.
-        settings: settings of the search. If it is None, `LINEAR` for a linear 8-bit camera is used.
+        settings: settings of the search. If `settings` is None, `LINEAR` for a linear 8-bit camera is used.
 
     Raises:
         ValueError: if the image does not have the size of the camera, or has non-finite pixels.
@@ -542,7 +542,7 @@ def cameras_by_sun(sun: CoarseSun, cameras: Sequence[MountedCamera]) -> list[Cam
     """Return the cameras in the order in which they are read for the Sun, or no camera if it is dark.
 
     Cameras with the coarse Sun direction in their field of view come first, followed by cameras that may have
-    the Sun in their field of view. Each of these groups is sorted by the angle between boresight and coarse
+    the Sun in their field of view. Each group of cameras is sorted by the angle between boresight and coarse
     Sun direction. If there is no coarse Sun direction, all cameras are possible, in their given order.
     """
     if sun.direction is None or sun.basis is None or sun.tangent_covariance is None:
@@ -573,7 +573,7 @@ class SunOfCameras:
         covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
         camera: index of the camera that found the Sun; None if the solar strings gave the direction.
         each: solutions by camera index, in the order in which the cameras were read.
-        reason: reason why no camera found the Sun. It is empty if a camera found the Sun.
+        reason: reason why no camera found the Sun. The reason is empty if a camera found the Sun.
     """
 
     direction: FloatArray | None

@@ -388,9 +388,9 @@ class _Candidate:
         result: result of the estimation with this motion.
         rotation: (3,) rad, rotation vector over the exposure.
         verdict: verdict of the streak check on this motion.
-        middles: (n, 2) px, centres of the bright streaks. It is empty for a global shutter.
-        excess: (n,) chi-square minus the number of pixels of each bright streak. It is empty for a global
-            shutter.
+        middles: (n, 2) px, centres of the bright streaks. For a global shutter, `middles` is empty.
+        excess: (n,) chi-square minus the number of pixels of each bright streak. For a global shutter,
+            `excess` is empty.
     """
 
     result: MotionResult

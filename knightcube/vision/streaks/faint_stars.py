@@ -7,10 +7,10 @@ Across the circles, the filter response of a star is the star's profile. Peaks o
 stars, and a linear system separates the heights of overlapping peaks. For bright stars, the second difference
 along the circle separates overlapping triangles.
 
-If the brightest regions do not determine the rotation angle, all circles are searched. This happens if
-streaks are faint and fragmented, or if the border truncates all of them. The mean of the pixels in a box
-along a circle is compared with the mean of the pixels on both sides of the box. The box length with the
-largest sum of squared significances is the length of the streaks.
+If the brightest regions do not determine the rotation angle, all circles are searched. A search of all
+circles is necessary if streaks are faint and fragmented, or if the border truncates all of them. The mean of
+the pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
+length with the largest sum of squared significances is the length of the streaks.
 """
 
 from __future__ import annotations
@@ -182,8 +182,8 @@ class RunningSums:
     Attributes:
         light: (r, c) counts.
         count: (r, c) number of samples on the detector in each running sum.
-        span: (r, 2) first and last column of each circle on the detector. It is infinite if a circle leaves
-            the detector in between.
+        span: (r, 2) first and last column of each circle on the detector. The span is infinite if a circle
+            leaves the detector in between.
         excess: (r,) noise of the running sums on each circle, relative to the noise of independent samples.
     """
 

@@ -226,8 +226,8 @@ def sensitivities_and_velocity(
     """Return derivatives (m, 2, 8) of pixels at `time` (m,), and velocities (m, 2), px per exposure.
 
     The parameters are the rate (3), the acceleration (3) and the star's pixel at mid-exposure (2). The
-    derivatives with respect to rate and star are exact. Those with respect to the acceleration have an error
-    of second order in the rotation angle, and are zero unless `growing`.
+    derivatives with respect to rate and star are exact. Derivatives with respect to the acceleration have an
+    error of second order in the rotation angle, and are zero unless `growing`.
     """
     turned = _rotation_until(motion, time)
     v = _rotated(turned, _directions(pinhole, stars))
@@ -346,7 +346,7 @@ class Shutter:
     """Exposure times of the rows of a detector with a rolling or global shutter.
 
     Attributes:
-        delay_per_row: delay from one row to the next, in exposures. It is 0 for a global shutter.
+        delay_per_row: delay from one row to the next, in exposures. The delay is 0 for a global shutter.
         middle: row that is at mid-exposure at time zero.
     """
 

@@ -191,7 +191,8 @@ class StreakFit:
         scene: the fitted scene.
         solution: last step.
         evaluation: normal equations of the last step.
-        last_step: last step of the shared parameters in standard deviations. It is 0 if the fit is converged.
+        last_step: last step of the shared parameters in standard deviations. The value is 0 if the fit is
+            converged.
         windows: fitted pixels.
         free: (SHARED,) mask of the shared parameters that were fitted.
         hidden: stars on the fitted pixels that were subtracted instead of fitted; None without any.
@@ -239,7 +240,7 @@ def iterate(
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
-        evaluation = None  # This frees tens of MB before the next evaluation.
+        evaluation = None  # Deleting the old equations frees tens of MB before the next evaluation.
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
@@ -262,7 +263,7 @@ def iterate(
             break
         previous, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
-            del windows, whole  # This frees tens of MB before new windows are selected.
+            del windows, whole  # Deleting the old windows frees tens of MB before new windows are selected.
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
@@ -667,7 +668,7 @@ def joint_fit(camera: FitProblem, scene: StreakScene, room: float = 1.0) -> Stre
     if done is None or _excessive(done.scene.motion):
         return None
     scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
-    del done  # This frees tens of MB, and `pop` lets the iteration free the windows too.
+    del done  # Deleting the fit frees tens of MB, and `pop` lets the iteration free the windows too.
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)

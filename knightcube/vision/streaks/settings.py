@@ -25,9 +25,9 @@ class LikelihoodSettings:
         psf_sigma: initial standard deviation of the point spread, px. From 2 px on, the frame is binned.
         rate_model: `constant` for a constant rate, `accelerating` for a linearly changing rate, or `auto` to
             let a score test decide.
-        line_time: delay between the exposures of successive rows, s. It is positive for a rolling shutter and
-            0 for a global shutter. If the line time is None, it is unknown, and the fit assumes 0 with a
-            large uncertainty.
+        line_time: delay between the exposures of successive rows, s. The line time is positive for a rolling
+            shutter and 0 for a global shutter. If the line time is None, it is unknown, and the fit assumes 0
+            with a large uncertainty.
         threshold_sigmas: threshold of the 3 x 3 sums for bright regions, in standard deviations.
         most_stars: maximum number of bright stars that determine the motion.
         most_neighbours: maximum number of fainter stars that are fitted because they overlap bright stars.

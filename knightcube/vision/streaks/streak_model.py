@@ -22,9 +22,9 @@ the path by c(t), the counts change by
 where e0 and e1 are the counts per px of path at the two ends. All derivatives are combinations of seven basis
 images, with coefficients for each block. The first moment of m accounts for the change of c_n along a block.
 
-A spot is a short streak or the slow part of a longer streak. Its model is a sum of Gaussians at instants of
-the exposure (Gauss-Legendre quadrature), each integrated over every pixel. This sum is also exact for a star
-at rest.
+A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
+instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
+exact for a star at rest.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def _parts(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # This keeps the end exact for the comparison below.
+    edges[:, -1] = times[:, 1]  # The assignment keeps the end time exact for the comparison below.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)

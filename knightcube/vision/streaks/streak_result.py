@@ -1,8 +1,8 @@
 """Results of an estimate from star streaks, and checks of the arguments that all estimators share.
 
-The control process reads results that worker processes compute. This module therefore imports no estimator. A
-single frame does not distinguish the rate omega from -omega. A prior rate, from a gyro or the previous
-estimate, determines the sign.
+The control process reads results that worker processes compute. The module imports no estimator, because the
+control process needs only the results. A single frame does not distinguish the rate omega from -omega. A
+prior rate, from a gyro or the previous estimate, determines the sign.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class MotionResult(FrameMotion):
         misfit: median chi-square per degree of freedom of the bright stars.
         rate_model: fitted model of the rate, `constant` or `accelerating`.
         acceleration: (3,) fitted angular acceleration, rad/s^2, or None if it was not fitted.
-        reason: one-line reason for a missing rate. It is empty if there is a rate.
+        reason: one-line reason for a missing rate. The reason is empty if there is a rate.
         course: rotation from the navigation filter whose higher-order terms the fit used; None if it used
             none.
         line_time_sigma: standard deviation of the shutter's line time, s.

@@ -158,7 +158,7 @@ class CalibrationCorrection:
     """Effect of camera calibration errors on the shared parameters of the fit.
 
     Attributes:
-        step: (k,) correction of the shared parameters. It is 0 if the errors are not significant.
+        step: (k,) correction of the shared parameters. The correction is 0 if the errors are not significant.
         added: (k, k) covariance that calibration errors add to the covariance for an exact camera.
         described: (k, k) part of `added` from errors whose size is specified.
         score: (n, k) gradient of each star after the correction.
@@ -399,7 +399,8 @@ _MOST_IMPROVEMENT = 100.0
 class _PathLight:
     """Sums over the pixels of a streak that give chi-square for any intensity along its path.
 
-    Here d are the pixel values, w their weights, and g is the point-spread profile across the path.
+    In the sums below, d are the pixel values, w their weights, and g is the point-spread profile across the
+    path.
 
     Attributes:
         places: (k,) distances along the path from the point of rest, px.
