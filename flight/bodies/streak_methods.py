@@ -1,4 +1,4 @@
-"""The methods for streaks, other than maximum likelihood, that a configuration selects for comparison."""
+"""Estimators of the rate from streaks, other than maximum likelihood, that a configuration may select."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from knightcube.vision.frame_job import StreakEstimator
 
 
 def streak_estimator(camera: Camera | None) -> StreakEstimator | None:
-    """Return the configured estimator by corner detectors, None without one."""
+    """Return the estimator by corner detectors that a camera configures, or None if it configures none."""
     if camera is None or camera.estimator == "likelihood":
         return None
     from knightcube.reference.corner_streaks.estimator import CornerEstimator  # noqa: PLC0415 - seldom needed

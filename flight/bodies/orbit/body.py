@@ -1,6 +1,6 @@
-"""A satellite in orbit with three coils: its composition from the configuration, its packets and texts.
+"""A satellite in orbit with three coils, built from its configuration, with its telemetry packets and texts.
 
-The satellite detumbles by magnetometer and gyro, acquires its attitude with its coils at rest, and points.
+The satellite detumbles with magnetometer and gyro, acquires its attitude with the coils off, and points.
 `ORBIT` builds it.
 """
 
@@ -63,12 +63,12 @@ SPIN_EVERY = 10
 NAVIGATION_EVERY = 40
 """Control cycles from one navigation packet to the next."""
 LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
-"""The knowledge by its number in the packet."""
+"""Knowledge of the attitude, in the order of the numbers in the navigation packet."""
 _NAN3 = [math.nan] * 3
 
 
 class OrbitView:
-    """Implements `flight.loop.body.BodyView`."""
+    """Packets and texts of the satellite; implements `flight.loop.body.BodyView`."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class OrbitView:
         self._recorder = services.recorder
 
     def record_cycle(self, output: ControlOutput) -> None:
-        """Record how well the attitude is known, and the spin packet during detumbling."""
+        """Record the navigation packet, and the spin packet during detumbling."""
         self._record_knowledge(output)
         if output.mode is not Mode.DETUMBLE or output.cycle.slot % SPIN_EVERY:
             return
@@ -104,7 +104,7 @@ class OrbitView:
         )
 
     def _record_knowledge(self, output: ControlOutput) -> None:
-        """Record the navigation packet; report another knowledge as an event."""
+        """Record the navigation packet, and report a change of the attitude knowledge as an event."""
         found, now_ns, estimate = self._filter, output.cycle.start_ns, output.estimate
         known = found.knowledge
         if known is not self._knowledge:
@@ -135,11 +135,11 @@ class OrbitView:
         self._events.report(events.TARGET, now_ns, target.law.text)
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
-        """Return the body's fields of the mode packet."""
+        """Return the fields of the mode packet that belong to this body."""
         return {"target_q2": math.nan}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return a rate from streaks as text."""
+        """Return an angular rate that was measured from streaks as text."""
         return f"{np.rad2deg(rate.rate).round(3).tolist()} deg/s"
 
     def progress(self, output: ControlOutput | None) -> str:
@@ -154,14 +154,14 @@ class OrbitView:
 
 
 _BELOW = 0.8
-"""Largest rate of a path, as a fraction of the rate at which the body is detumbled; the rest is a margin."""
+"""Largest rate of a planned path, as a fraction of the rate at which detumbling starts."""
 
 
 class SatelliteEstimation(BodyEstimation):
-    """The estimate of the satellite, and its orbit."""
+    """Estimation of the satellite: attitude filter, orbit, Sun sensing and horizon cameras."""
 
     def __init__(self, config: OrbitConfig, services: Services, learned: Mapping[str, Learned]) -> None:
-        """Start from the states that an earlier boot learned."""
+        """Start from the slow states that an earlier boot learned."""
         try:
             elements = None if config.elements is None else TwoLineElements(*config.elements)
         except UsageError as error:
@@ -180,16 +180,16 @@ class SatelliteEstimation(BodyEstimation):
             )
 
     def field(self, estimate: Estimate) -> FloatArray:
-        """Return the expected field (3,) T in body axes; zero while the orbit is not known."""
+        """Return the expected magnetic field (3,), T, in body axes, or zero while the orbit is unknown."""
         around = self.environment.at(estimate.time_ns)
         return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
     def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then."""
+        """Return the power spectral density (3, 3), rad^2/s^3, of the acceleration noise at a time."""
         return self.orbit_filter.acceleration_psd(time_ns)
 
     def learned(self, estimate: Estimate) -> Mapping[str, Learned]:
-        """Return the slow states, with the time to which they refer."""
+        """Return the filter's slow states, with the time to which they refer."""
         return learned_of(self.orbit_filter.slow, _utc(self._services))
 
     def knowledge(self) -> Knowledge:
@@ -197,19 +197,19 @@ class SatelliteEstimation(BodyEstimation):
         return self.orbit_filter.knowledge
 
     def orbit(self, time_ns: int) -> OrbitState | None:
-        """Return position and velocity, ICRS; None while no orbit is known."""
+        """Return the satellite's position and velocity (ICRS), or None while the orbit is unknown."""
         return self.environment.state(time_ns)
 
     def velocity(self, time_ns: int) -> FloatArray | None:
-        """Return the velocity (3,) m/s about the Sun, ICRS; None while no orbit is known."""
+        """Return the satellite's velocity (3,), m/s, relative to the Sun (ICRS), or None without an orbit."""
         return self.environment.velocity(time_ns)
 
     def accept_fix(self, reading: GpsReading) -> bool:
-        """Accept an epoch of the receiver; return whether it is used."""
+        """Accept a report of the GPS receiver, and return whether it is used."""
         return self.environment.fix(reading)
 
     def accept_sun(self, reading: StringReading) -> str | None:
-        """Pass a reading of the solar cells to the estimate, and to the Sun acquisition of SAFE."""
+        """Pass a solar cell reading to the filter and to the Sun acquisition of SAFE."""
         if self._sun is None or self.sun_acquisition is None:
             return None
         self.sun_acquisition.update_sun(reading)
@@ -217,7 +217,7 @@ class SatelliteEstimation(BodyEstimation):
 
 
 class SatelliteControl(BodyControl):
-    """Guidance and control of the satellite."""
+    """Guidance and control of the satellite, built from its configuration."""
 
     def __init__(self, config: OrbitConfig, estimation: SatelliteEstimation, services: Services) -> None:
         environment, filter_ = estimation.environment, estimation.orbit_filter
@@ -245,20 +245,20 @@ class SatelliteControl(BodyControl):
         self.sun_acquisition = estimation.sun_acquisition
 
     def follows_objects(self) -> bool:
-        """Return whether an object is searched for or followed."""
+        """Return whether the satellite searches for an object or follows one."""
         return self._objects.seeks
 
     def accept_tracks(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Choose the track to follow."""
+        """Accept the confirmed tracks of objects, and choose the one to follow."""
         self._objects.accept(tracks, now_ns)
 
     def exposure_start(self, from_ns: int, exposure_ns: int) -> int:
-        """Return the first time from `from_ns` on at which an exposure meets no step of the coils."""
+        """Return the first start time from `from_ns` on at which no coil switches during the exposure."""
         return self._pauses.calm(from_ns, exposure_ns)
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
-    """Return the satellite of a configuration, with the states that an earlier boot learned."""
+    """Return the satellite of a configuration, started with the states that an earlier boot learned."""
     config = as_orbit(config)
     estimation = SatelliteEstimation(config, services, learned)
     control = SatelliteControl(config, estimation, services)
@@ -275,7 +275,7 @@ def _limit(config: OrbitConfig) -> float:
 
 
 def _pauses(config: OrbitConfig) -> WindowSchedule:
-    """Return the windows of pointing: the pauses of detumbling, and longer times to act."""
+    """Return the windows of pointing: pauses as in detumbling, but a longer time with current."""
     settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
 
@@ -300,7 +300,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     )
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
-    # Without a star camera the keep-out cones refer to the pointing axis.
+    # Without a star camera, the keep-out cones are centred on the pointing axis.
     camera = config.camera
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
@@ -309,7 +309,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
-    """Return boresight and field of the star camera; None if it does not search for objects."""
+    """Return the star camera's boresight and field of view, or None if it does not search for objects."""
     camera = config.camera
     if camera is None or not config.looks_for_objects():
         return None
@@ -319,13 +319,13 @@ def _sensor(config: OrbitConfig) -> Sensor | None:
 
 
 def fastest_rate(config: OrbitConfig) -> float:
-    """Return the rate (rad/s) above which the body is detumbled again or the star camera pauses."""
+    """Return the rate (rad/s) at which the satellite detumbles or, if lower, the star camera pauses."""
     camera = config.camera.max_rate if config.camera is not None else None
     return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
 
 _FIELD_ERROR = 5.0e-8
-"""Error of the magnetic field model (T) per axis."""
+"""Standard deviation of the magnetic field model, T per axis."""
 
 
 def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
@@ -341,14 +341,14 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
 
 
 def _utc(services: Services) -> float:
-    """Return the host's UTC (s), for the age of learned states."""
+    """Return the host's UTC (s), from which the age of learned states is computed."""
     return services.clock.utc_ns() / SECOND_NS
 
 
 def _filter(
     config: OrbitConfig, environment: EstimatedEnvironment, learned: Mapping[str, Learned], utc: float
 ) -> tuple[OrbitFilter, list[str]]:
-    """Return the filter, and why learned states were rejected."""
+    """Return the attitude filter, and the reasons why learned states were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
     slow, problems = start_from(learned, filter_settings(config), section.changed, utc)
     settings = OrbitFilterSettings(
@@ -381,7 +381,7 @@ def _sun(
 
 
 def _sun_acquisition(config: OrbitConfig, services: Services) -> SunAcquisitionLaw | None:
-    """Return the law that turns the pointing axis to the Sun in SAFE; None without solar cells."""
+    """Return the law that turns the pointing axis to the Sun in SAFE, or None without solar cells."""
     section, craft = config.solar_strings, config.craft
     if section is None:
         return None
@@ -420,7 +420,7 @@ def _coil_monitor(config: OrbitConfig) -> CoilMonitor:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia, dipole = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
     settle_ns = round(config.detumble.settle * SECOND_NS)
-    # The field is a sixteenth of the testbed's: the same torque takes longer to be measurable.
+    # The field is 16 times weaker than the testbed's, so a coil's torque takes longer to detect.
     response = ResponseSettings(
         inertia,
         dipole,

@@ -1,12 +1,12 @@
-"""Coarse directions: solar cells with the magnetic field, and Sun and nadir of the horizon cameras.
+"""Coarse attitude from solar cells and magnetic field, and from the horizon cameras.
 
-They start the filter without a star fix, and update it until the attitude is fine.
+These measurements start the filter without a star fix, and update it until the attitude is fine.
 
-The covariance of an attitude from field and solar cells includes every rotation that is possible if any one
-cell has failed (`FieldAndStrings`). Errors of cells and cameras (lens, height of the limb) may last for
-minutes. A measurement is therefore used only if it is more accurate than the estimate, so that repeated
-measurements do not reduce the filter's covariance. If two directions contradict an estimate several times in
-a row, and stars have not made this estimate fine, the filter is restarted.
+The covariance of an attitude from magnetic field and solar cells (`FieldAndStrings`) includes every rotation
+that is possible if any one cell has failed. Errors of solar cells and cameras (lens, height of the limb) may
+last for minutes. A measurement is therefore used only if it is more accurate than the estimate, so that
+repeated measurements do not make the filter overconfident. If several measurements in a row contradict an
+estimate that star fixes have not made fine, the filter is restarted.
 """
 
 from __future__ import annotations
@@ -45,31 +45,34 @@ from knightcube.vision.horizon_camera_job import HorizonCameraJob, HorizonCamera
 from knightcube.vision.solar_cells import FieldAndStrings, KnownDirections, SolarStringModel, StringFix
 
 PERIOD_NS = 5 * SECOND_NS
-"""Interval (ns) between readings that are checked.
+"""Interval (ns) between the solar cell readings that are checked.
 
-The errors of readings are correlated over shorter times.
+Readings at shorter intervals have correlated errors.
 """
 OVERHEAD_ALBEDO = 0.2
-"""Irradiance by a fully lit Earth, relative to sunlight, for an albedo of 0.3."""
+"""Irradiance of a cell by the fully lit Earth at an albedo of 0.3, as a fraction of sunlight."""
 CLOUDS = 0.5
 """Relative variation of the Earth's irradiance due to clouds."""
 LEAST_ALBEDO = 0.02
 STUCK = 3
-"""Number of identical readings in a row that indicate a fault. Intact readings differ by noise."""
+"""Number of identical solar cell readings in a row that indicate a fault.
+
+Readings of working cells differ by noise.
+"""
 SUNLIT = 0.99
 """Visible fraction of the solar disc above which the solar cells are expected to measure the Sun."""
 CONTRADICTED = 3
-"""Number of contradicting measurements in a row after which an estimate that is not fine is discarded."""
+"""Number of contradicting measurements in a row after which a coarse estimate is discarded."""
 GATE = 30.7
-"""Chi-square threshold of three axes (1e-6) for an attitude that contradicts the estimate."""
+"""Chi-square threshold (3 degrees of freedom, probability 1e-6) above which an attitude contradicts."""
 START_SIGMA = np.radians(5.0)
-"""Largest standard deviation (rad) of the rotation about the field with which the filter starts."""
+"""Largest standard deviation (rad) of the rotation about the field direction at which the filter starts."""
 STRENGTH_SIGMA = 5.0
-"""Largest accepted deviation of the field strength from its model, in standard deviations."""
+"""Largest accepted deviation of the measured field strength from the model, in standard deviations."""
 
 
 class CoarseSunFeed:
-    """Gives the filter an attitude from the magnetic field and the solar cells."""
+    """Determines the attitude from the magnetic field and the solar cells, and passes it to the filter."""
 
     def __init__(
         self,
@@ -78,7 +81,7 @@ class CoarseSunFeed:
         filter_: OrbitFilter,
         environment: EstimatedEnvironment,
     ) -> None:
-        """`period_ns` is the time (ns) in which all cells are read, one after the other."""
+        """`period_ns` is the time (ns) in which all cells are read, one after another."""
         self.strings = strings
         self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
@@ -91,7 +94,7 @@ class CoarseSunFeed:
         self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
-        """Accept a reading; return its fault or an empty text; None if the reading was not checked."""
+        """Accept a reading, and return its fault, an empty text if it is good, or None if it is unchecked."""
         self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
@@ -120,7 +123,7 @@ class CoarseSunFeed:
         if abs(excess) > STRENGTH_SIGMA * sigma:
             self._turns.forget()
             return f"the field is {excess * 1e6:+.1f} uT off its model: no attitude by it"
-        # The body rotates while the cells are read one after the other.
+        # The body rotates while the cells are read one after another.
         blur = float(np.linalg.norm(gyro)) * self._period_ns / SECOND_NS / np.sqrt(12.0)
         fix = self._turns.accept(reading.currents, seen, sigma, sky, blur)
         if fix is not None and self._filter.knowledge is not Knowledge.FINE:
@@ -128,7 +131,7 @@ class CoarseSunFeed:
         return self._turns.wrong
 
     def _use(self, time_ns: int, fix: StringFix, sun: FloatArray) -> None:
-        """Start the filter from an attitude, or give it the direction of the Sun."""
+        """Start the filter from an attitude fix, or update it with the Sun direction of the fix."""
         if not self._filter.runs or self._against >= CONTRADICTED:
             doubted, self._against = self._against >= CONTRADICTED, 0
             if fix.about <= START_SIGMA:
@@ -136,7 +139,7 @@ class CoarseSunFeed:
                 self._filter.begin(attitude, doubted=doubted)
             return
         then = self._filter.past(time_ns)
-        if then is None:  # the filter started after this reading
+        if then is None:  # the filter started after this reading was taken
             return
         claim = then.covariance[ATTITUDE, ATTITUDE]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))
@@ -149,7 +152,7 @@ class CoarseSunFeed:
 
 
 def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
-    """Return field, Sun, nadir, and the irradiance by the Earth, whose clouds are unknown."""
+    """Return the directions of field, Sun and nadir, and the Earth's irradiance with its uncertainty."""
     up = around.position / np.linalg.norm(around.position)
     light = OVERHEAD_ALBEDO * max(float(sun @ up), 0.0) + LEAST_ALBEDO
     return KnownDirections(around.field, sun, -up, light, CLOUDS * light)
@@ -158,19 +161,19 @@ def _sky(around: FilterEnvironment, sun: FloatArray) -> KnownDirections:
 DIRECTIONS_START_SIGMA = math.radians(15.0)
 """Largest standard deviation (rad), about the worst axis, of an attitude that may start the filter."""
 NEEDED_SIGMA = math.radians(0.05)
-"""Standard deviation (rad), about the worst axis, above which directions accurate to 0.01 to 0.04 deg help.
+"""Attitude standard deviation (rad), about the worst axis, above which the horizon cameras are used.
 """
 ROUGH_SIGMA = 0.3
-"""Largest standard deviation (rad) of an estimate that helps to find the horizon."""
+"""Largest standard deviation (rad) of an attitude that is used as a prior in the search for the horizon."""
 IMPROBABLE = 1e-6
-"""Probability of rejecting directions that belong to one attitude."""
+"""Probability that the gate rejects directions that are consistent with one attitude."""
 STRINGS_AGE_NS = 2 * SECOND_NS
 FIELD_SIGMA = 0.03
-"""Lower bound (rad) of the standard deviation of the field's direction in the search for the horizon."""
+"""Lower bound (rad) of the standard deviation of the field direction in the search for the horizon."""
 
 
 class HorizonCameraFeed:
-    """Implements `flight.loop.body.HorizonCameraUse`."""
+    """Updates the filter from the horizon cameras; implements `flight.loop.body.HorizonCameraUse`."""
 
     def __init__(
         self,
@@ -181,11 +184,11 @@ class HorizonCameraFeed:
         sun: CoarseSunFeed | None,
         response: LogarithmicResponse | None,
     ) -> None:
-        """`lens_error` is the lens error (rad, per axis) after calibration.
+        """`lens_error` is the residual lens error (rad, per axis) after calibration.
 
-        `sun` has the newest cell reading.
+        `sun` holds the newest reading of the solar cells.
 
-        `response` is the response of all cameras to light; None for a linear response.
+        `response` is the response of all cameras to light, or None for a linear response.
         """
         self._cameras = tuple(cameras)
         self._lens = lens_error**2 * np.eye(3)
@@ -197,7 +200,7 @@ class HorizonCameraFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether frames are needed often; in the Earth's shadow only while the attitude is lost."""
+        """Whether the attitude needs horizon frames; in eclipse only while the attitude is lost."""
         if self._filter.worst_sigma <= NEEDED_SIGMA:
             return False
         around = self._environment.at(self._filter.measured_ns)
@@ -205,7 +208,7 @@ class HorizonCameraFeed:
         return not dark or self._filter.knowledge is Knowledge.LOST
 
     def job(self, frames: Mapping[int, Frame]) -> HorizonCameraJob:
-        """Return the worker's job for simultaneous frames, with the prior knowledge at their time."""
+        """Return the worker's job for simultaneous frames, with the prior knowledge at the exposures."""
         times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
         time_ns = sum(times) // len(times)
         pixels = {number: frame.pixels for number, frame in frames.items()}
@@ -214,7 +217,7 @@ class HorizonCameraFeed:
         )
 
     def accept(self, time_ns: int, found: HorizonCameraResult) -> tuple[bool, bool]:
-        """Start or update the filter from Sun, nadir and field; return whether Sun and nadir were used."""
+        """Start or update the filter; return whether the Sun was used, and whether the nadir was used."""
         around, sun = self._environment.at(time_ns), self._environment.sun(time_ns)
         if around is None or sun is None:
             return False, False
@@ -229,12 +232,12 @@ class HorizonCameraFeed:
         then = self._filter.past(time_ns)
         if then is None:
             return False, False
-        # A Sun direction from the solar cells alone is passed to the filter by `CoarseSunFeed`.
+        # A Sun direction that comes from the solar cells alone is used by `CoarseSunFeed` instead.
         of_cells = found.sun is not None and not found.sun.cameras
         mine = [None if of_cells else seen[0], seen[1]]
         claim, turn = then.covariance[ATTITUDE, ATTITUDE], attitude_matrix(then.quaternion)
         refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
-        # Count the rounds in a row that contradict an estimate that no stars made fine.
+        # Count consecutive rounds that contradict an estimate that is not fine.
         if self._filter.knowledge is Knowledge.FINE:
             self._against = 0
         elif any(one is not None for one in mine):
@@ -246,7 +249,7 @@ class HorizonCameraFeed:
         return sun_used, nadir_used
 
     def _begin(self, time_ns: int, seen: list[VectorObservation]) -> bool:
-        """Start the filter from all directions, if they determine an attitude and agree; return whether."""
+        """Start the filter if the directions agree and determine an attitude; return whether it started."""
         field = self._field_sight(time_ns)
         sights = seen if field is None else [*seen, field]
         if not seen or len(sights) < 2:
@@ -270,7 +273,7 @@ class HorizonCameraFeed:
         return any(taken)
 
     def _field_sight(self, time_ns: int) -> VectorObservation | None:
-        """Return the direction of the magnetic field at a time; None without a recent measurement."""
+        """Return the magnetic field direction at a time, or None without a recent measurement."""
         measured_field = self._filter.newest_field()
         turned = None if measured_field is None else self._filter.turned(measured_field[0].time_ns, time_ns)
         around = self._environment.at(time_ns)
@@ -311,7 +314,7 @@ def horizon_camera_feed(
     environment: EstimatedEnvironment,
     sun: CoarseSunFeed | None,
 ) -> HorizonCameraFeed:
-    """Return the feed of the configured horizon cameras."""
+    """Return the horizon camera feed of a configuration."""
     cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
     error = math.radians(max(one.lens_error_deg for one in sections))
     first, response = sections[0], None
@@ -323,23 +326,27 @@ def horizon_camera_feed(
 def _spread(
     sight: VectorObservation, turn: FloatArray, claim: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the deviation (2,) of a direction from an attitude (3, 3), and both covariances (2, 2)."""
+    """Compare a direction with an attitude matrix (3, 3).
+
+    Return the deviation (2,) of the direction, its covariance (2, 2), and the covariance (2, 2) due to the
+    attitude.
+    """
     expected = turn @ sight.reference
     across = tangent_basis(expected)
-    # A small rotation e changes the direction d by d x e.
+    # A small rotation e changes a direction d by the cross product d x e.
     rows = across @ np.cross(expected, np.eye(3)).T
     return across @ sight.observed, across @ sight.covariance @ across.T, rows @ claim @ rows.T
 
 
 def _contradicts(sight: VectorObservation, turn: FloatArray, claim: FloatArray) -> bool:
-    """Return whether a direction contradicts an attitude (3, 3) with its covariance (3, 3)."""
+    """Return whether a direction contradicts an attitude matrix (3, 3) with covariance `claim` (3, 3)."""
     off, own, known = _spread(sight, turn, claim)
     behind = float(sight.observed @ turn @ sight.reference) < 0.0
     return behind or float(off @ np.linalg.solve(own + known, off)) > chi_square.bound(IMPROBABLE, 2)
 
 
 def _says_more(sight: VectorObservation, claim: FloatArray) -> bool:
-    """Return whether a direction is more accurate than an attitude's covariance (3, 3) about some axis."""
+    """Return whether a direction is more accurate than an attitude of covariance `claim` about some axis."""
     across = tangent_basis(sight.observed)
     rows = across @ np.cross(sight.observed, np.eye(3)).T
     known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T

@@ -1,13 +1,14 @@
 """The control laws of a satellite in orbit: detumbling, turning to the Sun in SAFE, and pointing.
 
-Detumbling follows the momentum plan in the measured field, or in the field expected ahead. SAFE turns to the
-Sun by solar cells, gyro and measured field, without orbit, attitude or clock. Pointing follows the pointing
-law along its path; far off its path the body's rotation is damped first (`PathRecovery` and `damping_dipole`
-of `knightcube.gnc.control.pointing_law`).
+Detumbling follows the momentum plan in the measured magnetic field, or in the predicted field if attitude and
+orbit are known. In SAFE the satellite turns to the Sun with solar cells, gyro and magnetometer only; orbit,
+attitude and clock may be unknown. Pointing follows a path with the pointing law. Far off the path, the
+rotation is damped before a new path is planned (`PathRecovery` and `damping_dipole` of
+`knightcube.gnc.control.pointing_law`).
 
-While pointing, the coils pause at the beginning of each window, so that the magnetometer is read without
-their field; then one dipole, computed at the pause's end, is held. The dipole is increased to make up for the
-pause.
+While pointing, the coils are off at the beginning of each control window, so that the magnetometer can be
+read. At the end of this pause one dipole is computed, which is held until the window ends. This dipole is
+increased, so that its mean over the window is the dipole that the law requires.
 """
 
 from __future__ import annotations
@@ -35,25 +36,25 @@ from knightcube.vision.solar_cells import SolarStringModel, coarse_sun
 
 
 class _MagneticLaw:
-    """A law that drives the coils by magnetometer and gyro; implements `flight.loop.body.WindowedLaw`."""
+    """A control law that needs only magnetometer and gyro; implements `flight.loop.body.WindowedLaw`."""
 
     def __init__(self, law: FieldDetumbler | SunAcquisition, dipole_per_ampere: float) -> None:
-        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
         self._law = law
         self._dipole_per_ampere = dipole_per_ampere
         self._field_check = StuckFieldCheck()
 
     def begin(self, now_ns: int) -> None:
-        """Begin with no knowledge of the field."""
+        """Begin without knowledge of the magnetic field."""
         self._law.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s at `time_ns`; a stuck field is ignored."""
+        """Accept a field (3,), T, and the gyro's rate (3,), rad/s; a stuck field is ignored."""
         if self._field_check.accept(field):
             self._law.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now, which is zero if the magnetometer is stuck."""
+        """Return the present command, which is zero if the magnetometer is stuck."""
         dipole = self._law.dipole(now_ns)
         if self._field_check.stuck:
             dipole = np.zeros(3)
@@ -61,19 +62,19 @@ class _MagneticLaw:
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:
-        """Propagate the rate with the currents (3,) A that flow; an excluded coil makes no torque."""
+        """Propagate the rate with the currents (3,), A, that flow, which are zero in excluded coils."""
         self._law.acts(currents * self._dipole_per_ampere)
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes at the last command; None before it is known."""
+        """Return the field (3,), T, in body axes at the last command, or None before the field is known."""
         return self._law.field
 
 
 class FieldDetumblingLaw(_MagneticLaw):
-    """Detumbles the body; `detumbler` holds the estimated rate and field."""
+    """Detumbles the body; the `detumbler` attribute holds the estimated rate and field."""
 
     def __init__(self, detumbler: FieldDetumbler, dipole_per_ampere: float) -> None:
-        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
         super().__init__(detumbler, dipole_per_ampere)
         self.detumbler = detumbler
 
@@ -81,9 +82,10 @@ class FieldDetumblingLaw(_MagneticLaw):
 def expected_field(
     filter_: OrbitFilter, environment: EstimatedEnvironment, instants: FloatArray
 ) -> Callable[[int], FloatArray | None]:
-    """Return a function that predicts the field (n, 3) T at `instants` (n,) s after a time.
+    """Return a function that predicts the magnetic field (n, 3), T, at `instants` (n,), s, after a time.
 
-    The field is in body axes at that time. The function returns None while attitude or orbit are unknown.
+    The predicted field is given in the body axes at that time. The function returns None while attitude or
+    orbit are unknown.
     """
     field = FieldAhead()
 
@@ -98,12 +100,12 @@ def expected_field(
 
 
 class SunAcquisitionLaw(_MagneticLaw):
-    """Turns the body to the Sun, and reports whether the solar cells measure the Sun."""
+    """Turns the body to the Sun, and reports whether the solar cells measure a Sun direction."""
 
     def __init__(
         self, law: SunAcquisition, strings: SolarStringModel, dipole_per_ampere: float, log: EventLog
     ) -> None:
-        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
         super().__init__(law, dipole_per_ampere)
         self._acquisition, self._strings = law, strings
         self._events = log
@@ -118,7 +120,7 @@ class SunAcquisitionLaw(_MagneticLaw):
             self._acquisition.update_sun(reading.time_ns, found.direction)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now. Without a Sun it only damps the rotation."""
+        """Return the command now. Without a Sun direction, the command only damps the rotation."""
         found = self._acquisition.sun is not None
         if found is not self._found:
             self._found = found
@@ -133,7 +135,7 @@ _NOTHING: FloatArray = np.zeros(3)
 
 
 class PointingTracker:
-    """Tracks a path by the pointing law; implements `flight.loop.body.Tracker`."""
+    """Tracks a path with the pointing law; implements `flight.loop.body.Tracker`."""
 
     def __init__(
         self,
@@ -144,7 +146,11 @@ class PointingTracker:
         dipole_per_ampere: float,
         inertia: FloatArray,
     ) -> None:
-        """`limit` is in A m^2, `dipole_per_ampere` in m^2, of each coil; `inertia` (3,) in kg m^2."""
+        """Create the tracker for coils with the largest dipole `limit` (A m^2).
+
+        `dipole_per_ampere` is the number of turns times the area of each coil (m^2). `inertia` (3,) holds
+        the principal moments of inertia (kg m^2).
+        """
         self._inertia = inertia
         self._filter, self._environment = filter_, environment
         self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
@@ -152,7 +158,7 @@ class PointingTracker:
         self._window: tuple[int, object] | None = None
 
     def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
-        """Return the command of the present window, which is zero in its pause."""
+        """Return the command of the present control window, which is zero in its pause."""
         pauses, now_ns = self._pauses, reference.time_ns
         if now_ns % pauses.period_ns < pauses.settle_ns + pauses.measure_ns:
             return CoilCommand(_NOTHING, _NOTHING)
@@ -162,7 +168,7 @@ class PointingTracker:
         return self._held
 
     def reset(self) -> None:
-        """Discard the command of the present window."""
+        """Discard the command of the present control window."""
         self._window = None
 
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
@@ -178,7 +184,7 @@ class PointingTracker:
         dipole = found.dipole
         if not reference.paths.led(found.rotation, rate, reference.time_ns):
             dipole = damping_dipole(self._inertia, rate, field) - residual
-        # The mean over the window equals the requested dipole.
+        # With this factor the mean dipole over the window equals the required dipole.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         largest = float(np.abs(dipole).max())
         saturated = largest > self._limit

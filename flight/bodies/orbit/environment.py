@@ -1,8 +1,8 @@
-"""The estimated orbit environment: position, magnetic field, Sun and shadow at any time.
+"""The estimated orbit environment: position, magnetic field, Sun direction and sunlight at any time.
 
-The position is propagated from the newest GPS fix or, without a fix, from two-line elements. The environment
-is predicted for some 20 s at once (2 ms) and interpolated. Predictions of a revolution belong into a worker,
-because they take 0.3 ms for each 10 s.
+The position is propagated from the newest GPS fix, or from two-line elements before the first fix. The
+environment is predicted for about 20 s at once, which takes 2 ms, and then interpolated. Predictions for a
+whole revolution belong in a worker, because they take 0.3 ms for each 10 s.
 """
 
 from __future__ import annotations
@@ -24,46 +24,47 @@ from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_velocity
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
-"""Span (s) of the short prediction, after and before the time for which it is made."""
+"""Spans (s) of the short prediction, after and before the requested time."""
 GPS_DELAY_NS = 100_000_000
-"""Delay (ns) from an epoch of the receiver to the first byte of its report; at most 0.2 s."""
+"""Delay (ns) from the time of a GPS fix to the first byte of the receiver's report; at most 0.2 s."""
 GATE, LEAST_GATE = 5.0, 5e3
-"""Sigmas by which a fix may differ from the known orbit, and difference (m) that is always allowed."""
+"""Gates for a GPS fix: deviation from the known orbit in sigmas, and deviation (m) that is always accepted.
+"""
 CONTRADICTED = 30
-"""Number of contradicting fixes in a row after which the last accepted fix counts as wrong."""
+"""Number of rejected GPS fixes in a row after which the last accepted fix is considered wrong."""
 TIME_GATE_NS = SECOND_NS // 2
-"""Largest step (ns) of the receiver's time relative to the clock; the craft flies 4 km in this time."""
+"""Largest accepted step (ns) of the receiver's time relative to the host's clock."""
 _SHORTEST = 1.0
 
 
 class EstimatedEnvironment:
-    """Knowledge of the orbit. `refused` counts the GPS fixes that contradict it."""
+    """Knowledge of the orbit. The attribute `refused` counts the GPS fixes that contradict the orbit."""
 
     def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
-        """`elements` are the two-line elements; with None the orbit is unknown until the first fix."""
+        """`elements` are the two-line elements; without them the orbit is unknown until the first fix."""
         self._elements = elements
         self._clock = clock
         self._fix: GpsFix | None = None
         self._utc_offset_ns: int | None = None
-        self._newest_offset_ns: int | None = None  # of the newest fix, used or not
+        self._newest_offset_ns: int | None = None  # from the newest GPS fix, used or not
         self._near: Ephemeris | None = None
         self._refused_in_a_row = 0
         self.refused = 0
 
     @property
     def known(self) -> bool:
-        """Whether the last request found a known orbit."""
+        """Whether the orbit was known at the last request."""
         return self._near is not None
 
     def julian_date(self, now_ns: int) -> float:
-        """Return the Julian date UTC by the receiver's time; before the first fix by the host's clock."""
+        """Return the Julian date (UTC) by the receiver's time; before the first fix, by the host's clock."""
         offset_ns = self._utc_offset_ns
         if offset_ns is None:
             offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         return UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
 
     def fix(self, reading: GpsReading) -> bool:
-        """Accept an epoch of the receiver; return whether it is used."""
+        """Accept a report of the GPS receiver, and return whether it is used."""
         if not reading.valid:
             return False
         date = UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
@@ -83,11 +84,11 @@ class EstimatedEnvironment:
         return True
 
     def state(self, now_ns: int) -> OrbitState | None:
-        """Return position and velocity, ICRS; None while the orbit is unknown."""
+        """Return position and velocity (ICRS), or None while the orbit is unknown."""
         return self._state(self.julian_date(now_ns))
 
     def at(self, now_ns: int) -> FilterEnvironment | None:
-        """Return field, position, pressures and sunlight; None while the orbit is unknown."""
+        """Return field, position, pressures and sunlight, or None while the orbit is unknown."""
         near, times = self._prediction(now_ns)
         if near is None:
             return None
@@ -100,12 +101,12 @@ class EstimatedEnvironment:
         )
 
     def sun(self, now_ns: int) -> FloatArray | None:
-        """Return the Sun's direction (3,), ICRS (no aberration, 21"); None while the orbit is unknown."""
+        """Return the Sun direction (3,), ICRS, neglecting aberration (21"), or None for an unknown orbit."""
         near, times = self._prediction(now_ns)
         return None if near is None else np.asarray(near.sun_at(times)[0])
 
     def velocity(self, now_ns: int) -> FloatArray | None:
-        """Return the velocity (3,) m/s about the Sun, ICRS; None while the orbit is unknown."""
+        """Return the velocity (3,), m/s, relative to the Sun (ICRS), or None while the orbit is unknown."""
         near, times = self._prediction(now_ns)
         if near is None:
             return None
@@ -113,7 +114,7 @@ class EstimatedEnvironment:
         return np.asarray(earth_velocity(date) + near.velocity_at(times)[0])
 
     def _seconds_into(self, ephemeris: Ephemeris, now_ns: int) -> float:
-        """Return the time, s, of `ephemeris` at a time of the clock."""
+        """Return the time (s) since the start of `ephemeris` at a time of the clock."""
         return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
 
     def _state(self, date: float) -> OrbitState | None:
@@ -126,7 +127,7 @@ class EstimatedEnvironment:
         return None
 
     def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
-        """Return the short prediction, renewed near its end, and the time (1,) s in it."""
+        """Return the short prediction, renewed if needed, and the time (1,), s, since its start."""
         near = self._near
         seconds = math.inf if near is None else self._seconds_into(near, now_ns)
         if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
@@ -140,7 +141,7 @@ class EstimatedEnvironment:
         return near, np.array([seconds])
 
     def _is_out_of_time(self, offset_ns: int) -> bool:
-        """Return whether the receiver's time stops or jumps; a lasting jump is accepted after a while."""
+        """Return whether the receiver's time has stopped or jumped; a lasting jump is accepted later."""
         last_offset_ns, self._newest_offset_ns = self._newest_offset_ns, offset_ns
         if last_offset_ns is not None and abs(offset_ns - last_offset_ns) > TIME_GATE_NS:
             return True
@@ -149,7 +150,7 @@ class EstimatedEnvironment:
         return jumped and self._refused_in_a_row < CONTRADICTED
 
     def _contradicts(self, fix: GpsFix) -> bool:
-        """Return whether a fix is too far from the elements, or from the last fix."""
+        """Return whether a GPS fix contradicts the two-line elements or, without elements, the last fix."""
         known: GpsFix | TwoLineElements | None = self._elements or self._fix
         if known is None or (known is self._fix and self._refused_in_a_row >= CONTRADICTED):
             return False

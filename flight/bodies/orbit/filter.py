@@ -1,18 +1,19 @@
-"""The satellite's filter behind the loop's Protocol: `FreeFilter` in steps of a second at most.
+"""The satellite's attitude filter, which runs `FreeFilter` in steps of at most one second.
 
-A step holds the commands and measurements between two times. It ends early when the coils are switched on or
-off, so that its dipole is nearly constant. The filter processes a step after its end, with the mean commanded
-dipole and the mean of the gyro samples. Magnetometer samples are used only while the coils are off and their
-field has decayed. Between steps the estimate is propagated by the model. A measurement of a past time, such
-as a star fix, is applied at that time: the filter returns to the beginning of the step that contains it, and
-processes this step and the later ones again.
+A step holds the coil commands and the measurements between two times. A step ends early when the coils are
+switched on or off, so that the dipole is nearly constant during a step. When a step has ended, the filter
+processes it with the mean commanded dipole and the mean of the gyro samples. Magnetometer samples are used
+only while the coils are off and their field has decayed. Within the step under way, the estimate is
+propagated by the model. A measurement of a past time, such as a star fix, is applied at its time: the filter
+returns to the beginning of the step that contains this time, and processes this step and all later steps
+again.
 
 The learned states are stored for the next boot in two parts, without their cross-covariance:
-`attitude-errors` has the biases of gyro and magnetometer and the rotation of the principal axes,
-`attitude-torques` the residual dipole in shadow and sunlight and the torques. A third entry, `learned-at`, is
-the time (UTC, s) to which their covariance refers. At the next boot the random walk of each state is
-continued over the elapsed time, and a fraction of its initial standard deviation is added, because the bias
-of a unit changes when the unit is switched off and on.
+`attitude-errors` holds the biases of gyro and magnetometer and the rotation of the principal axes,
+`attitude-torques` the residual dipole in shadow and in sunlight and the torques. A third entry, `learned-at`,
+is the time (UTC, s) for which these states were estimated. At the next boot, the covariance of each state
+grows by its random walk over the elapsed time, and by a fraction of its initial standard deviation, because
+switching a sensor off and on changes its bias.
 """
 
 from __future__ import annotations
@@ -62,18 +63,18 @@ _NOTHING: Floats = (0.0, 0.0, 0.0)
 
 
 class DipoleHistory:
-    """The commanded dipoles, in order of time."""
+    """Record of the commanded dipoles, in order of time."""
 
     def __init__(self, history_ns: int) -> None:
         self._history_ns = history_ns
         self._times: list[int] = []
         self._dipoles: list[Floats] = []
-        self._sums: list[Floats] = []  # integral of the dipole until each time, A m^2 ns
+        self._sums: list[Floats] = []  # integral of the dipole up to each time, A m^2 ns
         self.unknown_ns = -1
-        """Time (ns) until which the dipoles were unknown; -1 if they were always known."""
+        """Last time (ns) at which the dipole was unknown; -1 if it was always known."""
 
     def record(self, time_ns: int, dipole: Floats, known: bool) -> None:
-        """Record the dipole (A m^2) in force from `time_ns` on; calls are in order of time."""
+        """Record the dipole (A m^2) that is in force from `time_ns` on; calls must be in order of time."""
         if not known:
             self.unknown_ns = max(self.unknown_ns, time_ns)
         if self._dipoles and dipole == self._dipoles[-1]:
@@ -87,17 +88,17 @@ class DipoleHistory:
             del self._times[:oldest], self._dipoles[:oldest], self._sums[:oldest]
 
     def total(self, time_ns: int) -> FloatArray:
-        """Return the integral (3,) A m^2 s of the dipole until a time, from an arbitrary origin."""
+        """Return the integral (3,), A m^2 s, of the dipole up to a time, from an arbitrary origin."""
         return np.array(self._sum(time_ns)) / SECOND_NS
 
     def mean(self, from_ns: int, to_ns: int) -> FloatArray:
-        """Return the mean dipole (3,) A m^2 between two times; before the first record it is zero."""
+        """Return the mean dipole (3,), A m^2, between two times; it is zero before the first record."""
         if to_ns <= from_ns:
             return np.array(self._dipoles[-1] if self._dipoles else _NOTHING)
         return np.subtract(self._sum(to_ns), self._sum(from_ns)) / (to_ns - from_ns)
 
     def at_rest_since(self) -> int | None:
-        """Return the time since which the dipole is zero (ns); None if it is not zero."""
+        """Return the time (ns) since which the dipole is zero, or None if it is not zero."""
         if not self._dipoles:
             return 0
         return self._times[-1] if self._dipoles[-1] == _NOTHING else None
@@ -113,16 +114,17 @@ class DipoleHistory:
 
 @dataclass(slots=True, eq=False)
 class FilterStep:
-    """The commands and measurements between two times.
+    """Coil commands and measurements between two times.
 
     Attributes:
         dipole: mean commanded dipole (3,), A m^2.
-        doubt: largest possible deviation of an axis from `dipole`, A m^2; zero for known dipoles.
-        gyro: (3,) rad/s, mean of `samples` readings, whose mean time is `gyro_ns`.
-        impulse: (3,) A m^2 s, impulse of the dipole after a sample, as the mean over the samples.
-        field: (3,) T, mean of `fields` readings around `field_ns`; None without a reading.
-        late: measurements with a time in the step, oldest first.
-        before: the estimate at the beginning; None without an estimate.
+        doubt: largest possible deviation of the dipole from `dipole`, A m^2 per axis; zero for known dipoles.
+        gyro: mean angular rate (3,), rad/s, of `samples` gyro readings, whose mean time is `gyro_ns`.
+        impulse: time integral (3,), A m^2 s, of the dipole from a gyro reading to the end, averaged over
+            readings.
+        field: mean magnetic field (3,), T, of `fields` readings around `field_ns`, or None without a reading.
+        late: measurements whose time lies in the step, oldest first.
+        before: the estimate at the beginning of the step, or None without an estimate.
     """
 
     begin_ns: int
@@ -147,10 +149,10 @@ class FilterStep:
 
 
 class OpenStep:
-    """Collects the readings of the present step."""
+    """Collects the readings of the step under way."""
 
     def __init__(self, begin_ns: int, acts: bool) -> None:
-        """Start a step at a time; `acts` is whether the coils carry current during the step."""
+        """Start a step at a time; `acts` states whether the coils carry current during the step."""
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
@@ -159,7 +161,10 @@ class OpenStep:
         self._rates_ns = self._fields_ns = 0
 
     def add(self, reading: ImuReading, total: FloatArray, listens: bool) -> None:
-        """Add a reading and the dipole's integral `total` (3,); `listens` is whether its field is valid."""
+        """Add a reading and the dipole's integral `total` (3,).
+
+        `listens` states whether the field of the reading is valid.
+        """
         since = reading.time_ns - self.begin_ns
         self.end_ns = reading.time_ns
         self._rates.append(reading.rate)
@@ -170,7 +175,7 @@ class OpenStep:
             self._fields_ns += since
 
     def is_over(self, acts: bool, longest_ns: int) -> bool:
-        """Return whether the step has its full length, or the coils were switched on or off."""
+        """Return whether the step has reached its full length, or the coils were switched on or off."""
         return acts != self._acts or self.end_ns - self.begin_ns >= longest_ns
 
     def close(self, dipole: FloatArray, doubt: float, around: FilterEnvironment) -> FilterStep:
@@ -200,17 +205,17 @@ _EYE: FloatArray = np.eye(3)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrbitFilterSettings:
-    """The body, its sensors, and the steps.
+    """Settings of the satellite's attitude filter: body, sensors and steps.
 
     Attributes:
-        inertia: inertia (3, 3), kg m^2. dipole_per_ampere: turns times area, m^2. dipole_limit: largest
-            dipole of each coil, A m^2.
-        gyro_noise, field_noise: standard deviations per axis of a gyro sample (rad/s) and a magnetometer
+        inertia: inertia matrix (3, 3), kg m^2. dipole_per_ampere: number of turns times area of a coil, m^2.
+            dipole_limit: largest dipole of each coil, A m^2.
+        gyro_noise, field_noise: standard deviations per axis of a gyro sample (rad/s) and of a magnetometer
             sample (T).
-        unknown_psd: power spectral density of the body's angular acceleration without an estimate, rad^2/s^3.
-        settle_ns: time (ns) from switching the coils off until their field at the magnetometer has decayed.
-        history_ns: largest age of a measurement that is applied, ns.
-        step_ns: longest duration of a step, ns.
+        unknown_psd: power spectral density of the angular acceleration while there is no estimate, rad^2/s^3.
+        settle_ns: time (ns) after switching the coils off until their field at the magnetometer has decayed.
+        history_ns: age (ns) of the oldest measurement that can be applied.
+        step_ns: longest duration of a filter step, ns.
         slow: the slow states that an earlier boot learned.
     """
 
@@ -228,14 +233,14 @@ class OrbitFilterSettings:
 
 
 class StepReplay:
-    """Owns the filter and its recent steps, oldest first.
+    """The filter and its recent steps, which can be processed again.
 
     Attributes:
-        free: the estimate at the end of the newest step.
-        refused_gyros: number of steps in a row whose gyro contradicts the motion.
-        contradicted: number of steps with a dipole in a row whose gyro contradicts it; reset after
-            `FORGOTTEN_NS`, because coils at rest give no evidence.
-        refused_fields: number of fields in a row that contradict the estimate.
+        free: the filter, with the estimate at the end of the newest step.
+        refused_gyros: number of steps in a row whose mean gyro rate contradicts the estimated motion.
+        contradicted: number of steps in a row, with current in the coils, whose gyro contradicts the motion;
+            reset after `FORGOTTEN_NS`, because coils that are off give no evidence.
+        refused_fields: number of magnetic fields in a row that contradict the estimate.
     """
 
     def __init__(self, settings: OrbitFilterSettings) -> None:
@@ -248,7 +253,7 @@ class StepReplay:
         self._refused_ns = 0
 
     def add(self, step: FilterStep) -> None:
-        """Add the newest step and forget those beyond the history; take it if there is an estimate."""
+        """Append the newest step, discard steps beyond the history, and process the step if possible."""
         self.steps.append(step)
         while self.steps[0].end_ns < step.end_ns - self._settings.history_ns:
             self.steps.popleft()
@@ -258,14 +263,15 @@ class StepReplay:
     def follow_gyro(self) -> None:
         """Process the last steps again with unknown dipoles if the gyro contradicts the commanded dipoles.
 
-        The deviation may have begun in the step before, whose mean rate shows only half of it.
+        The step before is included, because the deviation may have begun within it, where the mean rate shows
+        only half of the deviation.
         """
         steps, refused = self.steps, self.refused_gyros > 0
         now_ns = steps[-1].end_ns
         if refused:
             self.contradicted, self._refused_ns = self.contradicted + 1, now_ns
         elif steps[-1].dipole.any() or now_ns - self._refused_ns >= FORGOTTEN_NS:
-            self.contradicted = 0  # a pause between two commands gives no evidence
+            self.contradicted = 0  # coils that are off between two commands give no evidence
         if refused and not steps[-1].doubt:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):
@@ -273,7 +279,7 @@ class StepReplay:
             self.take_again(first)
 
     def doubt_since(self, since_ns: int) -> set[int]:
-        """Process the steps since a time again with unknown dipoles; return the measurements used."""
+        """Process the steps since a time again with unknown dipoles, and return the measurements used."""
         steps = self.steps
         first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
         for k in range(first, len(steps)):
@@ -281,9 +287,9 @@ class StepReplay:
         return self.take_again(first)
 
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
-        """Treat the dipoles since a time as unknown if a refused attitude then passes; return those used.
+        """Treat the dipoles since a time as unknown if a rejected attitude then passes; return what was used.
 
-        Deviations of the dipoles that the gyro cannot detect accumulate in the attitude.
+        Dipole errors that are too small for the gyro accumulate in the attitude.
         """
         doubts = [step.doubt for step in self.steps]
         used = self.doubt_since(min(since_ns, refused.time_ns))
@@ -294,9 +300,9 @@ class StepReplay:
         return self.take_again(0)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
-        """Start from an attitude in step number `place`, and discard the estimates before it.
+        """Start from an attitude in the step with index `place`, and discard all earlier estimates.
 
-        `doubted` is whether these estimates were contradicted.
+        `doubted` states whether the earlier estimates were contradicted.
         """
         first = self.steps[place]
         self.free.start(attitude.quaternion, attitude.covariance, first.gyro, doubted=doubted)
@@ -308,16 +314,17 @@ class StepReplay:
         self.take_on(place + 1)
 
     def place(self, time_ns: int) -> int | None:
-        """Return the number of the step that holds a time; None beyond the history."""
+        """Return the index of the step that contains a time, or None beyond the history."""
         for k, step in enumerate(self.steps):
             if step.begin_ns <= time_ns < step.end_ns:
                 return k
         return None
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate (3,) rad/s of its step; None without a field.
+        """Return the newest field with the mean gyro rate (3,), rad/s, of its step, or None without a field.
 
-        The covariance is for the start of an estimate, because it includes the magnetometer's bias.
+        The covariance of the field includes the unknown magnetometer bias, because it is used to start an
+        estimate.
         """
         step = next((step for step in reversed(self.steps) if step.field is not None), None)
         if step is None or step.field is None:
@@ -327,7 +334,7 @@ class StepReplay:
         return field, step.gyro
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
+        """Return the rotation (4,) of the body between two times by the gyro, or None beyond the history."""
         if to_ns < from_ns:
             back = self.turned(to_ns, from_ns)
             return None if back is None else conjugate(back)
@@ -340,9 +347,9 @@ class StepReplay:
         return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
-        """Return to the start of step `first`, and process it and the later steps.
+        """Return to the start of step `first`, and process this step and all later steps again.
 
-        Return the measurements used.
+        Return the identities of the late measurements used.
         """
         while first < len(self.steps) and self.steps[first].before is None:
             first += 1
@@ -354,7 +361,7 @@ class StepReplay:
         return self.take_on(first)
 
     def take_on(self, first: int) -> set[int]:
-        """Process the steps from number `first` on; return the identities of the late measurements used."""
+        """Process the steps from index `first` on; return the identities of the late measurements used."""
         used: set[int] = set()
         for k in range(first, len(self.steps)):
             step = self.steps[k]
@@ -376,12 +383,12 @@ class StepReplay:
             self.free.advance(seconds / parts, step.dipole, step.around, step.doubt)
 
     def _end(self, step: FilterStep) -> None:
-        """Apply the gyro's and the magnetometer's means of a step, at its end."""
+        """Apply the mean gyro and magnetometer readings of a step at its end."""
         free, settings = self.free, self._settings
         since = (step.end_ns - step.gyro_ns) / SECOND_NS
         shown = attitude_matrix(free.quaternion) @ step.around.field
-        # The coils act during a part of the step only: the rate change after its samples follows from
-        # `impulse`, not from the mean dipole.
+        # The coils may act only during a part of the step.
+        # Therefore `impulse`, not the mean dipole, gives the rate change after the mean time of the samples.
         uneven = np.cross(step.impulse - since * step.dipole, shown)
         change = since * free.acceleration + free.motion.inverse @ uneven
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
@@ -395,7 +402,7 @@ class StepReplay:
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _apply(self, measurement: Measurement) -> bool:
-        """Apply a measurement to the estimate of its time; return whether it passed the gate."""
+        """Apply a measurement to the estimate at its time, and return whether it passed the gate."""
         free = self.free
         if isinstance(measurement, AttitudeMeasurement):
             return free.attitude(measurement.quaternion, measurement.covariance)
@@ -422,17 +429,20 @@ class StuckFieldCheck:
 
     @property
     def stuck(self) -> bool:
-        """Whether the field has been the same for `STUCK` readings."""
+        """Whether the magnetometer has repeated the same field in `STUCK` readings."""
         return self._same >= STUCK
 
     def accept(self, field: FloatArray) -> bool:
-        """Accept the field (3,) of a reading; return whether it may be used because it is not stuck."""
+        """Accept the field (3,) of a reading, and return whether the magnetometer is working, not stuck."""
         values = field.tolist()
         self._same, self._last = (self._same + 1 if values == self._last else 0), values
         return not self.stuck
 
     def text(self, refused: int) -> str:
-        """Return why the magnetometer is rejected, else ""; `refused` counts rejections in a row."""
+        """Return why the magnetometer is rejected, or "".
+
+        `refused` counts the magnetic fields in a row that contradict the estimate.
+        """
         if self.stuck:
             return "the magnetometer gives the same field in every reading"
         return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""
@@ -451,9 +461,9 @@ class _Beginning:
     """An estimate at the end of a step, with terms that are computed once for all its propagations.
 
     Attributes:
-        spread: (19, 19) the covariance in the loop's order.
-        mixed: (3, 3) rad^2/s, of turn and rate, with its transpose.
-        field, residual: (3,) T and A m^2, body axes.
+        spread: covariance (19, 19) of the estimate, with the states in the order that the loop uses.
+        mixed: cross-covariance (3, 3) of attitude and rate plus its transpose, rad^2/s.
+        field, residual: magnetic field (3,), T, and residual dipole (3,), A m^2, in body axes.
     """
 
     around: FilterEnvironment
@@ -468,7 +478,7 @@ class _Beginning:
 
 
 class EstimatePropagation:
-    """Propagates the estimates of a filter, in 0.03 ms each."""
+    """Propagates a filter's estimates, in 0.03 ms for each estimate."""
 
     def __init__(self, free: FreeFilter) -> None:
         self._free = free
@@ -478,7 +488,7 @@ class EstimatePropagation:
     def now(
         self, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment, measured_ns: int
     ) -> Estimate:
-        """Return the newest estimate `seconds` s later under a dipole (3,) A m^2."""
+        """Return the newest estimate, propagated by `seconds` under a dipole (3,), A m^2."""
         free, newest = self._free, self._newest
         if newest is None or self._changes != free.changes or newest.around is not around:
             bias, magnet = free.gyro_bias, free.magnet_bias
@@ -489,7 +499,7 @@ class EstimatePropagation:
     def then(
         self, memory: FreeMemory, time_ns: int, seconds: float, dipole: FloatArray, around: FilterEnvironment
     ) -> Estimate:
-        """Return an earlier estimate `seconds` s later under a dipole (3,) A m^2."""
+        """Return an earlier estimate, propagated by `seconds` under a dipole (3,), A m^2."""
         bias, magnet = memory.constants[states.GYRO], memory.constants[states.MAGNET]
         begun = self._beginning(memory.quaternion, memory.rate, bias, magnet, memory.covariance, around)
         return self._carry(begun, time_ns, seconds, dipole, time_ns)
@@ -536,13 +546,13 @@ class EstimatePropagation:
 
 
 REFUSALS_TO_RESTART = 3
-"""Number of attitudes in a row that contradict the estimate, after which the filter restarts."""
+"""Number of contradicting attitudes in a row after which a fine estimate is restarted."""
 
 
 class OrbitFilter:
     """The satellite's filter; implements `flight.loop.body.Filter`.
 
-    The class is longer than 200 lines because loop, feeds and telemetry each use several short methods.
+    The class exceeds 200 lines because the loop, the feeds and the telemetry use many of its short methods.
 
     Attributes:
         restarts: number of estimates that were discarded.
@@ -551,7 +561,7 @@ class OrbitFilter:
     def __init__(
         self, settings: OrbitFilterSettings, around: Callable[[int], FilterEnvironment | None]
     ) -> None:
-        """`around` returns the orbit environment at a time of the clock; None while it is not known."""
+        """`around` returns the orbit environment at a time of the clock, or None while it is unknown."""
         self._settings = settings
         self._around = around
         self._replay = StepReplay(settings)
@@ -571,26 +581,26 @@ class OrbitFilter:
 
     @property
     def worst_sigma(self) -> float:
-        """The attitude's standard deviation about its worst axis, rad; infinite before a start."""
+        """The attitude's standard deviation (rad) about its worst axis; infinite without an estimate."""
         return self._free.worst_sigma if self._free.started else math.inf
 
     @property
     def started(self) -> bool:
-        """Whether there is an estimate; false while the attitude is lost."""
+        """Whether the attitude is known at least coarsely."""
         return self.knowledge is not Knowledge.LOST
 
     @property
     def runs(self) -> bool:
-        """Whether the filter accepts measurements, also while the attitude is lost."""
+        """Whether the filter accepts measurements; it does so also while the attitude is lost."""
         return self._free.started
 
     def newest_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate (`StepReplay.newest_field`)."""
+        """Return the newest field and the gyro's rate in its step (`StepReplay.newest_field`)."""
         self._close()
         return self._replay.newest_field()
 
     def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
-        """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
+        """Return the rotation (4,) of the body between two times by the gyro, or None beyond the history."""
         self._close()
         return self._replay.turned(from_ns, to_ns)
 
@@ -601,51 +611,51 @@ class OrbitFilter:
 
     @property
     def doubts_commands(self) -> bool:
-        """Whether the gyro contradicts the motion that the commanded dipoles make."""
+        """Whether the gyro contradicts the motion that the commanded dipoles would cause."""
         return self._replay.contradicted >= 2
 
     @property
     def refused(self) -> int:
-        """The number of measurements that did not pass their gate, replays included."""
+        """The number of measurements rejected by their gates, including those of repeated steps."""
         return self._free.refused
 
     @property
     def field_doubt(self) -> str:
-        """Why the magnetometer is rejected; empty while it is used."""
+        """The reason why the magnetometer is rejected; empty while the magnetometer is used."""
         return self._field_check.text(self._replay.refused_fields)
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """The sizes (9,) N m of the torques (`knightcube.astro.earth.disturbance`)."""
+        """The estimated strengths (9,), N m, of the torques (`knightcube.astro.earth.disturbance`)."""
         return self._free.torque_sizes
 
     @property
     def residual_dipole(self) -> FloatArray:
-        """The residual dipole (3,) A m^2 in the present light, body axes."""
+        """The residual dipole (3,), A m^2, in body axes, for the present sunlight."""
         lit = self._steps[-1].around.sunlit if self._steps else 0.0
         return self._free.residual_dipole(lit)
 
     @property
     def slow(self) -> SlowStates:
-        """The states of biases, dipole, torques and axes."""
+        """The slow states: sensor biases, residual dipoles, torques and principal axes."""
         return self._free.slow
 
     @property
     def magnet_bias(self) -> FloatArray:
-        """The magnetometer's bias (3,) T, body axes."""
+        """The magnetometer's bias (3,), T, body axes."""
         return self._free.magnet_bias
 
     def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on; `known` is whether they are certain."""
+        """Record the coil currents (3,), A, in force from `time_ns` on; `known` means they are certain."""
         x, y, z = (self._settings.dipole_per_ampere * currents).tolist()
         self._dipoles.record(time_ns, (x, y, z), known)
 
     def mark_unknown(self, since_ns: int) -> None:
-        """Treat the currents recorded since a time as unknown, and process the steps since then again."""
+        """Treat the coil currents since a time as unknown, and process the steps since that time again."""
         self._replay.doubt_since(since_ns)
 
     def accept(self, reading: ImuReading) -> bool:
-        """Accept a reading; return whether there is an estimate with which the gyro agrees."""
+        """Accept a reading, and return whether there is an estimate that agrees with the gyro."""
         if self._open is None:
             self._open = OpenStep(reading.time_ns, self._acts())
             return False
@@ -660,9 +670,9 @@ class OrbitFilter:
         return self.started and not self.doubts_commands
 
     def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
-        """Start from an attitude; return False for a non-finite attitude, or if no step holds its time.
+        """Start from an attitude, and return whether it was used: it must be finite, and within the history.
 
-        `doubted` is whether the estimate was contradicted, so that its learned states are less accurate.
+        `doubted` states whether the estimate was contradicted, so that its learned states are less accurate.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
@@ -674,7 +684,7 @@ class OrbitFilter:
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
-        """Apply measurements of past times; `applied` is called with which of them passed the gate."""
+        """Apply measurements of past times, and call `applied` with a flag for each that passed its gate."""
         self._close()
         places = [self._replay.place(m.time_ns) for m in late]
         inside = [k for k in places if k is not None and self._steps[k].before is not None]
@@ -688,7 +698,7 @@ class OrbitFilter:
             for m in late:
                 if not isinstance(m, AttitudeMeasurement) or id(m) not in known - used:
                     continue
-                # If an attitude is refused that is more accurate than a fine estimate, the dipoles may be
+                # A rejected attitude that is more accurate than a fine estimate is a sign of wrong dipoles.
                 # wrong.
                 sigma = math.sqrt(float(m.covariance.diagonal().max()))
                 if self.knowledge is Knowledge.FINE and sigma < self._free.worst_sigma:
@@ -707,17 +717,17 @@ class OrbitFilter:
                 self.begin(m, doubted=True)
 
     def catch_up(self, most: int | None = None) -> None:
-        """Do nothing, because late measurements are applied at once, in a millisecond or two."""
+        """Do nothing, because late measurements are applied at once, within two milliseconds."""
 
     def at(self, time_ns: int) -> Estimate:
-        """Return the estimate propagated to `time_ns`; the filter itself does not change."""
+        """Return the estimate propagated to `time_ns`, without changing the filter."""
         newest = self._steps[-1]
         dipole = self._dipoles.mean(newest.end_ns, time_ns)
         seconds = (time_ns - newest.end_ns) / SECOND_NS
         return self._propagated.now(time_ns, seconds, dipole, newest.around, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the estimate at a past time, None beyond the history."""
+        """Return the estimate at a past time, or None if the time is beyond the history."""
         if self._steps and time_ns >= self._steps[-1].end_ns:
             return self.at(time_ns) if time_ns <= self.measured_ns else None
         place = self._replay.place(time_ns)
@@ -730,7 +740,7 @@ class OrbitFilter:
         return self._propagated.then(step.before, time_ns, seconds, step.dipole, step.around)
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
+        """Return times (n,), ns, and rates (n, 3), rad/s, of an interval, or None beyond the history."""
         inside = [s for s in self._steps if s.end_ns > begin_ns and s.begin_ns < end_ns]
         last = self.past(max(end_ns, inside[-1].end_ns)) if inside else None
         if not inside or last is None or inside[0].begin_ns > begin_ns:
@@ -743,7 +753,7 @@ class OrbitFilter:
         return np.array([*times, last.time_ns], dtype=np.int64), np.array([*rates, last.rate])
 
     def acceleration_psd(self, time_ns: int) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the acceleration noise at a time."""
+        """Return the power spectral density (3, 3), rad^2/s^3, of the acceleration noise at a time."""
         place = self._replay.place(time_ns) if self._free.started else None
         if place is None:
             return self._settings.unknown_psd * np.eye(3)
@@ -754,7 +764,7 @@ class OrbitFilter:
         return self._dipoles.at_rest_since() is None
 
     def _close(self) -> None:
-        """End the step under way at the newest reading, and take it."""
+        """End the step under way at its newest reading, and process it."""
         gathered = self._open
         if gathered is None or gathered.end_ns == gathered.begin_ns:
             return
@@ -770,27 +780,27 @@ class OrbitFilter:
 
 
 class OrbitFeed:
-    """Implements `ReadingFeed` with gyro and magnetometer of a reading; the stars give the attitude."""
+    """Passes gyro and magnetometer readings to the filter; implements `ReadingFeed`."""
 
     def __init__(self, filter_: OrbitFilter) -> None:
         self._filter = filter_
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
-        """Gather rate and field for the filter's next step."""
+        """Collect angular rate and magnetic field for the filter's next step."""
         return ReadingAgreement(self._filter.accept(reading))
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start the filter from an attitude of the stars; return whether it did."""
+        """Start the filter from an attitude measured with stars, and return whether it started."""
         return self._filter.begin(attitude)
 
 
 ERRORS, SOURCES, LEARNED_AT = "attitude-errors", "attitude-torques", "learned-at"
 UNKNOWN_AGE = 86_400.0
-"""Largest age (s) of learned states, also used if the clock was set back."""
+"""Largest assumed age (s) of learned states, also assumed if the clock was set back."""
 
 
 def _places(*parts: slice) -> IntArray:
-    """Return the indices of parts of the filter's state among the slow states."""
+    """Return the indices, within the slow states, of parts of the filter's state."""
     return np.concatenate([np.arange(part.start, part.stop) for part in parts]) - GYRO.start
 
 
@@ -798,7 +808,7 @@ PARTS = {ERRORS: _places(GYRO, MAGNET, AXES), SOURCES: _places(DIPOLE, SUNLIT, T
 
 
 def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
-    """Return the slow states by name, as known at a time (UTC, s)."""
+    """Return the slow states by name, as estimated at a time (UTC, s)."""
     found = {name: Learned.of(slow.values[at], slow.covariance[np.ix_(at, at)]) for name, at in PARTS.items()}
     return {**found, LEARNED_AT: Learned((utc,), ((0.0,),))}
 
@@ -806,9 +816,9 @@ def learned_of(slow: SlowStates, utc: float) -> dict[str, Learned]:
 def start_from(
     learned: Mapping[str, Learned], settings: FreeFilterSettings, changed: float, utc: float
 ) -> tuple[SlowStates, list[str]]:
-    """Return the prior of the filter at a time (UTC, s), and why learned states were rejected.
+    """Return the filter's prior at a time (UTC, s), and the reasons why learned states were rejected.
 
-    Since the last boot a state may have changed by the fraction `changed` of its initial deviation.
+    Switching off and on may have changed a state by the fraction `changed` of its initial deviation.
     """
     start, walks = settings.of_slow(0), settings.of_slow(1)
     prior = SlowStates(np.zeros(len(start)), np.diag(start**2))

@@ -1,12 +1,13 @@
-"""Guidance of a satellite: targets, the path that is flown, and plans requested from the planner worker.
+"""Guidance of a satellite: targets, the flown path, and plans from the planner worker.
 
-A path is a table of the pointing law. A table is made when a target is set, when the attitude is known again,
-when the body leaves its path, and periodically: the orbit's prediction ages, and a free roll follows the
-body's own.
+A path is a table of feedback gains and reference motion for the pointing law. A path is planned when a target
+is set, when the attitude becomes known again, when the body leaves its path, and periodically, because the
+orbit prediction ages and a free roll angle follows the body.
 
-A satellite that follows an object points to the place of the search, then to the track of the object. Without
-a track the boresight stays at the place of the search. Of several tracks the brightest is followed, until it
-ends. The body is steered by the track's prediction, so it goes on while the object is not detected.
+A satellite that follows an object points to the search direction first, then to the track of the object.
+Without a track, the boresight stays at the search direction. If there are several tracks, the satellite
+follows the brightest object until its track ends. The satellite is steered by the prediction of the track, so
+it follows the object also between detections.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from knightcube.gnc.tracker import Track
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathPoint:
-    """The path at one time of the clock, `seconds` after its origin; implements `Reference` of the loop."""
+    """The planned motion at one time, `seconds` after the start of the path; implements `Reference`."""
 
     paths: PointingPaths
     law: PointingLaw
@@ -67,15 +68,18 @@ class PathPoint:
 
 
 class PointingPaths:
-    """The path being flown; implements `flight.loop.body.FlownPaths`.
+    """The path that the satellite follows; implements `flight.loop.body.FlownPaths`.
 
     Attributes:
         off: angle (rad) between body and path at the last command; zero for a new path.
-        astray: the recovery of a body far off its path.
+        astray: damping and replanning state of a body far off its path.
     """
 
     def __init__(self, limit: float, fastest: float) -> None:
-        """`limit` (A m^2) is a coil's mean dipole over a window; every path stays below `fastest` (rad/s)."""
+        """`limit` is a coil's largest mean dipole (A m^2) over a window.
+
+        `fastest` is the largest rate (rad/s) of a path.
+        """
         self._limit, self._fastest = limit, fastest
         self._law: PointingLaw | None = None
         self._target: PointingTarget | None = None
@@ -85,7 +89,7 @@ class PointingPaths:
         self.astray = PathRecovery()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
-        """Fly a table, or its part that is slow enough; return why it is refused, empty if it is flown."""
+        """Follow a new table, or its slow enough part; return why it is rejected, or "" if it is followed."""
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
@@ -101,13 +105,13 @@ class PointingPaths:
         return ""
 
     def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
-        """Accept rotation (3,) off the path and rate (3,); return whether the path is flown."""
+        """Accept the rotation (3,) between path and body and the rate (3,); return whether to go on."""
         self.off = float(np.linalg.norm(turn))
         self.astray.update(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
         return self.astray.since is None
 
     def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:
-        """Return whether a slew to a target is flown and not over."""
+        """Return whether a slew to this target is under way."""
         return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
 
     def has_arrived(self, now_ns: int) -> bool:
@@ -118,21 +122,21 @@ class PointingPaths:
         return over
 
     def sample(self, now_ns: int) -> PathPoint | None:
-        """Return the path now; None without one, or after its end."""
+        """Return the planned motion now, or None without a path or after its end."""
         if self._law is None:
             return None
         seconds = (now_ns - self._origin_ns) / SECOND_NS
         return PathPoint(self, self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
 
     def attitude(self, target: PointingTarget, now_ns: int) -> FloatArray | None:
-        """Return the attitude (4,) of a target now; None while no path to this target is flown."""
+        """Return the planned attitude (4,) of a target, or None while no path to this target is followed."""
         point = self.sample(now_ns)
         if point is None or target != self._target:
             return None
         return point.law.wanted(point.seconds).quaternion
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether there is a path, which is followed to its end."""
+        """Return whether a path is being followed."""
         return self.sample(now_ns) is not None
 
     def is_adrift(self, now_ns: int) -> bool:
@@ -147,7 +151,7 @@ class PointingPaths:
 
 @dataclass(frozen=True, slots=True)
 class PointingTargetLaw:
-    """The attitude of a target over time, by the path that is flown to it; implements `AttitudeLaw`."""
+    """The planned attitude of a target as a function of time; implements `AttitudeLaw`."""
 
     target: PointingTarget
     paths: PointingPaths
@@ -158,36 +162,39 @@ class PointingTargetLaw:
         return self.target.text
 
     def quaternion(self, now_ns: int) -> FloatArray:
-        """Return the attitude (4,), ICRS into body; NaN before the first path to the target."""
+        """Return the attitude (4,), ICRS to body, with NaN before the first path to the target."""
         found = self.paths.attitude(self.target, now_ns)
         return np.full(4, np.nan) if found is None else found
 
 
 def target_of(target: Target) -> PointingTarget:
-    """Return the pointing target of a target of this body."""
+    """Return the pointing target of a satellite's target."""
     law = target.law
     assert isinstance(law, PointingTargetLaw), "only the satellite's own targets reach its planner"
     return law.target
 
 
 class PointingTargets:
-    """Implements `flight.loop.body.BodyTargets`."""
+    """The configured and commanded targets of a satellite; implements `flight.loop.body.BodyTargets`."""
 
     def __init__(
         self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
     ) -> None:
-        """Take the configured targets with their mission times (s) in order; the first time is 0."""
+        """Accept the configured targets in order of their mission times (s), the first of which is 0."""
         self._looks_for_objects = looks_for_objects
         self._paths = paths
         self._times = [round(at * 1e9) for at, _ in timed]
         self._steps = [Target(k, PointingTargetLaw(target, paths)) for k, (_, target) in enumerate(timed)]
 
     def configured(self, mission_time_ns: int) -> Target:
-        """Return the configured target in force at a mission time."""
+        """Return the configured target that is in force at a mission time."""
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of command `number`. Raises UsageError for a q2."""
+        """Return the target that command `number` sets.
+
+        Raises UsageError if the command gives a q2, as for the testbed.
+        """
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite points to a goal, not to a q2")
         if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
@@ -195,12 +202,12 @@ class PointingTargets:
         return Target(COMMANDED + number, PointingTargetLaw(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
-        """Return the present attitude as a target."""
+        """Return a target that keeps the present attitude."""
         qx, qy, qz, qw = estimate.quaternion.tolist()
         return Target(KEPT, PointingTargetLaw(PointingTarget(Goal.INERTIAL, (qx, qy, qz, qw)), self._paths))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return True, because every attitude can be held in the mean over a revolution."""
+        """Return True, because every attitude can be held on average over a revolution."""
         return True
 
     def speed(self, estimate: Estimate) -> float:
@@ -208,44 +215,43 @@ class PointingTargets:
         return float(np.linalg.norm(estimate.rate))
 
     def error(self, estimate: Estimate, target: Target) -> float:
-        """Return the angle between body and target, rad; zero before there is a path."""
+        """Return the angle (rad) between body and target, or zero before there is a path."""
         wanted = target.law.quaternion(estimate.time_ns)
         return 0.0 if np.isnan(wanted[0]) else float(angle_between(estimate.quaternion, wanted))
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return None, because the arrival depends on the magnetic field."""
+        """Return None, because the arrival time depends on the magnetic field."""
         return None
 
 
 EFFORT = 0.25
-"""Dipole of unit cost, as a fraction of the coils' limit."""
+"""Dipole of unit cost, as a fraction of the coils' limit, while following an object."""
 ROLL = math.radians(20.0)
-"""Roll error of unit cost, rad about the boresight: large, because the field's corners do not matter."""
+"""Roll error (rad) of unit cost about the boresight; it is large, because roll hardly moves the object."""
 RATE = math.radians(1.0)
-"""Rate error of unit cost, rad/s: a body that rolls fast blurs the stars at the field's edge."""
+"""Rate error (rad/s) of unit cost: a body that rolls fast blurs the stars at the edge of the image."""
 FORESIGHT = 30.0
-"""Prediction span (s) within which an object is reported to leave the field of view; longer predictions of a
-young track are not accurate enough."""
+"""Longest time (s) for which the report about an object leaving the field of view predicts its track."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sensor:
-    """The star camera: boresight (3,), body axes, and angle (rad) from it to the nearest edge."""
+    """The star camera: boresight (3,), body axes, and angle (rad) from the boresight to the nearest edge."""
 
     boresight: FloatArray
     half_field: float
 
 
 class ObjectAim:
-    """Directs the planner's jobs while the target is an object.
+    """Adapts the planner's jobs to a target that is an object.
 
     Attributes:
-        seeks: whether the target is an object.
-        moved: whether the track changed since the last plan.
+        seeks: whether the target is an object to be searched for or followed.
+        moved: whether the followed track has changed since the last plan.
     """
 
     def __init__(self, sensor: Sensor | None, limit: float, log: EventLog) -> None:
-        """`sensor` is None without a search for objects; `limit` (A m^2) is of each coil."""
+        """`limit` is a coil's largest dipole (A m^2); `sensor` is None if no objects are searched for."""
         self._sensor, self._limit, self._events = sensor, limit, log
         self._target: PointingTarget | None = None
         self._place: FloatArray | None = None
@@ -263,7 +269,7 @@ class ObjectAim:
         self.seeks = target.goal is Goal.OBJECT and self._sensor is not None
 
     def accept(self, tracks: Sequence[Track], now_ns: int) -> None:
-        """Accept the confirmed tracks after a frame, and choose a track to follow."""
+        """Accept the confirmed tracks after a frame, and choose the track to follow."""
         self._tracks = tuple(tracks)
         if not self.seeks:
             return
@@ -275,12 +281,12 @@ class ObjectAim:
                 text = f"object {found.number}, V {found.magnitude:.1f} +- {found.magnitude_sigma:.1f}"
                 self._events.report(events.OBJECT_FOLLOWED, now_ns, text)
             elif before:
-                # The search starts again at the body's attitude, or at the commanded direction.
+                # Search again, in the commanded direction or in the direction of the camera.
                 self._place = None
         self.moved = self.moved or before > 0 or self._followed > 0
 
     def directed(self, job: PointingJob) -> PointingJob:
-        """Return a job for the body's target; for an object it points to the search or to the track."""
+        """Return a job for the body's target; for an object, point to the search direction or the track."""
         sensor = self._sensor
         self.moved = False
         if not self.seeks or sensor is None:
@@ -290,7 +296,7 @@ class ObjectAim:
         track = self._track()
         if track is None:
             place = self._searched(job.quaternion)
-            # With another axis a rotation of the boresight would have a low cost.
+            # Weights about another axis would make rotations of the boresight cheap.
             weights = replace(job.weights, roll=ROLL, axis=boresight)
             return replace(
                 job, axes=axes, weights=weights, slew=None, sight=ObjectDirection(place, np.zeros(3), 0.0)
@@ -302,7 +308,7 @@ class ObjectAim:
         return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
-        """Report an object that leaves the field of view on the path of a table."""
+        """Report an event if the object leaves the field of view along the path of a table."""
         sensor, sight = self._sensor, job.sight
         if sensor is None or sight is None or not sight.velocity.any():
             return
@@ -329,11 +335,11 @@ class ObjectAim:
         self._escapes = bool(len(outside))
 
     def _track(self) -> Track | None:
-        """Return the followed track; None if it has ended or no track is followed."""
+        """Return the followed track, or None if it has ended or none is followed."""
         return next((track for track in self._tracks if track.number == self._followed > 0), None)
 
     def _searched(self, quaternion: FloatArray) -> FloatArray:
-        """Return the direction (3,) of the search: as commanded, or that of the camera at its beginning."""
+        """Return the search direction (3,): the commanded one, or the camera's when the search began."""
         if self._place is None:
             assert self._target is not None
             assert self._sensor is not None
@@ -348,15 +354,16 @@ class ObjectAim:
 
 
 AGAIN_NS = 10_000_000_000
-"""Time (ns) until the next request after a failed plan, or while the orbit is unknown."""
+"""Time (ns) until the next planning request after a failed plan, or while the orbit is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
-    """The planner's model of the craft.
+    """The planner's model of the satellite.
 
-    `inertia` (3, 3) is in kg m^2, body axes. `limit` (A m^2) is the mean dipole of a coil over a window of
-    pause and action. `slew` is the request of slews.
+    `inertia` is the inertia matrix (3, 3), kg m^2, in body axes. `limit` (A m^2) is the largest mean dipole
+    of a coil over a window with its pause. `slew` holds the constraints and heat coefficients that every slew
+    request uses.
     """
 
     inertia: FloatArray
@@ -367,7 +374,7 @@ class PlannedCraft:
 
 
 class PointingPlanner:
-    """Implements `flight.loop.body.Planner`."""
+    """Requests plans from the planner worker; implements `flight.loop.body.Planner`."""
 
     def __init__(
         self,
@@ -378,7 +385,7 @@ class PointingPlanner:
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """`disturbed` returns the estimated torques (9,) N m and residual dipole (3,) A m^2."""
+        """`disturbed` returns the estimated torques (9,), N m, and the residual dipole (3,), A m^2."""
         self._craft, self._paths, self._environment = craft, paths, environment
         self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
@@ -388,11 +395,11 @@ class PointingPlanner:
         self._count = self._accepted = self._refused = 0
 
     def busy_since_ns(self) -> int | None:
-        """Return when the worker began its plan (ns); None while it is idle."""
+        """Return when the worker began its plan (ns), or None while it is idle."""
         return None if self._job is None else self._job.origin_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
-        """Request a plan for a new target; the present path is flown until then."""
+        """Request a plan for a new target; the present path is followed until the plan arrives."""
         self._wanted, self._after_ns = True, now_ns
 
     def request(self, now_ns: int) -> None:
@@ -400,14 +407,14 @@ class PointingPlanner:
         self._wanted = True
 
     def resume(self, now_ns: int) -> None:
-        """Do nothing, because the path goes on while there is no control."""
+        """Do nothing, because the path continues while the coils are not controlled."""
 
     def replan(self, cycle: Cycle) -> None:
-        """Request the periodic plan: the task of the replanning rate group."""
+        """Request the periodic plan; called by the replanning rate group."""
         self._wanted = True
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
-        """Submit the requested job to the worker."""
+        """Submit the requested job to the worker, if it is due."""
         goal, astray = target_of(target), self._paths.astray
         self._objects.aim(goal)
         if astray.since is not None:
@@ -418,7 +425,7 @@ class PointingPlanner:
             if not astray.ready:
                 return
         elif self._paths.is_slewing(now_ns, goal):
-            return  # a new plan for the rest of a slew would dissipate many times the heat
+            return  # a new plan for the rest of a slew would dissipate far more heat
         if self._paths.has_arrived(now_ns):
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
@@ -451,9 +458,10 @@ class PointingPlanner:
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
     def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewRequest | None:
-        """Return the request of a slew to a goal; None for a body on a path to it.
+        """Return the request of a slew to a goal, or None if the body is already on a path to this goal.
 
-        Torques along the field make a path leave its goal for a time; this requires no slew.
+        Disturbance torques along the field may move the body off its goal for a while, which requires no
+        slew.
         """
         on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
         return None if on_path else replace(self._craft.slew, residual=residual)
@@ -466,7 +474,7 @@ class PointingPlanner:
         if result.outcome != "done":
             self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
-            self._wanted = True  # the plan is from before; a new plan follows once the body is slow
+            self._wanted = True  # requested before the damping; a new plan follows later
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
@@ -478,11 +486,11 @@ class PointingPlanner:
                 self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def counts(self) -> tuple[int, int]:
-        """Return how many plans were accepted and refused since the start."""
+        """Return how many plans were accepted, and how many were rejected, since the start."""
         return self._accepted, self._refused
 
     def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
-        """Report a plan that is not flown, and request another plan after `wait_ns`."""
+        """Report a plan that cannot be followed, and request another plan after `wait_ns`."""
         self._refused += 1
         self._wanted, self._after_ns = True, now_ns + wait_ns
         self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -1,1 +1,1 @@
-"""The testbed: a body on a thread in a fixed field, turned about one axis."""
+"""The testbed: a body that hangs from a thread in a fixed magnetic field and rotates about the thread."""

@@ -1,6 +1,7 @@
-"""The testbed: a body on a thread in a fixed horizontal field, turned about one axis by the coil on body x.
+"""The testbed: a body on a thread in a fixed horizontal field, rotated about the thread by one coil.
 
-`TESTBED` builds the testbed from the configuration; q2 and the thread appear only in this package.
+`TESTBED` builds the testbed from the configuration. Only this package knows of the thread and of q2, the
+second component of the quaternion.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ from knightcube.gnc.guidance.one_axis.vmc import NODES
 
 
 class UnitFeed:
-    """Implements `ReadingFeed`: starts the filter from attitude and rate, and applies both."""
+    """Starts and updates the filter from the unit's attitude and rate; implements `ReadingFeed`."""
 
     def __init__(self, filter_: AttitudeFilter, unit: InertialUnitSection) -> None:
         self._filter = filter_
@@ -77,7 +78,7 @@ class UnitFeed:
         self._rate_covariance: FloatArray = np.eye(3) * unit.rate_noise**2
 
     def accept(self, reading: ImuReading) -> ReadingAgreement:
-        """Start the filter from a reading, or apply its attitude and its rate."""
+        """Start the filter from a reading, or update it with the attitude and the rate of the reading."""
         latency = self._filter.latency
         time_ns = reading.time_ns - round(latency * SECOND_NS)
         attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
@@ -85,7 +86,7 @@ class UnitFeed:
         if not self._filter.started:
             self._filter.start(attitude, rate)
             return ReadingAgreement(True)
-        # Attitude and rate have separate gates: a correct gyro keeps the rate while the attitude is rejected.
+        # Attitude and rate have separate gates, so a correct rate is used even if the attitude is rejected.
         turned = self._filter.measure(attitude)
         moved = self._filter.started and self._filter.measure(rate)
         if turned and moved:
@@ -94,12 +95,12 @@ class UnitFeed:
         return ReadingAgreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Return False, because the inertial unit's attitude starts the filter."""
+        """Return False, because only the inertial unit's attitude starts this filter."""
         return False
 
 
 class ThreadView:
-    """The packets and texts of the testbed; implements `flight.loop.body.BodyView`."""
+    """The telemetry packets and texts of the testbed; implements `flight.loop.body.BodyView`."""
 
     def __init__(self, reader: ThreadReader, planning: Planning, services: Services) -> None:
         self._read = reader.read
@@ -108,7 +109,7 @@ class ThreadView:
         self._events = services.events
 
     def record_cycle(self, output: ControlOutput) -> None:
-        """Record the control packet."""
+        """Record the control packet of a cycle."""
         estimate = self._read(output.estimate) if output.estimate is not None else None
         steered, sample, written = output.steered, output.steered.reference, output.written
         now_ns, nan = output.cycle.start_ns, math.nan
@@ -134,7 +135,7 @@ class ThreadView:
         )
 
     def announce(self, target: Target, now_ns: int) -> None:
-        """Record and report a new target, unless the present attitude is held."""
+        """Record and report a new target, except one that holds the present attitude."""
         if target.index == KEPT:
             return
         law = law_of(target)
@@ -142,15 +143,15 @@ class ThreadView:
         self._events.report(events.TARGET, now_ns, f"step {target.index}: q2 = {law.q2:+.2f}")
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
-        """Return the body's fields of the mode packet."""
+        """Return the fields of the mode packet that belong to this body."""
         return {"target_q2": math.nan if wanted is None else law_of(wanted).q2}
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return a rate from streaks as text."""
+        """Return an angular rate that was measured from streaks as text."""
         return f"{rate.rate[1]:.5f} rad/s +- {math.sqrt(rate.covariance[1, 1]):.1e}"
 
     def progress(self, output: ControlOutput | None) -> str:
-        """Return target and attitude as text, for the progress line."""
+        """Return target and attitude as text for the progress line."""
         target, estimate = (None, None) if output is None else (output.target, output.estimate)
         wanted = law_of(target).q2 if target else 0.0
         if estimate is None:
@@ -163,7 +164,7 @@ _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 
 
 class TestbedEstimation(BodyEstimation):
-    """The estimate of the testbed."""
+    """Estimation of the testbed: its attitude filter and coil monitor."""
 
     def __init__(
         self,
@@ -172,7 +173,7 @@ class TestbedEstimation(BodyEstimation):
         reader: ThreadReader | None = None,
         cage: CageField | None = None,
     ) -> None:
-        """Start from the parameters that an earlier boot learned."""
+        """Start from the plant parameters that an earlier boot learned."""
         plant = plant_of(config)
         self._reader = reader or thread_reader(plant)
         self._cage = cage
@@ -185,18 +186,18 @@ class TestbedEstimation(BodyEstimation):
         self.coil_monitor = coil_monitor(config, plant)
 
     def field(self, estimate: Estimate) -> FloatArray:
-        """Return the field (3,) T in body axes."""
+        """Return the magnetic field (3,), T, in body axes."""
         angle = self._reader.read(estimate).angle
         field = self._field if self._cage is None else self._cage.at(estimate.time_ns)
         return np.asarray(attitude_matrix(about_axis_y(angle)) @ field)
 
     def angular_acceleration_psd(self, time_ns: int) -> FloatArray:
-        """Return the density (3, 3) rad^2/s^3 of the angular acceleration due to current noise."""
+        """Return the power spectral density (3, 3), rad^2/s^3, of the acceleration due to current noise."""
         return self._density
 
 
 class TestbedControl(BodyControl):
-    """Guidance and control of the testbed."""
+    """Guidance and control of the testbed, built from its configuration."""
 
     def __init__(
         self, config: TestbedConfig, reader: ThreadReader, cage: CageField | None, services: Services
@@ -216,7 +217,7 @@ class TestbedControl(BodyControl):
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> FlightBody:
-    """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
+    """Return the testbed of a configuration, started with the parameters that an earlier boot learned."""
     config = as_testbed(config)
     cage = None if config.cage is None else CageField(config.cage, config.plant.field, services.clock)
     reader = thread_reader(plant_of(config))
@@ -227,14 +228,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 def thread_reader(plant: SingleAxisPlant) -> ThreadReader:
-    """Return the reader of the rotation about the thread of `plant`."""
+    """Return the reader that computes the rotation about the thread for the parameters of `plant`."""
     return ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
 
 
 def _tracker(
     config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
 ) -> Tracker:
-    """Return the tracker for the coil on body x, or in a cage for the coils on x and z."""
+    """Return the tracker for the coil on body x or, in a Helmholtz cage, for the coils on x and z."""
     period, dipole = 1.0 / CONTROL_RATE_HZ, dipole_per_ampere(config)
     controller = controller_of(config.control, plant, period, config.identification)
     tracker = ThreadTracker(controller, reader, dipole)
@@ -245,12 +246,12 @@ TESTBED = BodyKind(plan_job.run, make)
 
 
 def surrounding_field(config: TestbedConfig) -> FloatArray:
-    """Return the surrounding field (3,) T, reference axes."""
+    """Return the magnetic field (3,), T, that surrounds the testbed, in reference axes."""
     return np.array([0.0, 0.0, -config.plant.field])
 
 
 def dipole_per_ampere(config: TestbedConfig) -> float:
-    """Return n A of each coil, m^2."""
+    """Return the number of turns times the area of each coil, m^2."""
     return config.plant.coil_turns * config.plant.coil_area
 
 
@@ -260,7 +261,7 @@ def attitude_filter(
     learned: Mapping[str, Learned],
     cage: CageField | None = None,
 ) -> tuple[AttitudeFilter, list[str]]:
-    """Return the filter of a body on the thread, and why `learned` parameters were rejected."""
+    """Return the filter of the testbed, and the reasons why `learned` parameters were rejected."""
     section = config.estimation
     body = RigidBody(
         np.eye(3) * plant.inertia,
@@ -291,7 +292,7 @@ def attitude_filter(
 
 
 def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
-    """Return the law and the windows of detumbling."""
+    """Return the detumbling law with its control windows."""
     section = config.detumble
     settle_ns, measure_ns, act_ns = (
         round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
@@ -305,7 +306,7 @@ def detumbling_law(config: TestbedConfig, plant: SingleAxisPlant) -> BdotLaw:
 
 
 def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
-    """Return the monitor of the coils' circuit."""
+    """Return the monitor of the coils and their circuit."""
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     response = ResponseSettings(
         np.eye(3) * plant.inertia,
@@ -318,7 +319,7 @@ def coil_monitor(config: TestbedConfig, plant: SingleAxisPlant) -> CoilMonitor:
 
 
 def planning_settings(config: TestbedConfig) -> PlanningSettings:
-    """Return the settings of planning."""
+    """Return the settings of path planning."""
     section = config.guidance
     return PlanningSettings(
         horizon=section.horizon,

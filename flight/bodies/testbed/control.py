@@ -1,21 +1,24 @@
-"""Guidance and control of the testbed: rotation about the thread, targets, requested paths and control laws.
+"""Guidance and control of the testbed: rotation about the thread, targets, path planning and control laws.
 
-Guidance has three strategies. GOAL plans a step for a goal time when commanded, and again every few seconds
-from the newest estimate for the remaining time: each plan is the optimal rest of the step. Near the goal time
-the path is flown to its end, which is held; a body displaced from its path gets a new plan. RECEDING is the
-strategy of the thesis: each plan reaches the target a whole horizon later (Sease ch. 5, Optimal Path
-Planning). STEP makes no plan: the controller tracks the target itself.
+Paths are planned by one of three strategies. The strategy GOAL plans the whole step when a target is set, and
+every few seconds plans the remaining part again from the newest estimate: each new plan is the optimal
+continuation of the step. Near the goal time, the last path is followed to its end, and the attitude at its
+end is held; a body displaced from its path gets a new plan. The strategy RECEDING is that of the thesis: each
+plan reaches the target a whole horizon later (Sease, chapter 5, Optimal Path Planning). The strategy STEP
+makes no plan, so that the controller tracks the target itself.
 
-The control laws are B-dot detumbling and a controller about the thread. In a Helmholtz cage the field is that
-of an orbit, as the flight predicts it. The cage shows the body the field that a satellite on the orbit meets
-in its local frame: x along the flight, z down, y against the orbit's normal, which is the axis of the thread.
-The rotation about the thread is therefore the pitch of a satellite that looks down, in a field that turns
-once a revolution and changes its strength. The cage renders the two components of that field normal to the
-thread, `scale` times as strong. The third component makes no torque about the thread.
+The control laws are B-dot detumbling and a controller of the rotation about the thread. In a Helmholtz cage,
+the magnetic field is that of an orbit, which the flight software predicts. The cage produces the field that a
+satellite would meet in its local orbital frame: x along the flight direction, z down, and y, the axis of the
+thread, opposite to the orbit normal. The rotation about the thread is therefore the pitch of an
+Earth-pointing satellite, in a field that rotates once per revolution and varies in strength. The cage
+produces only the two field components normal to the thread, multiplied by `scale`. The component along the
+thread would cause no torque about the thread.
 
-The field is predicted by WMM along the elements at UTC, on which the cage's control computer and the flight
-agree. The coil on body x alone has no torque if the field is parallel to it, so the coils on x and z make the
-torque about the thread together, with the least current.
+The field is predicted by the World Magnetic Model along the orbit of the two-line elements, by UTC, in the
+cage's control computer and in the flight software alike. The coil on body x has no torque while the field is
+parallel to its axis, so the coils on x and z share the torque about the thread in the way that needs the
+least current.
 """
 
 from __future__ import annotations
@@ -69,7 +72,7 @@ from knightcube.reference.control import AdaptiveController, AdaptiveSettings, P
 
 
 def plant_of(config: TestbedConfig) -> SingleAxisPlant:
-    """Return the plant model that planner, tracker and filter use."""
+    """Return the plant model that planner, tracker and filter share."""
     section = config.plant
     return SingleAxisPlant(
         inertia=section.inertia,
@@ -84,14 +87,14 @@ def plant_of(config: TestbedConfig) -> SingleAxisPlant:
 
 
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
-"""Limits of the estimated coil gain, beyond which the filter has not converged."""
+"""Limits of the estimated coil gain; outside these limits the filter has not converged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThreadEstimate:
     """Angle (rad), rate (rad/s) and disturbance (rad/s^2) about the thread, with their covariance (3, 3).
 
-    `measured_ns` is the time of the newest measurement used.
+    `measured_ns` is the time of the newest measurement that the estimate uses.
     """
 
     time_ns: int
@@ -103,15 +106,15 @@ class ThreadEstimate:
 
     @property
     def q2(self) -> float:
-        """The second quaternion component."""
+        """The second component of the quaternion (q2)."""
         return math.sin(0.5 * self.angle)
 
 
 def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstimate:
-    """Return the rotation about the thread, which is exact for a suspended body.
+    """Return the rotation about the thread; no approximation is needed for a suspended body.
 
     The disturbance is the acceleration that a plant with the parameters of `model` does not explain, scaled
-    so that the holding current of that plant is the holding current of the body.
+    so that this plant and the body need the same current to hold an attitude.
     """
     angle, rate = angle_about_axis_y(estimate.quaternion), float(estimate.rate[1])
     torsion, damping, gain = estimate.parameters
@@ -133,14 +136,14 @@ def about_thread(estimate: Estimate, model: Parameters = NOMINAL) -> ThreadEstim
 
 
 class ThreadReader:
-    """Computes the rotation about the thread from an estimate, once for each estimate."""
+    """Computes the rotation about the thread, once for each estimate."""
 
     def __init__(self, model: Parameters) -> None:
         self._model = model
         self._last: tuple[Estimate, ThreadEstimate] | None = None
 
     def read(self, estimate: Estimate) -> ThreadEstimate:
-        """Return the rotation about the thread."""
+        """Return the rotation about the thread according to an estimate."""
         if self._last is None or self._last[0] is not estimate:
             self._last = estimate, about_thread(estimate, self._model)
         return self._last[1]
@@ -148,23 +151,23 @@ class ThreadReader:
 
 @dataclass(frozen=True, slots=True)
 class ThreadLaw:
-    """Reach `q2` at `rate` rad/s and keep that rate; zero holds the attitude."""
+    """A target that reaches `q2` at `rate` rad/s and keeps this rate; a zero rate holds the attitude."""
 
     q2: float
     rate: float = 0.0
 
     @property
     def text(self) -> str:
-        """The law as text, for events."""
+        """The target as text for events."""
         return f"q2 {self.q2:+.3f}"
 
     def quaternion(self, now_ns: int) -> FloatArray:
-        """Return the attitude (4,) to be reached, reference into body."""
+        """Return the attitude (4,) to be reached, from the reference frame to the body."""
         return about_axis_y(angle_of(self.q2))
 
 
 def law_of(target: Target) -> ThreadLaw:
-    """Return the law of a target of the testbed."""
+    """Return the target law of a testbed's target."""
     law = target.law
     assert isinstance(law, ThreadLaw), "only the testbed's own targets reach its planner"
     return law
@@ -172,11 +175,11 @@ def law_of(target: Target) -> ThreadLaw:
 
 _AGAIN_NS = 1_000_000_000
 _MAX_HORIZON = 60.0
-"""Longest horizon of a path, s."""
+"""Longest planning horizon (s) of a path."""
 
 
 class Strategy(StrEnum):
-    """How paths are planned: see the module."""
+    """Strategies of path planning, which are described at the top of this module."""
 
     GOAL = "goal"
     RECEDING = "receding"
@@ -188,15 +191,15 @@ class PlanningSettings:
     """Settings of planning.
 
     Attributes:
-        horizon: s, requested for a new target; an initial guess where time has a price.
-        late_after_ns: planning time after which a plan is late.
-        nodes: number of nodes of the path.
+        horizon: duration (s) requested for a new path; an initial guess if `time_price` is set.
+        late_after_ns: planning time (ns) after which a plan is reported as late.
+        nodes: number of interpolation nodes of a path.
         strategy: see the module.
-        time_price: W, cost of a second of a slew; None for a fixed horizon.
-        current_share: fraction of the coil's limit that a plan may use; the rest is the controller's.
-        cost: the power whose integral a path minimises.
-        least_horizon: s, time to the goal below which there is no new plan.
-        displaced: rad, distance from the path above which there is a new plan.
+        time_price: cost (W) of the duration of a slew, or None for a fixed horizon.
+        current_share: fraction of the current limit that a plan may use; the controller may use the rest.
+        cost: the power whose integral over time a path minimises.
+        least_horizon: time (s) before the goal time from which on no new plan is made.
+        displaced: deviation (rad) from the path above which a new plan is made.
     """
 
     horizon: float
@@ -211,7 +214,7 @@ class PlanningSettings:
 
 
 class Planning:
-    """Owns the running job, the request for the next one and the goal time."""
+    """Owns the planner's running job, the request for the next job, and the goal time."""
 
     def __init__(
         self,
@@ -239,15 +242,15 @@ class Planning:
         self.flown = 0
 
     def counts(self) -> tuple[int, int]:
-        """Return how many plans were accepted and refused since the start."""
+        """Return how many plans were accepted, and how many were rejected, since the start."""
         return self._accepted, self._refused
 
     def busy_since_ns(self) -> int | None:
-        """Return when the worker began its plan (ns); None while it is idle."""
+        """Return when the worker began its plan (ns), or None while it is idle."""
         return None if self._job is None else self._asked_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
-        """Set a new target, and request a plan for it at once; the present path is flown until then."""
+        """Set a target and request a plan for it; the present path is followed until the plan arrives."""
         law = law_of(target)
         self._guidance.aim(law.q2, law.rate, now_ns)
         self._goal_ns = self._due_ns = None
@@ -257,28 +260,28 @@ class Planning:
             self._due_ns = now_ns + round(self._settings.horizon * 1e9)
 
     def due_angle(self, law: ThreadLaw, now_ns: int) -> float | None:
-        """Return the angle due by now, rad; None before the target is due.
+        """Return the angle (rad) that the target has at present, or None before the target is due.
 
-        The target is due at the end of the first path to it, whatever is planned later; without plans, a
-        horizon after the command.
+        A target is due when the first path to it ends, whatever is planned later. The strategy STEP has no
+        plans, so its targets are due one horizon after the command.
         """
         if self._due_ns is None or now_ns < self._due_ns:
             return None
         return _moved(law, (now_ns - self._due_ns) * 1e-9)
 
     def request(self, now_ns: int) -> None:
-        """Request a plan, made once there is an estimate and the worker is free."""
+        """Request a plan, which is made once there is an estimate and the worker is free."""
         self._wanted = True
         if self._is_near_goal(now_ns):
             self._goal_ns = None
 
     def resume(self, now_ns: int) -> None:
-        """Request the rest of a path after a time without control, unless its end is near."""
+        """After a time without control, request a plan for the rest of the path, unless its end is near."""
         if now_ns - self._asked_ns > _AGAIN_NS and not self._is_near_goal(now_ns):
             self._wanted = True
 
     def replan(self, cycle: Cycle) -> None:
-        """Request the periodic plan: the task of the replanning rate group."""
+        """Request the periodic plan; called by the replanning rate group."""
         if self._job is None:
             self._wanted = self._wanted or not self._is_near_goal(cycle.start_ns)
         elif cycle.start_ns - self._job.origin_ns > self._settings.late_after_ns:
@@ -288,14 +291,14 @@ class Planning:
             self._wanted = True
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
-        """Submit the requested job to the worker."""
+        """Submit the requested job to the worker, if it is due."""
         if estimate is None or self._settings.strategy is Strategy.STEP:
             return
         now = self._read(estimate)
         if self._is_displaced(now.angle, now_ns):
             self.request(now_ns)
         if self._is_near_goal(now_ns):
-            self._wanted = False  # the goal came near while the worker was busy
+            self._wanted = False  # the goal time came near while the worker was busy
         if not self._wanted or self._job is not None:
             return
         job = self._job_from(now, law_of(target), now_ns)
@@ -311,7 +314,7 @@ class Planning:
         horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
         end_q2 = law.q2
         if towards_goal and law.rate != 0.0 and self._due_ns is not None:
-            # A moving target has moved on since it was first due.
+            # A target with a rate has moved since it was first due.
             late = horizon - (self._due_ns - now_ns) * 1e-9
             end_q2 = q2_of(_moved(law, max(late, 0.0)))
         if end_q2 != self._guidance.target_q2:
@@ -333,13 +336,13 @@ class Planning:
         )
 
     def _is_near_goal(self, now_ns: int) -> bool:
-        """Return whether too little time is left until the goal for a new plan."""
+        """Return whether the remaining time to the goal is too short for a new plan."""
         if self._settings.strategy is not Strategy.GOAL or self._goal_ns is None:
             return False
         return self._goal_ns - now_ns < self._settings.least_horizon * 1e9
 
     def _is_displaced(self, angle: float, now_ns: int) -> bool:
-        """Return whether the body is off its path, at most once a second, so that the path is useless."""
+        """Return whether the body is too far off its path to follow it; true at most once a second."""
         sample = self._guidance.sample(now_ns)
         if self._settings.strategy is not Strategy.GOAL or sample is None:
             return False
@@ -350,7 +353,7 @@ class Planning:
         )
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Offer the worker's plan to guidance, and record whether the plan was accepted."""
+        """Offer the worker's plan to guidance, and record whether it was accepted."""
         job, self._job = self._job, None
         if job is None:
             return
@@ -410,13 +413,13 @@ class Planning:
 
 
 def _moved(law: ThreadLaw, since: float) -> float:
-    """Return the angle of a law `since` s after it was due, rad, limited to where the coil has authority."""
+    """Return the angle (rad) of a target `since` s after it was due, clipped where the coil has no torque."""
     return min(max(angle_of(law.q2) + law.rate * since, -FARTHEST), FARTHEST)
 
 
 @dataclass(frozen=True, slots=True)
 class TimedStep:
-    """A step: reach `q2` at `rate` rad/s, from mission time `at` s on."""
+    """A configured step, which reaches `q2` at `rate` rad/s and is in force from mission time `at` (s) on."""
 
     at: float
     q2: float
@@ -424,12 +427,12 @@ class TimedStep:
 
 
 class ThreadTargets:
-    """Implements `flight.loop.body.BodyTargets`."""
+    """The configured and commanded steps of the testbed; implements `flight.loop.body.BodyTargets`."""
 
     def __init__(
         self, steps: Sequence[TimedStep], reader: ThreadReader, guidance: PathGuidance, planning: Planning
     ) -> None:
-        """Take the configured steps in order of time; the first is at 0."""
+        """Accept the configured steps in order of time, the first of which is at mission time 0."""
         self._steps = [Target(i, ThreadLaw(step.q2, step.rate)) for i, step in enumerate(steps)]
         self._times = [round(step.at * 1e9) for step in steps]
         self._read = reader.read
@@ -437,11 +440,14 @@ class ThreadTargets:
         self._planning = planning
 
     def configured(self, mission_time_ns: int) -> Target:
-        """Return the configured target in force at a mission time."""
+        """Return the configured target that is in force at a mission time."""
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
     def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
-        """Return the target of slew `number` to q2 `wanted`. Raises UsageError beyond the limit."""
+        """Return the target of command `number`, which requests the q2 `wanted`.
+
+        Raises UsageError if q2 is beyond its limit.
+        """
         if isinstance(wanted, PointingTarget):
             raise UsageError("the testbed goes to a q2, not to a direction")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
@@ -449,25 +455,25 @@ class ThreadTargets:
         return Target(COMMANDED + number, ThreadLaw(wanted))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
-        """Hold the present angle, within the limit; return it as a target."""
+        """Hold the present angle, clipped to the limit, and return it as a target."""
         q2 = min(max(self._read(estimate).q2, -Q2_LIMIT), Q2_LIMIT)
         self._guidance.hold(angle_of(q2), now_ns)
         return Target(KEPT, ThreadLaw(q2))
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return whether the coil has authority where the body is."""
+        """Return whether the coil can produce torque at the body's present angle."""
         return abs(self._read(estimate).q2) < Q2_LIMIT
 
     def speed(self, estimate: Estimate) -> float:
-        """Return the rate about the thread, rad/s, not negative."""
+        """Return the absolute rate about the thread, rad/s."""
         return abs(self._read(estimate).rate)
 
     def error(self, estimate: Estimate, target: Target) -> float:
-        """Return the angle between body and target, rad."""
+        """Return the angle (rad) between body and target."""
         return self._off(estimate, angle_of(law_of(target).q2))
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle to the attitude due by now, rad; None before one is due."""
+        """Return the angle (rad) between body and target at a time, or None before the target is due."""
         due = self._planning.due_angle(law_of(target), now_ns)
         return None if due is None else self._off(estimate, due)
 
@@ -476,19 +482,19 @@ class ThreadTargets:
 
 
 class BdotLaw:
-    """B-dot detumbling; implements `flight.loop.body.WindowedLaw`."""
+    """The B-dot detumbling law of the testbed; implements `flight.loop.body.WindowedLaw`."""
 
     def __init__(self, detumbler: Detumbler, dipole_per_ampere: float) -> None:
-        """`dipole_per_ampere` is n A of each coil (m^2)."""
+        """`dipole_per_ampere` is the number of turns times the area of each coil (m^2)."""
         self._detumbler = detumbler
         self._dipole_per_ampere = dipole_per_ampere
 
     def begin(self, now_ns: int) -> None:
-        """Begin with no knowledge of the field."""
+        """Begin without knowledge of the magnetic field."""
         self._detumbler.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`; the law needs no rate of the gyro."""
+        """Accept a field (3,), T, measured at `time_ns`; the gyro's rate is not needed."""
         self._detumbler.sample(time_ns, field)
 
     def command(self, now_ns: int) -> CoilCommand:
@@ -497,10 +503,10 @@ class BdotLaw:
         return CoilCommand(currents * self._dipole_per_ampere, currents)
 
     def sent(self, currents: FloatArray) -> None:
-        """Do nothing, because B-dot needs no model of the motion."""
+        """Do nothing, because B-dot needs no model of the body's motion."""
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes now; None before it is known."""
+        """Return the magnetic field (3,), T, in body axes, or None before it is known."""
         return self._detumbler.field(now_ns)
 
 
@@ -510,7 +516,7 @@ def controller_of(
     period: float,
     identification: Identification,
 ) -> AngleController:
-    """Return the controller of `plant` that `section` selects, for a period (s)."""
+    """Return the controller that `section` selects for `plant`, with a control period in s."""
     if section.tracker == "excitation":
         move = identification
         return ExcitationController(
@@ -533,7 +539,7 @@ def controller_of(
 
 
 class ThreadTracker:
-    """Tracks a path with the coil on body x (Sease 5.4); implements `flight.loop.body.Tracker`."""
+    """Tracks a path with the coil on body x (Sease thesis, 5.4); implements `flight.loop.body.Tracker`."""
 
     def __init__(self, controller: AngleController, reader: ThreadReader, dipole_per_ampere: float) -> None:
         self._controller = controller
@@ -541,30 +547,30 @@ class ThreadTracker:
         self._dipole = dipole_per_ampere
 
     def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
-        """Return the command that keeps the body on the reference."""
+        """Return the command that keeps the body on the reference motion."""
         now = self._read(estimate)
         wanted = self._controller.command(reference, now.angle, now.rate, now.disturbance)
         currents = np.array([wanted.current, 0.0, 0.0])
         return CoilCommand(self._dipole * currents, currents, wanted.saturated)
 
     def reset(self) -> None:
-        """Discard integrated errors."""
+        """Discard the controller's integrated errors."""
         self._controller.reset()
 
 
 AHEAD = 20.0
-"""Span (s) of one prediction, which takes a millisecond or two."""
+"""Span (s) of one field prediction, which takes about two milliseconds."""
 _ROUND = 6_000.0, 60.0
-"""Span (s) of about one revolution, and step (s), of the search for the weakest field."""
+"""Span (s), about one revolution, and step (s) of the search for the weakest field."""
 _ACROSS: FloatArray = np.array([1.0, 0.0, 1.0])
-"""Mask of the field components that the cage renders."""
+"""Mask of the field components that the cage produces."""
 
 
 class CageField:
-    """Predicts the cage's field at any time of the clock."""
+    """Predicts the magnetic field of the Helmholtz cage at any time."""
 
     def __init__(self, section: Cage, weakest: float, clock: Clock) -> None:
-        """Raise ConfigError for malformed elements, or a field that falls below `weakest` (T)."""
+        """Raise ConfigError for malformed elements, or if the field falls below `weakest` (T)."""
         try:
             self._elements = TwoLineElements(*section.elements)
         except UsageError as error:
@@ -581,11 +587,11 @@ class CageField:
             )
 
     def at(self, now_ns: int) -> FloatArray:
-        """Return the field (3,) T, reference axes, at a time of the clock."""
+        """Return the field (3,), T, in reference axes at a time of the clock."""
         near = self._near
         seconds = math.inf if near is None else (self._date(now_ns) - near.julian_date) * DAY
         if near is None or not 0.0 <= seconds <= AHEAD:
-            # The prediction begins a second earlier, for late measurements.
+            # The prediction begins one second earlier, because measurements may be late.
             state = self._elements.at(self._date(now_ns) - 1.0 / DAY)
             near = self._near = predict(state, AHEAD)
             self._local = np.array(
@@ -606,7 +612,7 @@ class CageField:
         return self._date_zero + now_ns / (DAY * SECOND_NS)
 
     def _weakest(self, now_ns: int) -> float:
-        """Return the minimum strength (T) of the rendered field over a revolution from now on."""
+        """Return the minimum strength (T) of the cage's field over the next revolution."""
         least = math.inf
         for seconds in np.arange(0.0, *_ROUND):
             date = self._date(now_ns) + float(seconds) / DAY
@@ -620,7 +626,7 @@ class CageField:
 
 
 def local_frame(position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Return the matrix (3, 3) into the local frame: x along the flight, y against the normal, z down."""
+    """Return the rotation matrix (3, 3) to the local orbital frame: x along the flight, z down."""
     down = -position / np.linalg.norm(position)
     across = np.cross(velocity, position)
     across = across / np.linalg.norm(across)
@@ -628,7 +634,7 @@ def local_frame(position: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 class CageFilter(AttitudeFilter):
-    """The testbed's filter, which uses the cage's field at the time of each command."""
+    """The testbed's filter in a Helmholtz cage, whose field is predicted at the time of each command."""
 
     def __init__(
         self, cage: CageField, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None
@@ -640,12 +646,12 @@ class CageFilter(AttitudeFilter):
     def command(
         self, time_ns: int, currents: FloatArray, field: FloatArray | None = None, known: bool = True
     ) -> None:
-        """Record the coil currents (3,) A in force from `time_ns` on, with the cage's field at that time."""
+        """Record the coil currents (3,), A, and the cage's field, in force from `time_ns` on."""
         super().command(time_ns, currents, self._cage.at(time_ns) if field is None else field, known)
 
 
 class CageTracker:
-    """Makes the torque of another tracker for coil x with the coils x and z in the cage's field."""
+    """Converts the torque that another tracker requests from coil x into currents in the coils x and z."""
 
     def __init__(
         self,
@@ -655,7 +661,10 @@ class CageTracker:
         field: CageField,
         dipole: float,
     ) -> None:
-        """`inner` assumes the field of `plant`; `dipole` is n A of each coil, m^2."""
+        """`inner` is a tracker for the constant field of `plant`.
+
+        `dipole` is the number of turns times the area of each coil, m^2.
+        """
         self._inner = inner
         self._read = reader.read
         self._plant = plant
@@ -663,12 +672,12 @@ class CageTracker:
         self._dipole = dipole
 
     def command(self, estimate: Estimate, reference: PathSample) -> CoilCommand:
-        """Return the command that makes the torque with the least current."""
+        """Return the command that makes the requested torque with the least current."""
         wanted = self._inner.command(estimate, reference)
         angle = self._read(estimate).angle
         torque = self._plant.torque_constant * float(wanted.currents[0]) * math.cos(angle)
         bx, _, bz = (attitude_matrix(about_axis_y(angle)) @ self._field.at(estimate.time_ns)).tolist()
-        # The torque about body y is m_z b_x - m_x b_z: most of it from a dipole normal to the field.
+        # The torque about body y is m_z b_x - m_x b_z, largest for a dipole normal to the field.
         each = torque / (self._dipole * (bx * bx + bz * bz))
         currents = np.array([-each * bz, 0.0, each * bx])
         excess = float(np.abs(currents).max()) / self._plant.current_limit
@@ -677,5 +686,5 @@ class CageTracker:
         return CoilCommand(self._dipole * currents, currents, wanted.saturated or excess > 1.0)
 
     def reset(self) -> None:
-        """Discard integrated errors."""
+        """Discard the inner tracker's integrated errors."""
         self._inner.reset()
