@@ -1,1 +1,1 @@
-"""Quaternions, directions and array types; attitude from directions, the Earth, and the star catalogue."""
+"""Astronomy and attitude: quaternions, attitude from directions, Earth and Sun models, star catalogue."""

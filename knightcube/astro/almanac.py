@@ -1,7 +1,7 @@
-"""Sun, magnetic field, eclipse and orbit of a satellite, as plain functions of time and position.
+"""Sun direction, geomagnetic field, eclipse and orbit of a satellite as functions of time and position.
 
-Times are `datetime` instants (UTC without a time zone). Positions and velocities are in ICRS axes from the
-Earth's centre, m and m/s, unless stated otherwise.
+Times are `datetime` objects (UTC without a time zone). Positions and velocities are geocentric, in ICRS axes,
+m and m/s, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from knightcube.errors import UsageError
 
 
 def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
-    """Return the geomagnetic field (3,) T, ICRS axes, at a position in orbit.
+    """Return the geomagnetic field (3,) in ICRS axes, T, at a position in orbit.
 
-    The model is the World Magnetic Model 2025 of degree 12. A call takes 0.2 ms.
+    The model is the World Magnetic Model 2025 (WMM2025) up to degree 12. A call takes 0.2 ms.
 
     Args:
-        time: instant, UTC without a time zone, in the years 2025 to 2030.
-        position: (3,) m from the Earth's centre, ICRS axes.
+        time: UTC without a time zone, in the years 2025 to 2030.
+        position: (3,) geocentric position in ICRS axes, m.
 
     Raises:
         GeomagneticError: outside the years of the model.
@@ -40,13 +40,13 @@ def magnetic_field(time: datetime, position: ArrayLike) -> FloatArray:
 def magnetic_field_on_ground(
     time: datetime, *, latitude: float, longitude: float, height: float = 0.0
 ) -> FloatArray:
-    """Return the geomagnetic field (3,) T, north, east and down, at geodetic coordinates.
+    """Return the north, east and down components (3,) of the geomagnetic field, T, at geodetic coordinates.
 
     Args:
-        time: instant, UTC without a time zone, in the years 2025 to 2030.
+        time: UTC without a time zone, in the years 2025 to 2030.
         latitude: geodetic latitude, rad.
-        longitude: rad, positive towards the east.
-        height: m above the WGS 84 ellipsoid.
+        longitude: longitude, positive towards the east, rad.
+        height: height above the WGS 84 ellipsoid, m.
 
     Raises:
         GeomagneticError: outside the years of the model, or for an invalid position.
@@ -56,10 +56,15 @@ def magnetic_field_on_ground(
 
 
 def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
-    """Return the apparent direction (3,) of the Sun, ICRS, and its distance, m, at a Julian date UTC.
+    """Return the apparent direction (3,) of the Sun in ICRS axes, and its distance, m.
 
-    The observer is at `position` (3,) m and moves with `velocity` (3,) m/s about the Earth. The parallax of a
-    low orbit is 9", the aberration by the Earth's motion 20.5" and by that of the satellite 5".
+    For an observer in a low orbit, the parallax is 9". The aberration is 20.5" by the Earth's motion and 5"
+    by the satellite's motion.
+
+    Args:
+        date: Julian date UTC.
+        position: (3,) geocentric position of the observer in ICRS axes, m.
+        velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
     """
     earth, earth_velocity = earth_from_sun(float(terrestrial_time(date)))
     towards = -earth - position
@@ -71,31 +76,32 @@ def apparent_sun(date: float, position: FloatArray, velocity: FloatArray) -> tup
 def sun_direction(
     time: datetime, position: ArrayLike = (0.0, 0.0, 0.0), velocity: ArrayLike = (0.0, 0.0, 0.0)
 ) -> FloatArray:
-    """Return the apparent direction (3,) of the Sun, a unit vector in ICRS axes.
+    """Return the apparent direction (3,) of the Sun as a unit vector in ICRS axes.
 
-    The Sun's position is that of VSOP2000. Parallax and aberration of the observer are included.
+    The Sun's position is computed by VSOP2000. Parallax and aberration due to the observer's position and
+    velocity are included.
 
     Args:
-        time: instant, UTC without a time zone.
-        position: (3,) m of the observer from the Earth's centre, ICRS axes.
-        velocity: (3,) m/s of the observer about the Earth's centre, ICRS axes.
+        time: UTC without a time zone.
+        position: (3,) geocentric position of the observer in ICRS axes, m.
+        velocity: (3,) geocentric velocity of the observer in ICRS axes, m/s.
     """
     observer, motion = (np.asarray(vector, dtype=float) for vector in (position, velocity))
     return apparent_sun(julian_date(time), observer, motion)[0]
 
 
 def sunlit_fraction(time: datetime, position: ArrayLike, shadow: Shadow = "conical") -> FloatArray:
-    """Return the visible fraction (...) of the Sun's disc: 1 in sunlight, 0 in the umbra of the Earth.
+    """Return the visible fraction (...) of the Sun's disc, which is 1 in sunlight and 0 in the Earth's umbra.
 
-    The Earth is a sphere of its equatorial radius without an atmosphere.
+    The Earth is modelled as a sphere with its equatorial radius and without an atmosphere.
 
     Args:
-        time: instant, UTC without a time zone.
-        position: (..., 3) m from the Earth's centre, ICRS axes.
-        shadow: "conical" includes the penumbra; "cylindrical" gives 0 or 1.
+        time: UTC without a time zone.
+        position: (..., 3) geocentric positions in ICRS axes, m.
+        shadow: shadow model, either "conical" with penumbra, or "cylindrical" with the values 0 and 1 only.
 
     Raises:
-        ValueError: for another kind of shadow.
+        ValueError: for an unknown shadow model.
     """
     sun = -earth_from_sun(float(terrestrial_time(julian_date(time))))[0]
     return sunlit_share(np.asarray(position, dtype=float), sun, shadow)
@@ -110,18 +116,18 @@ def orbit_state(
     argument_of_perigee: float = 0.0,
     true_anomaly: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return position (3,) m and velocity (3,) m/s, ICRS axes, of osculating Kepler elements.
+    """Return the position (3,), m, and velocity (3,), m/s, in ICRS axes for osculating Kepler elements.
 
     Args:
-        semi_major_axis: m.
-        eccentricity: 0 (circle) to below 1.
-        inclination: rad, against the equator of ICRS.
+        semi_major_axis: semi-major axis, m.
+        eccentricity: eccentricity, at least 0 (circle) and below 1.
+        inclination: inclination to the ICRS equator, rad.
         ascending_node: right ascension of the ascending node, rad.
-        argument_of_perigee: rad.
-        true_anomaly: rad.
+        argument_of_perigee: argument of perigee, rad.
+        true_anomaly: true anomaly, rad.
 
     Raises:
-        UsageError: for elements that are not finite or not those of an ellipse outside the Earth.
+        UsageError: for elements that are not finite or whose orbit intersects the Earth.
     """
     angles = (inclination, ascending_node, argument_of_perigee, true_anomaly)
     if not all(map(math.isfinite, (semi_major_axis, eccentricity, *angles))):
@@ -154,16 +160,16 @@ def orbit_state(
 def propagate_orbit(
     position: ArrayLike, velocity: ArrayLike, seconds: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return positions (n, 3) m and velocities (n, 3) m/s at times after (or before) a given state.
+    """Return positions (n, 3), m, and velocities (n, 3), m/s, at times after or before an initial state.
 
-    The forces are those of a spherical Earth and its oblateness J2, integrated by the classical Runge-Kutta
-    method in steps of at most 30 s. The neglected drag and gravity move a satellite in low orbit by about a
-    kilometre in two revolutions.
+    The force model contains the gravity of a spherical Earth and the oblateness term J2. The equations of
+    motion are integrated by the classical Runge-Kutta method in steps of at most 30 s. The neglected forces
+    shift a satellite in a low orbit by about one kilometre in two revolutions.
 
     Args:
-        position: (3,) m, ICRS axes.
-        velocity: (3,) m/s, ICRS axes.
-        seconds: (n,) s from the given state, in increasing or decreasing order.
+        position: (3,) initial position in ICRS axes, m.
+        velocity: (3,) initial velocity in ICRS axes, m/s.
+        seconds: (n,) times relative to the initial state, in increasing or decreasing order, s.
     """
     state, elapsed, states = (
         np.concatenate([np.asarray(position), np.asarray(velocity)]).astype(float),
@@ -178,18 +184,18 @@ def propagate_orbit(
 
 
 def propagate_elements(elements: tuple[str, str], times: Sequence[datetime]) -> tuple[FloatArray, FloatArray]:
-    """Return positions (n, 3) m and velocities (n, 3) m/s, ICRS axes, of two-line elements at `times`.
+    """Return positions (n, 3), m, and velocities (n, 3), m/s, in ICRS axes from a two-line element set.
 
-    The propagator is SGP4; its error is one to three kilometres near the epoch of the elements and grows by
-    about as much per day.
+    The propagator is SGP4. Its error is one to three kilometres near the epoch of the elements, and grows by
+    one to three kilometres per day.
 
     Args:
-        elements: the two lines of an element set.
-        times: instants, UTC without a time zone.
+        elements: the two lines of the element set.
+        times: times in UTC without a time zone.
 
     Raises:
         UsageError: if the lines are not a two-line element set or do not describe an orbit.
-        OrbitError: if SGP4 fails at one of the times, as for an orbit that has decayed.
+        OrbitError: if SGP4 fails at one of the times, for example because the orbit has decayed.
     """
     satellite = TwoLineElements(*elements)
     states = [satellite.at(julian_date(time)) for time in times]

@@ -1,4 +1,4 @@
-"""Array types used throughout the library, selection of rows from records of arrays, and vector products."""
+"""Array types used throughout the library, row selection in dataclasses of arrays, and vector products."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ Record = TypeVar("Record")
 
 
 def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record:
-    """Return a dataclass `record` with the rows that `chosen` picks, by mask (n,) or by index.
+    """Return a copy of a dataclass of arrays (`record`) that contains only the selected rows.
 
-    Fields named `common` belong to all rows and stay as they are.
+    Args:
+        record: dataclass whose fields are arrays with n rows each.
+        chosen: (n,) Boolean mask, or indices of the selected rows.
+        common: names of fields that do not have n rows and remain unchanged.
     """
     picked: dict[str, Any] = {
         field.name: getattr(record, field.name)[chosen]
@@ -33,13 +36,13 @@ def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record
 
 
 def tangent_basis(direction: Iterable[float]) -> FloatArray:
-    """Return two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other.
+    """Return two orthogonal unit vectors (2, 3) perpendicular to a unit vector (3,).
 
-    The two and the direction, in this order, are a right-handed frame.
+    The two vectors and the given vector, in this order, form a right-handed frame.
     """
-    # Floats, because numpy takes ten times as long for one vector.
+    # Python floats are used, because numpy takes ten times as long for a single vector.
     x, y, z = map(float, direction)
-    # Normal to the coordinate axis farthest from the direction.
+    # The first vector is perpendicular to the coordinate axis that is farthest from the given vector.
     farthest = min((abs(x), 0), (abs(y), 1), (abs(z), 2))[1]
     first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[farthest]
     length = math.hypot(*first)
@@ -48,20 +51,20 @@ def tangent_basis(direction: Iterable[float]) -> FloatArray:
 
 
 def cross_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b of vectors (3,), ten times as fast as numpy."""
+    """Return the cross product a x b of vectors (3,). This function is ten times as fast as numpy.cross."""
     ax, ay, az = a.tolist()
     bx, by, bz = b.tolist()
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
 def cross_matrix(vector: FloatArray) -> FloatArray:
-    """Return [v x] (3, 3) of a vector (3,)."""
+    """Return the cross-product matrix [v x] (3, 3) of a vector v (3,)."""
     x, y, z = vector.tolist()
     return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:
-    """Return [v x] (n, 3, 3) of vectors (n, 3)."""
+    """Return the cross-product matrices [v x] (n, 3, 3) of vectors v (n, 3)."""
     matrices = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
     matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x

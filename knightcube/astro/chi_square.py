@@ -1,7 +1,8 @@
-"""Upper quantiles of the chi-square distribution with few degrees of freedom.
+"""Upper quantiles of the chi-square distribution for small numbers of degrees of freedom.
 
-The probability has a closed form (Abramowitz and Stegun 26.4.4, 26.4.5, and 26.4.8 for two more degrees); its
-root is found by bisection. scipy would cost the control process 13 MB for three numbers.
+The upper tail probability has a closed form (Abramowitz and Stegun, 26.4.4, 26.4.5 and 26.4.8), which is
+inverted by bisection. The module scipy.stats is not used, because it would need 13 MB of memory in the
+control process.
 """
 
 from __future__ import annotations
@@ -12,7 +13,12 @@ _BISECTIONS = 200
 
 
 def chance_beyond(x: float, degrees: int) -> float:
-    """Return the probability that a chi-square of `degrees` >= 1 exceeds x >= 0."""
+    """Return the probability that a chi-square variable exceeds x.
+
+    Args:
+        x: threshold, at least 0.
+        degrees: number of degrees of freedom, at least 1.
+    """
     half = 0.5 * x
     chance = math.erfc(math.sqrt(half)) if degrees % 2 else math.exp(-half)
     for below in range(2 - degrees % 2, degrees, 2):
@@ -21,7 +27,12 @@ def chance_beyond(x: float, degrees: int) -> float:
 
 
 def bound(chance: float, degrees: int) -> float:
-    """Return the value that a chi-square of `degrees` exceeds with probability 0 < `chance` <= 1."""
+    """Return the value that a chi-square variable exceeds with a given probability.
+
+    Args:
+        chance: probability, above 0 and at most 1.
+        degrees: number of degrees of freedom, at least 1.
+    """
     low, high = 0.0, 1.0
     while chance_beyond(high, degrees) > chance:
         low, high = high, 2.0 * high

@@ -1,1 +1,1 @@
-"""Methods of the source publications that are not used in flight, for comparison with the methods in use."""
+"""Published methods that the flight does not use, for comparison with the methods in use."""

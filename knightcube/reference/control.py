@@ -1,21 +1,23 @@
-"""PID and adaptive controllers of the angle about the thread, for comparison (Sease 2013, ch. 5).
+"""PID and adaptive controllers of the testbed's rotation angle, for comparison (Sease 2013, ch. 5).
 
-PID (0.15 W on the testbed): the gains are free, or place three poles of a double integrator at -w: 3 w, 3 w^2
-and w^3 on rate, angle and its integral. The reference enters the proportional part with a weight b (two
-degrees of freedom, Astrom and Hagglund 1995, 3.4): with b = 0 a step of the target makes no step of the
-current and no overshoot. The integral stops while the limit is applied and the error would push it further
-(conditional integration). Of the plant the controller uses only the ratio of inertia to torque constant,
-which scales the gains.
+The PID controller (0.15 W on the testbed) has free gains, or gains that place all three poles of a double
+integrator at -w: 3 w on the rate, 3 w^2 on the angle and w^3 on the integral of the angle. The reference
+angle enters the proportional part with a weight b (set-point weighting, Astrom and Hagglund 1995, section
+3.4). With b = 0 a step of the target causes neither a step of the current nor overshoot. The integration
+stops while the current is saturated and the error would increase the saturation (conditional integration).
+The only plant parameter that the PID controller uses is the ratio of inertia to torque constant, which scales
+the gains.
 
-Adaptive (0.66 W): Slotine and Li 1991, 8.5. With the composite error s = e' + l e and a_r = theta_m'' + l e'
-the current
+The adaptive controller (0.66 W on the testbed) follows Slotine and Li 1991, section 8.5. With the composite
+error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the current I is defined by
 
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
-tracks for any inertia, stiffness, damping and constant torque in p (each over the torque constant).
-theta_m follows the target through a critically damped model of second order, so that the body can follow a
-step of the target. p is adapted only while the coil does not saturate and |s| exceeds the level of noise, and
-is bounded, because noise alone would make it drift.
+The parameters p are inertia, stiffness, damping and constant torque, each divided by the torque constant. The
+controller converges for any values of these parameters. The reference angle theta_m follows the target
+through a critically damped second-order model, so that the body can follow a step of the target. The
+parameters p are adapted only while the coil is not saturated and |s| exceeds the noise level. They are
+bounded, because noise alone would make them drift.
 """
 
 from __future__ import annotations
@@ -33,7 +35,13 @@ from knightcube.gnc.guidance.one_axis.plant import PathSample, SingleAxisPlant
 
 @dataclass(frozen=True, slots=True)
 class PidSettings:
-    """The gains on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
+    """PID gains.
+
+    Attributes:
+        proportional: gain on the angle error, 1/s^2.
+        integral: gain on the integral of the angle error, 1/s^3.
+        derivative: gain on the rate error, 1/s.
+    """
 
     proportional: float
     integral: float
@@ -48,19 +56,25 @@ class PidSettings:
 
     @classmethod
     def placed(cls, bandwidth: float) -> PidSettings:
-        """Return the gains that place three poles at -`bandwidth` rad/s."""
+        """Return the gains that place all three closed-loop poles at -`bandwidth`, rad/s."""
         return cls(3.0 * bandwidth**2, bandwidth**3, 3.0 * bandwidth)
 
 
 class PidController:
-    """Owns the integral of the error, rad s."""
+    """PID controller of the angle, whose state is the integral of the angle error, rad s."""
 
     def __init__(
         self, plant: SingleAxisPlant, period: float, gains: PidSettings, target_weight: float
     ) -> None:
-        """Control `plant` every `period` s.
+        """Prepare the controller.
 
-        Raises UsageError when a value is outside its range.
+        Args:
+            plant: testbed parameters, of which inertia, torque constant and current limit are used.
+            period: time between commands, s.
+            gains: PID gains.
+            target_weight: weight b of the reference angle in the proportional part, 0 to 1.
+
+        Raises UsageError if a value is outside its range.
         """
         if not (math.isfinite(period) and period > 0.0):
             raise UsageError(f"PID period is {period}: it must be finite and positive")
@@ -76,9 +90,15 @@ class PidController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
+        """Return the current command for the given state. The estimated disturbance is not used.
 
-        Raises UsageError when an input is not finite.
+        Args:
+            wanted: reference angle, rate and acceleration.
+            angle: measured angle, rad.
+            rate: measured rate, rad/s.
+            disturbance: estimated disturbance, which must be finite.
+
+        Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         # The initial integral cancels the proportional part, so that the first command at rest is zero.
@@ -98,7 +118,7 @@ class PidController:
         return made
 
     def reset(self) -> None:
-        """Clear the integral."""
+        """Reset the integral of the error."""
         self._sum = None
 
 
@@ -110,10 +130,11 @@ class AdaptiveSettings:
     """Settings of the adaptive controller.
 
     Attributes:
-        bandwidth: l in rad/s; also the gain on s, in s^-1.
-        adaptation: rate of adaptation of p: its gain over the square of each parameter's range, s/rad^2.
-        reference_bandwidth: of the reference model, rad/s; None follows the commanded motion directly.
-        dead_zone: rad/s; p is not adapted while |s| is below.
+        bandwidth: factor l in the composite error s = e' + l e, rad/s; also the gain on s, 1/s.
+        adaptation: adaptation gain relative to the square of each parameter's range, s/rad^2.
+        reference_bandwidth: bandwidth of the reference model, rad/s; None to follow the commanded motion
+            directly.
+        dead_zone: minimum |s| for adaptation of the parameters, rad/s.
     """
 
     bandwidth: float
@@ -130,12 +151,21 @@ class AdaptiveSettings:
 
 
 class AdaptiveController:
-    """Owns the parameters p (4,) in A s^2, A, A s and A, and the reference model's state."""
+    """Adaptive controller, whose state is the adapted parameters and the state of the reference model.
+
+    The parameters (4,) are inertia (A s^2), stiffness (A), damping (A s) and constant torque (A), each
+    divided by the torque constant.
+    """
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
-        """Begin with the plant's inertia, stiffness and damping; `period` in s between commands.
+        """Begin with the plant's inertia, stiffness and damping as parameters.
 
-        Raises UsageError when the period is not positive.
+        Args:
+            plant: testbed parameters.
+            period: time between commands, s.
+            settings: settings of the controller.
+
+        Raises UsageError if the period is not positive.
         """
         if not (math.isfinite(period) and period > 0.0):
             raise UsageError(f"adaptive period is {period}: it must be finite and positive")
@@ -145,7 +175,7 @@ class AdaptiveController:
         inertia = plant.inertia / plant.torque_constant
         self._gain = inertia * settings.bandwidth
         begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
-        # Half the coil's strength at one radian, and at one radian in five seconds.
+        # Stiffness and damping may use half the maximum current at 1 rad and at 0.2 rad/s, respectively.
         self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
         self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
         self._high = begin + self._range
@@ -155,9 +185,15 @@ class AdaptiveController:
     def command(
         self, wanted: PathSample, angle: float, rate: float, disturbance: float = 0.0
     ) -> CurrentCommand:
-        """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
+        """Return the current command for the given state. The estimated disturbance is not used.
 
-        Raises UsageError when an input is not finite.
+        Args:
+            wanted: reference angle, rate and acceleration.
+            angle: measured angle, rad.
+            rate: measured rate, rad/s.
+            disturbance: estimated disturbance, which must be finite.
+
+        Raises UsageError if an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         cosine = math.cos(angle)
@@ -175,11 +211,11 @@ class AdaptiveController:
         return made
 
     def reset(self) -> None:
-        """Restart the reference model from the body's state at the next command; p is kept."""
+        """Restart the reference model from the body's state at the next command. The parameters are kept."""
         self._model = None
 
     def _follow(self, wanted: PathSample, angle: float, rate: float) -> PathSample:
-        """Return the reference model's motion and propagate the model by one period."""
+        """Return the current motion of the reference model, and propagate the model by one period."""
         w = self._settings.reference_bandwidth
         if w is None:
             return wanted

@@ -1,26 +1,29 @@
-"""Nadir by the methods of Meller et al., chapter 3, to compare with `knightcube.vision.horizon`.
+"""Nadir by the methods of Meller et al., chapter 3, for comparison with `knightcube.vision.horizon`.
 
-Edges (3.1): a scan line is divided by the average of its high intensities and rounded to 0 or 1. Fluctuations
-shorter than a run are filtered out. The first change from 0 to 1 is the edge.
+Edge detection (Meller et al., section 3.1): A scan line is divided by the average of its high intensities and
+rounded to 0 or 1. Short fluctuations are filtered out. The first change from 0 to 1 is the edge.
 
-Circle (3.2.1): centre and radius of the horizon's circle by the pseudo-inverse. It assumes an image without
-distortion and a horizon that is a circle on a flat detector, which holds near the optical axis only. The
-paper does not state the side from which to scan: here it is the darkest border. Nor does it state how the
-circle of one camera gives nadir. Here, as in its successors, the point of the circle closest to the optical
-axis is on the limb, and nadir lies the Earth's half-angle beyond that point towards the centre of the circle.
-The distortion of the lens is removed first. The method does not distinguish limb and terminator.
+Circle fit (Meller et al., section 3.2.1): The centre and radius of the horizon circle are computed by a
+pseudo-inverse. The method assumes that the image has no distortion and that the horizon is a circle on the
+flat detector, which is valid near the optical axis only. The paper does not state from which side the image
+is scanned; this implementation scans from the darkest border. The paper does not state how to compute nadir
+from the circle of one camera either. Here the point of the circle closest to the optical axis is assumed to
+lie on the limb. Nadir lies in the direction from this point to the centre of the circle, at the angular
+radius of the Earth from the point. Lens distortion is removed first. The method does not distinguish between
+limb and terminator.
 
-Graphic Method (3.2.2, Fig. 10): the limb is a circle in the horizon plane, whose distance below the satellite
-follows from the altitude. Each camera's optical axis passes through the body's origin, so that the plane of
-its centre column holds the body's z axis and cuts the horizon plane in a line. Two such lines cross at Z, the
-point below the satellite on that axis. The vector from Z to the circle's centre gives the angle between axis
-and nadir. The paper does not state the ratio of pixels to kilometres. Here it is the ratio of the distance
-(px) of the circle's centre below the optical axis to the distance (km) of the horizon plane below the
-satellite, which is exact to first order in the tilt for level cameras, and for any tilt about an optical
-axis.
+Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
+distance below the satellite follows from the altitude. The plane through the centre column of a camera image
+contains the body's z axis and intersects the horizon plane in a line. The lines of two cameras intersect in a
+point Z on the body's z axis. The vector from Z to the centre of the circle gives the angle between the z axis
+and nadir. The paper does not state the ratio of pixels to kilometres. This implementation uses the distance
+of the circle's centre below the optical axis (px), divided by the distance of the horizon plane below the
+satellite (km). For level cameras this ratio is exact to first order in the tilt, and for tilts about an
+optical axis it is exact.
 
-Vector Method (3.2.2, equation 6): if a point on the horizon moves from Q to P, the shortest rotation from Q
-to P rotates the old nadir to the new nadir. A rotation of the body about P is not observed.
+Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from Q to P, the
+shortest rotation from Q to P rotates the old nadir to the new nadir. A rotation of the body about P is not
+observable.
 """
 
 from __future__ import annotations
@@ -39,9 +42,10 @@ from knightcube.vision.horizon.limb import MEAN_RADIUS, UNIT_DEPTH_HEIGHT
 
 
 def high_average(lines: Image) -> FloatArray:
-    """Return the average high intensity (n,) of lines (n, m): the mean of the values above mid-range.
+    """Return the average high intensity (n,) of scan lines (n, m).
 
-    The paper does not define high; here it is above the mean of the minimum and the maximum of a line.
+    Meller et al. do not define a high intensity. Here an intensity is high if it is at least the mean of the
+    line's minimum and maximum.
     """
     values = np.asarray(lines, dtype=float)
     middle = 0.5 * (values.min(axis=1, keepdims=True) + values.max(axis=1, keepdims=True))
@@ -50,42 +54,46 @@ def high_average(lines: Image) -> FloatArray:
 
 
 def binarised(lines: Image, high: FloatArray) -> BoolArray:
-    """Return lines (n, m) divided by their high averages (n,) and rounded to 0 or 1 (step 1 of 3.1)."""
+    """Return scan lines (n, m) divided by their high averages (n,) and rounded to 0 or 1.
+
+    This is step 1 in section 3.1 of Meller et al.
+    """
     return np.asarray(lines >= 0.5 * np.asarray(high)[:, None])
 
 
 def first_edges(binary: BoolArray) -> IntArray:
-    """Return the index (n,) of the first 1 after a 0 in each binary line (n, m); -1 if there is none."""
+    """Return the index (n,) of the first change from 0 to 1 in each binary line (n, m), -1 for no change."""
     rises = binary[:, 1:] & ~binary[:, :-1]
     return np.where(np.any(rises, axis=1), np.argmax(rises, axis=1) + 1, -1)
 
 
 def horizon_points(lines: Image) -> IntArray:
-    """Return the edge (n,) of each line (n, m) after normalisation, binarisation and filter; -1 for none."""
+    """Return the edge positions (n,) in scan lines (n, m), -1 for a line without an edge."""
     return first_edges(run_filtered(binarised(lines, high_average(lines)), RUN))
 
 
 class NoCircleError(FlightError):
-    """Raised for points that lie on no circle: fewer than three, or points on one line."""
+    """Raised for points that define no circle: fewer than three points, or collinear points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HorizonCircle:
-    """A circle: centre (2,) and radius in the unit of its points."""
+    """Circle fitted to horizon points: centre (2,) and radius, in the unit of the points."""
 
     centre: FloatArray
     radius: float
 
     def distances(self, points: FloatArray) -> FloatArray:
-        """Return the distances (n,) of points (n, 2) outside the circle; negative inside."""
+        """Return the distances (n,) of points (n, 2) from the circle, negative for points inside."""
         return np.asarray(np.linalg.norm(points - self.centre, axis=-1) - self.radius)
 
 
 def fit_circle(points: FloatArray) -> HorizonCircle:
-    """Return the circle through points (n, 2), n >= 3, by equations (3) to (5) and (2).
+    """Return the least-squares circle through points (n, 2), by equations (2) to (5) of Meller et al.
 
-    Each row pairs a point with the next one, and the last with the first. The circle is exact for three
-    points; for more points the radius is the root mean square of (2). Raises NoCircleError.
+    Each row of the linear system contains a point and the next point, cyclically. For three points the circle
+    is exact. For more points the radius is the RMS distance of the points from the centre. Raises
+    NoCircleError for fewer than three points and for collinear points.
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:
@@ -101,23 +109,24 @@ def fit_circle(points: FloatArray) -> HorizonCircle:
 
 
 LINES = 3
-"""Default number of scanned lines, as in the example of Meller et al."""
+"""Default number of scan lines, as in the example of Meller et al."""
 _ON_AXIS = 1e-6
-"""Distance (px) between optical axis and centre below which nadir lies on the axis."""
+"""Distance (px) between optical axis and circle centre below which nadir is assumed on the optical axis."""
 
 
 class NoHorizonError(FlightError):
-    """Raised if the scanned lines have no edges, or if their edges lie on no circle."""
+    """Raised if the scan lines contain too few edges, or if the edges define no circle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScannedHorizon:
-    """A circle through the edges in an image.
+    """Horizon edges in an image and the circle through these edges.
 
     Attributes:
-        points: (n, 2) px, edges in the image.
-        circle: px of the ideal pinhole camera of the same focal length (`CameraModel.ideal`).
-        middle: (3,) unit vector, camera axes, to the edge closest to the optical axis.
+        points: (n, 2) edge positions in the image, px.
+        circle: circle in the image of an ideal pinhole camera with the same focal length
+            (`CameraModel.ideal`), px.
+        middle: (3,) unit vector in camera axes to the edge closest to the optical axis.
     """
 
     points: FloatArray
@@ -126,7 +135,7 @@ class ScannedHorizon:
 
 
 def scan_horizon(frame: Image, camera: CameraModel, lines: int = LINES) -> ScannedHorizon:
-    """Return the circle through the first edges of `lines` lines of a frame. Raises NoHorizonError."""
+    """Return the circle through the first edges in scan lines of an image. Raises NoHorizonError."""
     points = _first_edges(frame, lines)
     rays = camera.unit_vectors(points) if len(points) else np.zeros((0, 3))
     seen = np.isfinite(rays[:, 0])
@@ -141,7 +150,13 @@ def scan_horizon(frame: Image, camera: CameraModel, lines: int = LINES) -> Scann
 
 
 def circle_nadir(circle: HorizonCircle, camera: CameraModel, altitude: float) -> FloatArray:
-    """Return nadir (3,), camera axes, from a horizon circle (px of the ideal pinhole); altitude in m."""
+    """Return the nadir direction (3,) in camera axes.
+
+    Args:
+        circle: horizon circle in the image of the ideal pinhole camera, px.
+        camera: model of the camera.
+        altitude: altitude of the satellite, m.
+    """
     off = circle.centre - np.array(camera.ideal.centre)
     distance = float(np.linalg.norm(off))
     towards = off / distance if distance > _ON_AXIS else np.array([1.0, 0.0])
@@ -151,7 +166,7 @@ def circle_nadir(circle: HorizonCircle, camera: CameraModel, altitude: float) ->
 
 
 def _first_edges(frame: Image, lines: int) -> FloatArray:
-    """Return the first edges (n, 2) px of evenly spaced lines, scanned from the darkest border."""
+    """Return the first edges (n, 2), px, in evenly spaced lines that are scanned from the darkest border."""
     rows, columns = frame.shape
     depth = max(1, min(rows, columns) // 8)
     borders = (frame[:depth], frame[-depth:], frame[:, :depth], frame[:, -depth:])
@@ -166,20 +181,20 @@ def _first_edges(frame: Image, lines: int) -> FloatArray:
 
 
 _MINIMUM_SINE = 0.1
-"""Smallest sine of the angle between the centre planes of the cameras."""
+"""Minimum sine of the angle between the planes through the centre columns of the two cameras."""
 
 
 class GraphicMethodError(FlightError):
-    """Raised if the centre columns do not cross: the cameras point in the same or in opposite directions."""
+    """Raised if the cameras point in nearly the same or opposite directions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LevelCamera:
-    """A camera with its boresight normal to the body's z axis and its rows down along that axis.
+    """Camera whose boresight is perpendicular to the body's z axis and whose y axis is parallel to that axis.
 
     Attributes:
-        right: (2,) body x and y components of the camera's x axis, a unit vector.
-        axis: pixel (x, y) of the optical axis.
+        right: (2,) body x and y components of the camera's x axis, which is a unit vector.
+        axis: position (x, y) of the optical axis in the image, px.
     """
 
     right: FloatArray
@@ -187,7 +202,7 @@ class LevelCamera:
 
 
 def horizon_plane_depth(altitude: float) -> float:
-    """Return the distance (m) of the limb's plane below the satellite: d - R^2/d with d = R + altitude."""
+    """Return the distance (m) of the horizon plane below the satellite: d - R^2/d with d = R + altitude."""
     distance = MEAN_RADIUS + altitude
     return distance - MEAN_RADIUS**2 / distance
 
@@ -195,9 +210,14 @@ def horizon_plane_depth(altitude: float) -> float:
 def graphic_nadir(
     cameras: tuple[LevelCamera, LevelCamera], horizons: tuple[HorizonCircle, HorizonCircle], altitude: float
 ) -> FloatArray:
-    """Return nadir (3,), body axes, from the horizon circles (px) of two cameras; altitude in m.
+    """Return the nadir direction (3,) in body axes by the Graphic Method.
 
-    Raises GraphicMethodError if the centre columns of the cameras are nearly parallel.
+    Args:
+        cameras: the two cameras.
+        horizons: horizon circle in the image of each camera, px.
+        altitude: altitude of the satellite, m.
+
+    Raises GraphicMethodError if the boresights of the cameras are nearly parallel.
     """
     depth = horizon_plane_depth(altitude)
     across = np.stack([camera.right for camera in cameras])
@@ -213,5 +233,9 @@ def graphic_nadir(
 
 
 def propagated_nadir(previous: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return N = [R] N_o (3,); R is the shortest rotation from the unit vector `before` to `after`, (3,)."""
+    """Return the nadir direction (3,) by the Vector Method.
+
+    The previous nadir is rotated by the shortest rotation from `before` to `after`, the directions (3,) of a
+    horizon point at the previous and at the current time.
+    """
     return np.asarray(shortest_turn(before, after) @ previous)

@@ -1,35 +1,46 @@
-"""The classical methods of star identification (Michalski 3.2), and `METHODS`, all methods by name.
+"""Classical methods of star identification (Michalski, section 3.2), for comparison with the default method.
 
-A method yields batches of candidates: observed stars and the guide stars that they may be. Each candidate
-gives an attitude. The brightest observed stars are transformed to the sky by it, and those that fall near
-guide stars are counted. The candidates with the highest counts are verified against the whole field by
-`knightcube.vision.startracker.verification`, which rejects false candidates of any method. A
-field of uncertain scale is searched at several scales (`ScaledField`).
+Each method proposes candidates, which assign guide stars to some observed stars and thereby define an
+attitude. With this attitude the brightest observed stars are transformed to the sky, and the stars close to
+guide stars are counted. The candidates with the highest counts are verified with all observed stars by
+`knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
+the field is searched at several scales (`ScaledField`).
 
-- Angle matching (3.2.1; Gottlieb in Wertz 1978, 7.7): the triangles of the brightest observed stars are taken
-  in order of brightness. Pairs of guide stars with the angles of two sides are joined at the star that they
-  share; those with the right third angle are candidates.
-- Triangles by area and polar moment (3.2.2, 3.2.3; Cole & Crassidis 2004, 2006): the area of an observed
-  triangle, plus and minus its propagated standard deviation, is a range of the table's k-vector. Candidates
-  are the triangles in this range whose polar moment and sides, in order of length, agree too. The sources
-  pivot to a neighbouring triangle when several remain; here each of them is compared with the field.
-- Pyramid (3.2.4; Mortari, Samaan, Bruccoleri & Junkins, Navigation 51, 2004): triangles are cycled so that no
-  observed star stays in many consecutive triangles and a false star spoils few of them. A matched triangle
-  becomes a pyramid if a fourth observed star has a guide star at the right angle from all three corners. Only
-  pyramids are candidates; the fourth star makes chance matches rare.
-- Rate matching (3.2.5): Michalski gives a title and one reference, Samaan, Mortari & Junkins, Recursive mode
-  star identification algorithms (IEEE TAES 41, 2005). Two frames, or the ends of streaks, give each point its
-  velocity across the sky. A star fixed in the sky moves as v' = -w x v with the body rate w that all stars
-  share; satellites, hot pixels and planes do not and are excluded. A previous attitude, rotated by that rate,
-  predicts the position of each star; without one, the pyramid identifies the remaining points.
-- Geometric voting (3.2.6; Kolomenkin, Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008): every pair of
-  observed stars votes. A guide star with a partner at the pair's angle gets one vote for being either of the
-  two, however many partners it has; if each partner counted, crowded parts of the sky would outvote the true
-  stars from 0.3 px of noise on. The assignments with the most votes then vote among themselves: those whose
-  angles agree belong together, and the largest such family is the candidate.
-- Grid (3.2.7; Padgett & Kreutz-Delgado, IEEE TAES 33, 1997): the pattern of each observed star is compared
-  with those of all guide stars by counting the cells occupied in both. The neighbour that aligns a pattern
-  may be false, or its guide star missing, so the next neighbours are tried too.
+- Angle matching (Michalski, section 3.2.1; Gottlieb in Wertz 1978, section 7.7): The triangles of the
+brightest
+  observed stars are processed in order of brightness. Two pairs of guide stars with the angles of two sides
+  are joined if they share a star. The joined pairs are a candidate if the third angle matches as well.
+- Triangles by area and polar moment (Michalski, sections 3.2.2 and 3.2.3; Cole & Crassidis 2004, 2006): The
+area of
+  an observed triangle and its propagated standard deviation define a range of areas in the table of guide
+  star triangles. The triangles in this range whose polar moment and side lengths match are candidates. If
+  several triangles match, the sources pivot to a neighbouring triangle, while this implementation tests all
+  of them.
+- Pyramid (Michalski, section 3.2.4; Mortari, Samaan, Bruccoleri & Junkins, Navigation 51, 2004): The
+triangles are
+  ordered so that no observed star occurs in many consecutive triangles, which limits the effect of a false
+  star. A matched triangle becomes a pyramid if the angles between a fourth observed star and all three
+  corners match as well. Only pyramids are candidates, because the fourth star makes chance matches rare.
+- Rate matching (Michalski, section 3.2.5; Samaan, Mortari & Junkins, Recursive mode star identification
+algorithms,
+  IEEE TAES 41, 2005): Two frames, or the ends of streaks, give the velocity of each observed point. A fixed
+  star moves as v' = -w x v, with a body rate w that is common to all stars. Satellites, hot pixels and planes
+  move differently and are excluded. A previous attitude, propagated by the body rate, predicts the position
+  of each star. Without a previous attitude, the pyramid method identifies the remaining points.
+- Geometric voting (Michalski, section 3.2.6; Kolomenkin, Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008):
+For
+  each pair of observed stars, each guide star with a partner at the pair's angle gets one vote for each of
+  the two observed stars. The number of partners is ignored, because otherwise crowded regions of the sky
+  would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments with the most votes
+  support each other if the angles between their stars agree. The largest group of consistent assignments is
+  the candidate.
+- Grid (Michalski, section 3.2.7; Padgett & Kreutz-Delgado, IEEE TAES 33, 1997): The grid pattern of each
+observed star
+  is compared with the patterns of all guide stars by counting the cells that both patterns occupy. The
+  neighbour that aligns a pattern may be a false star or missing in the catalogue, so that several neighbours
+  are tried.
+
+The dictionary `METHODS` contains all methods by name.
 """
 
 from __future__ import annotations
@@ -77,19 +88,18 @@ from knightcube.vision.startracker.verification import (
 
 @dataclass(frozen=True, slots=True)
 class ClassicalSettings:
-    """Settings of all methods; each method uses a part of them.
+    """Settings of the classical methods. Each method uses some of these settings.
 
     Attributes:
-        brightest: number of the brightest observed stars from which patterns are made.
-        tolerance: of an angle, an area or a moment, in its sigmas.
-        patterns: largest number of triangles or pivots that are looked up in a table.
-        joins: largest number of triangles made of pairs, over all scales. A join takes half a millisecond,
-            and a list of stars without a match needs all joins.
-        candidates: largest number of candidates of all patterns that are compared with the field.
+        brightest: number of the brightest observed stars from which patterns are formed.
+        tolerance: tolerance of angles, areas and moments, in standard deviations.
+        patterns: maximum number of triangles or grid patterns that are looked up in a table.
+        joins: maximum number of triangles formed from star pairs, over all scales; a triangle takes 0.5 ms.
+        candidates: maximum number of candidates per scale that are compared with the field.
         screened: number of the brightest observed stars with which a candidate is compared first.
-        verified: largest number of candidates of a pattern that are verified with the whole field.
-        scale_step: relative half width of the scales that one look-up covers.
-        scales: largest number of look-ups; a field that would need more is rejected.
+        verified: maximum number of candidates of a pattern that are verified with all observed stars.
+        scale_step: relative half width of the interval of image scales that one search covers.
+        scales: maximum number of searched image scales; a field that needs more is rejected.
         verification: conditions for the acceptance of a candidate.
     """
 
@@ -109,20 +119,23 @@ DEFAULT = ClassicalSettings()
 
 
 class FieldUnknown(FlightError):
-    """Raised for a field of view too uncertain for the classical methods; the default method solves it."""
+    """Raised if the image scale is too uncertain for the classical methods.
+
+    The default method can solve such a field.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaledField:
-    """A field at one scale.
+    """Star field at one assumed image scale.
 
     Attributes:
-        field: the field as given.
-        scale: factor on the tangents of the field.
-        direction: (n, 3) unit vectors of the scaled field.
-        sigma: (n,) rad.
-        slack: relative error of angles by the error of the scale.
-        stars: number of the brightest stars from which patterns are made.
+        field: original star field.
+        scale: factor by which the tangents of the field angles are multiplied.
+        direction: (n, 3) unit vectors to the observed stars at this scale.
+        sigma: (n,) standard deviations of the directions, rad.
+        slack: relative error of angles that the uncertainty of the scale causes.
+        stars: number of the brightest observed stars from which patterns are formed.
     """
 
     field: StarField
@@ -135,9 +148,15 @@ class ScaledField:
     def angles(
         self, one: IntArray, other: IntArray, tolerance: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the angles (k,) between observed stars, and the limits (k,), (k,) of the true ones.
+        """Return the angles (k,) between observed stars, with lower and upper limits (k,) of the true angles.
 
-        The limits add `tolerance` sigmas (31: the sum of both variances along the arc) and the slack.
+        The limits allow for the error of the scale, and for `tolerance` standard deviations of the angle
+        (Michalski, eq. 31).
+
+        Args:
+            one: (k,) indices of the first observed stars.
+            other: (k,) indices of the second observed stars.
+            tolerance: tolerance of the angles in standard deviations.
         """
         angle = angles(self.direction[one], self.direction[other])
         off = tolerance * np.hypot(self.sigma[one], self.sigma[other]) + self.slack * angle
@@ -145,9 +164,9 @@ class ScaledField:
 
 
 def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField]:
-    """Yield the field at the scales that cover its range, the most likely first.
+    """Yield the field at image scales that cover the uncertainty of its scale, most likely scale first.
 
-    Raises FieldUnknown when the range needs more scales than the settings allow.
+    Raises FieldUnknown if more scales are needed than the settings allow.
     """
     low, high = (math.log(edge) for edge in field.scale)
     steps = max(1, math.ceil((high - low) / (2.0 * settings.scale_step) - 1e-9))
@@ -173,11 +192,12 @@ def views(field: StarField, settings: ClassicalSettings) -> Iterator[ScaledField
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Patterns of observed stars that match patterns of guide stars.
+    """Candidates of an identification: patterns of observed stars that match patterns of guide stars.
 
     Attributes:
-        observed: (k, m) indices of observed stars, m >= 2. The first two fix the attitude and are far apart.
-        star: (k, m) indices of guide stars.
+        observed: (k, m) indices of at least two observed stars for each of the k candidates. The first two
+            stars of a candidate define the attitude.
+        star: (k, m) indices of the assigned guide stars.
     """
 
     observed: IntArray
@@ -188,7 +208,7 @@ class Candidates:
 
 
 _LEAST_BASE = 10.0
-"""Smallest separation of the first two stars of a candidate, in sigmas of a direction."""
+"""Minimum distance between the first two stars of a candidate, in standard deviations of a direction."""
 _LEAST_JOINS = 4
 Propose = Callable[[ScaledField, KnownSky, ClassicalSettings], Iterator[Candidates]]
 
@@ -196,9 +216,15 @@ Propose = Callable[[ScaledField, KnownSky, ClassicalSettings], Iterator[Candidat
 def search(
     field: StarField, sky: KnownSky, propose: Propose, settings: ClassicalSettings = DEFAULT
 ) -> StarMatch:
-    """Return the identification of the first candidate of `propose` that the whole field verifies.
+    """Return the first candidate of a method that passes the verification with all observed stars.
 
-    Raises FieldUnknown when the scale of the field is too uncertain.
+    Raises FieldUnknown if the image scale is too uncertain.
+
+    Args:
+        field: observed stars.
+        sky: guide stars and tables of their patterns.
+        propose: function of the method that yields candidates.
+        settings: settings of the method.
     """
     if len(field) < settings.verification.least_matches:
         return nothing(field, MatchStatus.TOO_FEW_STARS)
@@ -220,11 +246,11 @@ def search(
 def _best(
     view: ScaledField, sky: KnownSky, candidates: Candidates, taken: int, settings: ClassicalSettings
 ) -> StarMatch | None:
-    """Return the first of `taken` candidates that is verified, in descending order of supporting stars."""
+    """Return the first verified candidate of the first `taken` ones, in order of decreasing support."""
     if not taken:
         return None
     observed, star = candidates.observed[:taken], candidates.star[:taken]
-    # Two points closer than their errors fix no attitude, nor does the same guide star twice.
+    # Two very close observed stars, or the same guide star twice, do not define an attitude.
     base = view.direction[observed[:, 0]] - view.direction[observed[:, 1]]
     apart = np.linalg.norm(base, axis=-1) > _LEAST_BASE * view.sigma.max()
     apart &= star[:, 0] != star[:, 1]
@@ -250,7 +276,10 @@ def _best(
 
 
 def attitudes(observed: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the attitudes (k, 3, 3) that rotate reference pairs (k, 2, 3) onto observed ones."""
+    """Return the attitude matrices (k, 3, 3) that rotate pairs of reference directions onto observed pairs.
+
+    Both arguments (k, 2, 3) contain the unit vectors of k pairs.
+    """
     return np.swapaxes(_frames(observed), -1, -2) @ _frames(reference)
 
 
@@ -265,14 +294,14 @@ def _frames(pairs: FloatArray) -> FloatArray:
 def _support(
     view: ScaledField, sky: KnownSky, matrices: FloatArray, observed: IntArray, settings: ClassicalSettings
 ) -> IntArray:
-    """Return the number of bright observed stars that each attitude (k, 3, 3) maps close to a guide star."""
+    """Return for each attitude (k, 3, 3) the number of bright observed stars close to a guide star."""
     seen = view.direction[: settings.screened]
     pair = view.direction[observed[:, :2]]
     base = np.linalg.norm(pair[:, 0] - pair[:, 1], axis=-1)
     middle = 0.5 * (pair[:, 0] + pair[:, 1])
     lever = np.linalg.norm(seen[None] - middle[:, None], axis=-1)
     sigma = float(view.sigma.max())
-    # A star's error consists of its own error, and of the base's rotation error times the lever arm.
+    # The error of a star's position includes the attitude error of the pair times the distance from the pair.
     gate = settings.tolerance * sigma * np.sqrt(1.5 + 2.0 * (lever / base[:, None]) ** 2)
     gate = np.minimum(gate + view.slack * lever, 0.25 * math.atan(min(sky.half_width)))
     distance, _ = sky.tree.query(seen @ matrices, distance_upper_bound=float(gate.max()))
@@ -280,7 +309,7 @@ def _support(
 
 
 def propose_angles(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the matching triangles, in order of the brightness of the observed stars."""
+    """Yield candidates by angle matching, in order of the brightness of the observed stars."""
     triangles = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
     for corners in triangles[: settings.joins]:
         found = matching_triangles(view, sky, corners, settings.tolerance)
@@ -290,10 +319,10 @@ def propose_angles(view: ScaledField, sky: KnownSky, settings: ClassicalSettings
 def matching_triangles(
     view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], tolerance: float
 ) -> IntArray:
-    """Return guide stars (k, 3) that match the observed `corners` in angles and orientation.
+    """Return guide star triangles (k, 3) that match an observed triangle in angles and orientation.
 
-    Pairs with the angles of the first and the second side are joined at a shared star; the third angle is
-    compared as a cosine.
+    Pairs of guide stars that match the first and the second side are joined at their common star. The third
+    side is then compared by the cosine of its angle.
     """
     pivot, second, third = corners
     one, other = np.array([pivot, pivot, second]), np.array([second, third, third])
@@ -303,7 +332,7 @@ def matching_triangles(
     a1, b1, a2, c2 = a[first], b[first], a[~first], b[~first]
     place, of = shared(a1, a2)
     triangles = np.stack([a1[of], b1[of], c2[place]], axis=-1)
-    # A range beyond zero or pi is clipped, because the cosine is not monotonic there.
+    # Angle limits beyond 0 or pi are clipped, because the cosine is not monotonic there.
     alike = within(sky, triangles[:, 1], triangles[:, 2], low[2], high[2])
     triangles = triangles[alike & (triangles[:, 1] != triangles[:, 2])]
     same_orientation = _turns_left(sky.stars.direction[triangles]) == _turns_left(
@@ -313,7 +342,7 @@ def matching_triangles(
 
 
 def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all pairs of indices (k,) in `right` and (k,) in `left` with equal values."""
+    """Return the indices (k,) into `right` and (k,) into `left` of all pairs of equal values."""
     order = np.argsort(right, kind="stable")
     ranked = right[order]
     place, of = members(np.searchsorted(ranked, left), np.searchsorted(ranked, left, side="right"))
@@ -321,7 +350,7 @@ def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return which pairs of guide stars (k,) have an angle within limits."""
+    """Return for each pair of guide stars (k,) whether its angle lies between `low` and `high` (rad)."""
     direction = sky.stars.direction
     cosine = np.einsum("kx,kx->k", direction[one], direction[other])
     minimum, maximum = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
@@ -329,13 +358,13 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
 
 
 def _turns_left(corners: FloatArray) -> BoolArray:
-    """Return which triangles (k, 3, 3) have counterclockwise corners, seen from the centre of the sphere."""
+    """Return for triangles (k, 3, 3) whether the corners (a, b, c) are ordered so that a . (b x c) > 0."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)
 
 
 def propose_pyramids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the matching pyramids, triangle by triangle."""
+    """Yield candidates by the pyramid method, in batches for each observed triangle."""
     for corners in islice(cycled_triangles(view.stars), settings.joins):
         found = matching_triangles(view, sky, corners, settings.tolerance)
         if len(found):
@@ -343,7 +372,10 @@ def propose_pyramids(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
 
 
 def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
-    """Yield all triangles of `stars` stars in the order of the source: by the steps between their indices."""
+    """Yield the triangles of `stars` stars in the order of the pyramid method (Mortari et al. 2004).
+
+    The triangles are ordered by the differences between the indices of their stars.
+    """
     for step in range(1, stars - 1):
         for further in range(1, stars - step):
             for pivot in range(stars - step - further):
@@ -353,7 +385,7 @@ def cycled_triangles(stars: int) -> Iterator[tuple[int, int, int]]:
 def _pyramids(
     view: ScaledField, sky: KnownSky, corners: tuple[int, int, int], found: IntArray, tolerance: float
 ) -> Candidates:
-    """Return the triangles `found` (k, 3) that a fourth star confirms, each once."""
+    """Return the matched triangles `found` (k, 3) that a fourth star confirms, with this star."""
     rest = np.setdiff1d(np.arange(view.stars), corners)
     pivot = np.full(len(rest), corners[0])
     _, low, high = view.angles(pivot, rest, tolerance)
@@ -370,7 +402,7 @@ def _pyramids(
         alike &= within(sky, found[of, corner], fourth, low[owner], high[owner])
     triangles, fourth, owner = found[of[alike]], fourth[alike], owner[alike]
     observed = np.column_stack([np.tile(corners, (len(owner), 1)), rest[owner]])
-    # One pyramid per triangle is enough, because verification uses the other stars.
+    # One pyramid per triangle is enough, because the verification uses all other stars.
     _, once = np.unique(triangles, axis=0, return_index=True)
     return Candidates(observed[once], np.column_stack([triangles, fourth])[once])
 
@@ -379,12 +411,12 @@ _BATCH = 10
 
 
 def propose_planar(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the matching plane triangles."""
+    """Yield candidates by matching of planar triangles."""
     return _propose_triangles(view, sky, settings, sky.planar, measured_planar_shape)
 
 
 def propose_spherical(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the matching spherical triangles."""
+    """Yield candidates by matching of spherical triangles."""
     return _propose_triangles(view, sky, settings, sky.spherical, measured_spherical_shape)
 
 
@@ -395,7 +427,7 @@ def _propose_triangles(
     table: TriangleTable,
     measure: MeasuredShape,
 ) -> Iterator[Candidates]:
-    """Yield the matches in batches of triangles, those of the brightest stars first."""
+    """Yield matching triangles in batches, beginning with the triangles of the brightest observed stars."""
     chosen = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
     triangles = np.array(chosen[: settings.patterns], dtype=np.int64).reshape(-1, 3)
     for begin in range(0, len(triangles), _BATCH):
@@ -412,8 +444,8 @@ def _triangle_matches(
     found: TriangleShape,
     tolerance: float,
 ) -> Candidates:
-    """Return the triangles of the table that match the observed ones (t, 3)."""
-    # An area grows as the square of the scale, a polar moment as its fourth power.
+    """Return the guide star triangles in a table that match observed triangles (t, 3)."""
+    # The area of a triangle is proportional to the scale squared, the polar moment to its fourth power.
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
     # The limits are widened by the rounding of the table's values to float32.
     reach = reach + 1e-7 * found.area
@@ -442,13 +474,12 @@ _FAMILIES = 6
 
 
 def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield pairs from the families of the assignments that agree with most others."""
+    """Yield candidates by geometric voting: pairs from the largest groups of consistent assignments."""
     voters = min(len(view.direction), _VOTERS)
     one, other = np.triu_indices(voters, 1)
     _, low, high = view.angles(one, other, settings.tolerance)
     ballot = _ballot(voters, one, other, low, high, sky)
-    # Several guide stars are kept per observed star, because the true one does not always have the most
-    # votes.
+    # Several guide stars are kept per observed star, because the true star may not have the most votes.
     star = np.argpartition(-ballot, _KEPT, axis=1)[:, :_KEPT].ravel()
     observed = np.repeat(np.arange(voters), _KEPT)
     agrees = _agreement(view, sky, observed, star, settings.tolerance)
@@ -468,7 +499,7 @@ def propose_families(view: ScaledField, sky: KnownSky, settings: ClassicalSettin
 def _ballot(
     voters: int, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray, sky: KnownSky
 ) -> FloatArray:
-    """Return the votes (voters, stars) for each guide star to be each observed star."""
+    """Return the number of votes (voters, stars) for each assignment of a guide star to an observed star."""
     first, _, owner = sky.pairs.between(low, high)
     in_favour = np.zeros((len(one), len(sky.stars)), dtype=np.float32)
     in_favour[owner, first] = 1.0
@@ -481,13 +512,13 @@ def _ballot(
 def _agreement(
     view: ScaledField, sky: KnownSky, observed: IntArray, star: IntArray, tolerance: float
 ) -> BoolArray:
-    """Return which assignments (k, k) of observed to guide stars are compatible."""
+    """Return a matrix (k, k) of flags: whether two assignments of guide stars to stars are consistent."""
     count = len(observed)
     one, other = (index.ravel() for index in np.indices((count, count)))
     _, low, high = view.angles(observed[one], observed[other], tolerance)
     direction = sky.stars.direction[star]
     true = angles(direction[one], direction[other])
-    # Two observed stars closer than their errors may have the same best guide star.
+    # Two very close observed stars may be assigned to the same guide star.
     different = (observed[one] != observed[other]) & (star[one] != star[other])
     alike = (true >= low) & (true < high) & different
     return np.asarray(alike.reshape(count, count))
@@ -499,7 +530,7 @@ _LEAST_CELLS = 3
 
 
 def propose_grids(view: ScaledField, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
-    """Yield the guide stars whose patterns match each observed star best, central stars first."""
+    """Yield candidates by grid patterns, beginning with observed stars near the image centre."""
     middle = np.argsort(-view.direction[:, 2], kind="stable")
     for centre in middle[: max(1, settings.patterns // _ALIGNMENTS)]:
         place = tangent_positions(view.direction, np.full(len(view.direction), centre), view.direction)
@@ -525,11 +556,11 @@ def _grid_matches(sky: KnownSky, cells: IntArray, centre: int, neighbour: int) -
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMotion:
-    """The motion of the observed points of a field.
+    """Measured motion of the observed points in a field.
 
     Attributes:
-        velocity: (n, 3) 1/s, time derivatives of the directions, camera frame.
-        sigma: (n,) 1/s, its standard deviation along one axis.
+        velocity: (n, 3) time derivatives of the directions in the camera frame, 1/s.
+        sigma: (n,) standard deviations of the velocities per axis, 1/s.
     """
 
     velocity: FloatArray
@@ -538,12 +569,12 @@ class StarMotion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreviousAttitude:
-    """A previous attitude.
+    """Previous attitude of the camera and its uncertainty.
 
     Attributes:
-        attitude: (4,) ICRS to camera.
-        sigma: rad, standard deviation about each axis, including the drift since then.
-        elapsed: s since the attitude.
+        attitude: (4,) quaternion from ICRS to the camera frame.
+        sigma: standard deviation about each axis, including the drift since the previous attitude, rad.
+        elapsed: time since the previous attitude, s.
     """
 
     attitude: FloatArray
@@ -552,19 +583,19 @@ class PreviousAttitude:
 
     @property
     def part_of_all_attitudes(self) -> float:
-        """Volume of the rotations up to four sigmas, relative to all rotations."""
+        """Fraction of all attitudes that lie within four standard deviations of the previous attitude."""
         angle = min(4.0 * self.sigma, np.pi)
         return float(angle - np.sin(angle)) / np.pi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedRate:
-    """The body rate that most points share.
+    """Body rate with which most observed points agree.
 
     Attributes:
-        rate: (3,) rad/s, camera axes.
-        covariance: (3, 3).
-        shares: (n,) whether each point moves with it.
+        rate: (3,) body rate in camera axes, rad/s.
+        covariance: (3, 3) covariance of the rate, rad^2/s^2.
+        shares: (n,) whether the motion of each point agrees with the rate.
     """
 
     rate: FloatArray
@@ -573,7 +604,7 @@ class SharedRate:
 
 
 _CHI_SQUARE = 13.8
-"""Bound of chi-square with two degrees of freedom; one star in a thousand exceeds it."""
+"""Threshold of chi-square with two degrees of freedom, which one star in 1000 exceeds by chance."""
 _SEEDS = 10
 
 
@@ -584,10 +615,17 @@ def identify_by_rate(
     motion: StarMotion | None = None,
     previous: PreviousAttitude | None = None,
 ) -> StarMatch:
-    """Return the identification of a field from the motion of its points.
+    """Return the identification of a star field by rate matching.
 
-    Without `motion` all points count as stars, and the `previous` attitude as unchanged. Raises FieldUnknown
-    if the scale is too uncertain, ValueError if motion and field differ in length.
+    Raises FieldUnknown if the image scale is too uncertain, and ValueError if `motion` and `field` differ in
+    length.
+
+    Args:
+        field: observed stars.
+        sky: guide stars and tables of their patterns.
+        settings: settings of the method.
+        motion: motion of the observed points; None treats all points as stars and the attitude as constant.
+        previous: previous attitude, None if unknown.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
@@ -611,10 +649,14 @@ def identify_by_rate(
 
 
 def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
-    """Return the body rate that most of the points (n, 3) share, by least squares over these points.
+    """Return the body rate with which most observed points agree, by least squares over these points.
 
-    Two points fix a rate. The initial guess is the rate, of a pair among the first ten points, with which
-    most points agree. Raises ValueError when motion and directions differ in length.
+    A rate is computed from each pair of the first ten points, and the rate with which most points agree is
+    the initial guess. Raises ValueError if the numbers of directions and velocities differ.
+
+    Args:
+        direction: (n, 3) unit vectors to the points in the camera frame.
+        motion: motion of the points.
     """
     if len(motion.velocity) != len(direction):
         raise ValueError(f"{len(direction)} directions and {len(motion.velocity)} velocities: give one each")
@@ -626,7 +668,7 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # Two close points give an inaccurate rate, with which many points agree.
+        # The rate is refined, because many points agree with an inaccurate rate from two close points.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
@@ -640,7 +682,7 @@ def shared_rate(direction: FloatArray, motion: StarMotion) -> SharedRate:
 
 
 def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the least-squares rate (3,) and its covariance, from v' = v x w."""
+    """Return the least-squares body rate (3,) and its covariance (3, 3) from the model v' = v x w."""
     weight = 1.0 / sigma**2
     normal = np.sum(weight) * np.eye(3) - np.einsum("n,nx,ny->xy", weight, direction, direction)
     covariance = np.linalg.pinv(normal)
@@ -648,10 +690,10 @@ def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tup
 
 
 def _agrees(direction: FloatArray, motion: StarMotion, rate: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Return which points (n,) move with `rate` within both errors."""
+    """Return for each point (n,) whether its motion agrees with `rate` within the errors of both."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
-    # This is the largest variance across the line of sight due to the error of the rate.
+    # The error of the rate adds at most this variance perpendicular to the line of sight.
     spread = motion.sigma**2 + float(np.linalg.eigvalsh(covariance)[-1]) * (1.0 - direction[:, 2] ** 2)
     spread = spread + float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     return np.asarray(np.sum(residual**2, axis=-1) <= _CHI_SQUARE * spread)
@@ -662,12 +704,12 @@ DEFAULT_METHOD = "default"
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """A method of identification.
+    """Method of star identification.
 
     Attributes:
-        identify: function from a field and tables of the sky to the identification. All except the default
-            raise FieldUnknown for a scale that is too uncertain.
-        source: publication.
+        identify: function that returns the identification of a field from the tables of the sky. All methods
+            except the default method raise FieldUnknown if the image scale is too uncertain.
+        source: publication of the method.
     """
 
     identify: Callable[[StarField, KnownSky], StarMatch]
@@ -679,7 +721,10 @@ def _default(field: StarField, sky: KnownSky) -> StarMatch:
 
 
 def method_of(name: str) -> Callable[[StarField, SkyIndex], StarMatch]:
-    """Return the method `name` of METHODS for `SolveSettings`; it builds tables for each field."""
+    """Return an identification function of the method `name` for use in `SolveSettings`.
+
+    The function builds new tables of the sky for each field.
+    """
     method = METHODS[name]
 
     def identify(field: StarField, index: SkyIndex) -> StarMatch:

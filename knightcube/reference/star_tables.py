@@ -1,30 +1,32 @@
-"""Tables of the classical methods of star identification: pairs, triangles and grid patterns of guide stars.
+"""Tables for the classical methods of star identification: pairs, triangles and grid patterns of guide stars.
 
-Pairs by angle (Michalski 3.3.1 and 3.3.4, eq. 49-61): two numbers and a float32 angle, which is rounded by
-0.003" at most below 0.5 rad. Pairs are sorted by angle and searched with a k-vector, one cell for four pairs.
-The k-vector finds the keys of a range without a binary search (Mortari & Neta, K-vector range searching
-techniques, 2000). A straight line is drawn through the sorted keys; the k-vector counts the keys below each
-of its evenly spaced values, so that the inverse of the line gives the cell of any value and two look-ups
-bound a range. Ranges are half-open, low <= key < high, and both ends are compared with the keys of their
-cells: the result is exact, while equation 61 returns some keys too many. Two corrections: equation 54 needs 2
-delta-epsilon, as in the source, for the line to end above the largest key, and equation 56 is 2.22e-16; here
-the margin is relative to the size of the keys.
+Pair table (Michalski, sections 3.3.1 and 3.3.4, eq. 49-61): A pair consists of two star indices and the angle
+between the stars. The angle is stored as float32, with a rounding error of at most 0.003" below 0.5 rad.
+Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
+search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
+keys. The k-vector stores the number of keys below each of the evenly spaced values of the line. The inverse
+of the line gives the cell of a value, so that two look-ups delimit a range. Ranges are half-open (low <= key
+< high). Unlike equation 61 of Michalski, which returns some additional keys, this implementation compares the
+keys in the two boundary cells and is exact. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in
+the original paper, so that the line ends above the largest key. The fixed margin 2.22e-16 in equation 56 of
+Michalski is replaced by a margin relative to the size of the keys.
 
-Triangles of the brighter guide stars by area and polar moment. Plane triangles (Michalski 35-48; Cole &
-Crassidis, Fast star-pattern recognition using planar triangles, J. Guidance 29, 2006) are those of the
-chords. Equation 47a is corrected to a, b and c; the covariance of a direction is sigma^2 (1 - b b^T) (25).
-Spherical triangles (Michalski 32-34; Cole & Crassidis, Fast star pattern recognition using spherical
-triangles, AIAA 2004): the source sums the polar moment over ever smaller triangles. Here Gaussian quadrature
-integrates theta^2 over the plane triangle of the chords, each element of which covers det(v1, v2, v3)/|p|^3
-of the sphere. theta is the angle from the mean direction of the corners. The table holds every triangle whose
-sides fit into one frame, sorted by area with a k-vector. Corners stand opposite the shortest, the middle and
-the longest side, so that a match of shape also matches the corners.
+Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
+triangles (Michalski, eq. 35-48; Cole & Crassidis, Fast star-pattern recognition using planar triangles, J.
+Guidance 29, 2006) have chords as sides. Equation 47a of Michalski is corrected to the sides a, b and c. The
+covariance of a direction b is sigma^2 (1 - b b^T) (Michalski, eq. 25). Spherical triangles (Michalski, eq.
+32-34; Cole & Crassidis, Fast star pattern recognition using spherical triangles, AIAA 2004) have great-circle
+arcs as sides. Instead of the recursive subdivision of the source, Gaussian quadrature computes the polar
+moment as the integral of theta^2 over the triangle, where theta is the angle from the mean direction of the
+corners. Each table contains all triangles whose sides fit into one frame, sorted by area with a k-vector. The
+corners of a triangle are ordered by the length of the opposite side, so that matching triangles also have
+matching corners.
 
-The grid pattern of a star is the set of cells that its neighbours occupy (Padgett & Kreutz-Delgado 1997). The
-star is the origin of a tangent plane; its nearest neighbour beyond a buffer radius defines the +x axis; each
-other star within the pattern radius occupies a cell.
+Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells occupied by its
+neighbours. The star is the origin of a tangent plane, and the nearest neighbour outside a buffer radius
+defines the +x axis. Each other star within the pattern radius occupies one cell.
 
-Each table is built at its first use, so that a camera with one method holds the tables of one method.
+Each table is built at its first use, so that only the tables of the methods in use need memory.
 """
 
 from __future__ import annotations
@@ -48,12 +50,12 @@ from knightcube.vision.startracker.index.sky_index import (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KVector:
-    """Sorted keys, and a table of counts by which ranges of keys are found (k-vector).
+    """K-vector: sorted keys, and a table of counts that accelerates the search for ranges of keys.
 
     Attributes:
-        key: (n,) floating, in ascending order.
-        count: (cells + 1,) uint32, keys below each value of the line.
-        slope, origin: the line (53) has the value origin + slope j at j.
+        key: (n,) keys in ascending order.
+        count: (cells + 1,) number of keys below each value of the line.
+        slope, origin: parameters of the line, whose value at index j is origin + slope j (Michalski, eq. 53).
     """
 
     key: npt.NDArray[Any]
@@ -65,9 +67,9 @@ class KVector:
         return len(self.key)
 
     def ranges(self, low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[IntArray, IntArray]:
-        """Return start and stop (m,) of the keys with low <= key < high, for m ranges at once.
+        """Return the start and stop indices (m,) of the keys with low <= key < high, for m ranges at once.
 
-        An empty range has stop = start. Raises ValueError for a NaN.
+        An empty range has equal start and stop indices. Raises ValueError if a limit is NaN.
         """
         start = self._below(np.atleast_1d(np.asarray(low, dtype=np.float64)))
         stop = self._below(np.atleast_1d(np.asarray(high, dtype=np.float64)))
@@ -81,9 +83,9 @@ class KVector:
             return np.zeros(len(value), dtype=np.int64)
         last = len(self.count) - 2
         with np.errstate(over="ignore"):
-            # Far beyond the keys the quotient is infinite; it is clipped to the last cell.
+            # An infinite quotient, for a value far above the keys, is clipped to the last cell.
             cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
-        # Rounding may move the quotient across the bound of the cell.
+        # The cell is corrected if rounding has moved the quotient across the boundary of a cell.
         cell = np.maximum(cell - (self.origin + self.slope * cell > value), 0)
         cell = np.minimum(cell + (self.origin + self.slope * (cell + 1) <= value), last)
         lower = self.count[cell].astype(np.int64)
@@ -99,9 +101,10 @@ class KVector:
 
 
 def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
-    """Return the k-vector of sorted keys (n,), by default with as many cells as keys, as in the source.
+    """Return the k-vector of sorted keys (n,).
 
-    Raises ValueError when the keys are not finite or not in order, or `cells` is not positive.
+    By default there is about one cell per key, as in the publication. Raises ValueError if the keys are not
+    finite or not sorted, or if `cells` is not positive.
     """
     wide = key.astype(np.float64)
     if not np.all(np.isfinite(wide)) or np.any(np.diff(wide) < 0.0):
@@ -120,7 +123,7 @@ def build_k_vector(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
 
 
 def members(start: IntArray, stop: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all indices in the ranges (m,) one after the other, and the range that each belongs to."""
+    """Return the concatenated indices (k,) of m ranges, and the number (k,) of the range of each index."""
     length = stop - start
     owner = np.repeat(np.arange(len(start)), length)
     begin = np.cumsum(length) - length
@@ -132,13 +135,13 @@ _PAIRS_A_CELL = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairTable:
-    """Pairs in order of their angle.
+    """Table of guide star pairs, sorted by angle.
 
     Attributes:
-        first, second: (m,) uint16, uint32 from 65,536 stars on: numbers of guide stars, first < second.
-        angle: their angle, rad, float32, with its k-vector.
-        stars: number of paired guide stars, the brightest ones.
-        widest: rad, the largest angle.
+        first, second: (m,) indices of the two guide stars of each pair, with first < second.
+        angle: k-vector of the angles between the two stars, rad.
+        stars: number of guide stars from which pairs are formed.
+        widest: largest angle of a pair, rad.
     """
 
     first: npt.NDArray[Any]
@@ -151,9 +154,9 @@ class PairTable:
         return len(self.first)
 
     def between(self, low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[IntArray, IntArray, IntArray]:
-        """Return all pairs with low <= angle < high (m,), in both orders, with the range of each.
+        """Return all pairs whose angle lies in one of m ranges low <= angle < high, each in both orders.
 
-        The three arrays (k,) are guide star, partner and index of the range.
+        The three result arrays (k,) contain the guide star, its partner and the index of the range.
         """
         place, owner = members(*self.angle.ranges(low, high))
         first = self.first[place].astype(np.int64)
@@ -166,7 +169,10 @@ class PairTable:
 
 
 def build_pairs(stars: GuideStars, widest: float) -> PairTable:
-    """Return all pairs of `stars` closer than `widest` rad. Raises ValueError for an angle not in (0, pi)."""
+    """Return all pairs of guide stars with an angle below `widest`, rad.
+
+    Raises ValueError unless `widest` lies between 0 and pi.
+    """
     if not 0.0 < widest < np.pi:
         raise ValueError(f"widest = {widest!r}: an angle between 0 and pi rad")
     pairs = cKDTree(stars.direction).query_pairs(2.0 * np.sin(0.5 * widest), output_type="ndarray")
@@ -179,7 +185,13 @@ def build_pairs(stars: GuideStars, widest: float) -> PairTable:
 
 
 def faintest_for(stars: GuideStars, solid_angle: float, wanted: float) -> float:
-    """Return the magnitude limit at which a field of `solid_angle` sr shows `wanted` stars on average."""
+    """Return the limiting magnitude for which a field of view contains `wanted` guide stars on average.
+
+    Args:
+        stars: guide stars in order of brightness.
+        solid_angle: solid angle of the field of view, sr.
+        wanted: mean number of guide stars in the field of view.
+    """
     number = int(np.ceil(wanted * 4.0 * np.pi / solid_angle))
     return (
         float(stars.magnitude[number])
@@ -189,7 +201,10 @@ def faintest_for(stars: GuideStars, solid_angle: float, wanted: float) -> float:
 
 
 def angles(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the angles (...,) between unit vectors (..., 3), from half the chord: accurate if small (22)."""
+    """Return the angles (...,), rad, between unit vectors (..., 3).
+
+    The angles are computed from the chord, which is accurate for small angles (Michalski, eq. 22).
+    """
     return np.asarray(2.0 * np.arcsin(np.minimum(0.5 * np.linalg.norm(one - other, axis=-1), 1.0)))
 
 
@@ -198,9 +213,9 @@ class TriangleShape:
     """Shape parameters of t triangles, with standard deviations.
 
     Attributes:
-        area: (t,) sr.
-        moment: (t,) polar moment about the centroid, rad^4.
-        sigma_area, sigma_moment: (t,) their standard deviations.
+        area: (t,) areas of the triangles, sr.
+        moment: (t,) polar moments about the centroids, rad^4.
+        sigma_area, sigma_moment: (t,) standard deviations of the areas (sr) and polar moments (rad^4).
     """
 
     area: FloatArray
@@ -210,7 +225,10 @@ class TriangleShape:
 
 
 def planar_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return area (t,) and polar moment (t,) about the centroid of triangles (t, 3, 3) (35-37)."""
+    """Return the areas (t,) and polar moments (t,) of planar triangles (t, 3, 3) (Michalski, eq. 35-37).
+
+    The polar moments are about the centroids of the triangles.
+    """
     a, b, c = _sides(corners)
     s = 0.5 * (a + b + c)
     area = np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0.0))
@@ -218,9 +236,13 @@ def planar_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def measured_planar_shape(corners: FloatArray, sigma: FloatArray) -> TriangleShape:
-    """Return the shape of triangles (t, 3, 3) whose corners have errors `sigma` (t, 3) rad (38-48).
+    """Return the shapes of planar triangles with standard deviations (Michalski, eq. 38-48).
 
-    A triangle without area has infinite variances, because its area has no derivative.
+    A triangle with zero area has infinite standard deviations, because the area is not differentiable.
+
+    Args:
+        corners: (t, 3, 3) unit vectors to the corners of t triangles.
+        sigma: (t, 3) standard deviations of the corners, rad.
     """
     a, b, c = _sides(corners)
     area, moment = planar_shape(corners)
@@ -241,14 +263,17 @@ def measured_planar_shape(corners: FloatArray, sigma: FloatArray) -> TriangleSha
 
 
 def _sides(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the sides a, b and c between corners 1-2, 2-3 and 1-3 (Michalski 35b-35d)."""
+    """Return the side lengths a (corners 1-2), b (2-3) and c (1-3) of triangles (Michalski, eq. 35b-35d)."""
     p, q, r = np.moveaxis(corners, -2, 0)
     a, b, c = (np.linalg.norm(one - other, axis=-1) for one, other in ((p, q), (q, r), (p, r)))
     return a, b, c
 
 
 def _side_gradients(corners: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return the derivatives (3 sides, t, 3 corners, 3) of the sides by the corners (42)."""
+    """Return the derivatives of the side lengths with respect to the corners (Michalski, eq. 42).
+
+    The result has the shape (3 sides, t triangles, 3 corners, 3 components).
+    """
     p, q, r = np.moveaxis(corners, -2, 0)
     ab, bc, ac = (p - q) / a[:, None], (q - r) / b[:, None], (p - r) / c[:, None]
     none = np.zeros_like(ab)
@@ -256,7 +281,7 @@ def _side_gradients(corners: FloatArray, a: FloatArray, b: FloatArray, c: FloatA
 
 
 def _variance(gradient: FloatArray, corners: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Return H R H^T (t,) (43, 44)."""
+    """Return the variances (t,) H R H^T of a shape parameter with gradient H (Michalski, eq. 43 and 44)."""
     radial = np.sum(gradient * corners, axis=-1)
     return np.asarray(np.sum(sigma**2 * (np.sum(gradient**2, axis=-1) - radial**2), axis=-1))
 
@@ -266,7 +291,7 @@ _ORDER = 6
 
 
 def _quadrature() -> tuple[FloatArray, FloatArray]:
-    """Return the points (36, 3), barycentric, and weights (36,) of collapsed Gaussian quadrature."""
+    """Return the barycentric points (36, 3) and weights (36,) of Gaussian quadrature over a triangle."""
     nodes, weights = np.polynomial.legendre.leggauss(_ORDER)
     nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
@@ -278,9 +303,12 @@ _POINTS, _WEIGHTS = _quadrature()
 
 
 def spherical_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return area (...,) and polar moment (...,) of triangles (..., 3, 3) of unit vectors (32-34)."""
+    """Return the areas (...,) and polar moments (...,) of spherical triangles (Michalski, eq. 32-34).
+
+    The argument `corners` (..., 3, 3) contains the unit vectors to the three corners of each triangle.
+    """
     p, q, r = np.moveaxis(corners, -2, 0)
-    # Equation 32 loses small differences of the sides; the solid angle by Van Oosterom & Strackee does not.
+    # The formula of Van Oosterom & Strackee is more accurate for small triangles than Michalski's eq. 32.
     volume = np.abs(np.sum(p * np.cross(q, r), axis=-1))
     sides = 1.0 + np.sum(p * q, axis=-1) + np.sum(q * r, axis=-1) + np.sum(r * p, axis=-1)
     area = 2.0 * np.arctan2(volume, sides)
@@ -290,20 +318,25 @@ def spherical_shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     length = np.linalg.norm(inside, axis=-1)
     chord = np.linalg.norm(inside / length[..., None] - middle[..., None, :], axis=-1)
     theta = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
-    # Barycentric coordinates cover half a unit square.
+    # The factor 0.5 is the area of the triangle of barycentric coordinates.
     moment = 0.5 * volume * np.sum(_WEIGHTS * theta**2 / length**3, axis=-1)
     return area, moment
 
 
 def measured_spherical_shape(corners: FloatArray, sigma: FloatArray) -> TriangleShape:
-    """Return the shape of triangles (t, 3, 3) with corner errors `sigma` (t, 3) rad, by differences."""
+    """Return the shapes of spherical triangles with standard deviations from numerical derivatives.
+
+    Args:
+        corners: (t, 3, 3) unit vectors to the corners of t triangles.
+        sigma: (t, 3) standard deviations of the corners, rad.
+    """
     area, moment = spherical_shape(corners)
     variance_area, variance_moment = np.zeros_like(area), np.zeros_like(moment)
     for corner in range(3):
         at = corners[:, corner]
         along = corners[:, (corner + 1) % 3] - at
         along = along - np.sum(along * at, axis=-1, keepdims=True) * at
-        # Two coincident corners define no direction along their side: any direction will do.
+        # For two coincident corners any direction is used, because their side has no direction.
         length = np.linalg.norm(along, axis=-1, keepdims=True)
         along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), _across(at))
         for direction in (along, np.cross(at, along)):
@@ -319,26 +352,26 @@ def measured_spherical_shape(corners: FloatArray, sigma: FloatArray) -> Triangle
 
 
 def _across(direction: FloatArray) -> FloatArray:
-    """Return a unit vector (t, 3) normal to each direction (t, 3)."""
+    """Return unit vectors (t, 3) perpendicular to the directions (t, 3)."""
     axis = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
     normal = np.cross(direction, axis)
     return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
 
 
 Shape = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""Function from the corners of triangles to their areas and polar moments."""
+"""Function that returns the areas and polar moments of triangles from their corners."""
 MeasuredShape = Callable[[FloatArray, FloatArray], TriangleShape]
-"""Function from the corners of triangles and their errors (rad) to shapes with standard deviations."""
+"""Function that returns triangle shapes from the corners and their standard deviations (rad)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TriangleTable:
-    """Triangles in order of their area.
+    """Table of guide star triangles, sorted by area.
 
     Attributes:
-        corner: (t, 3) uint16 or uint32 numbers of guide stars.
-        area: (t,) float32, with its k-vector.
-        moment: (t,) float32 polar moment.
+        corner: (t, 3) indices of the guide stars at the corners.
+        area: k-vector of the areas (t,) of the triangles.
+        moment: (t,) polar moments of the triangles.
     """
 
     corner: npt.NDArray[np.unsignedinteger[npt.NBitBase]]
@@ -352,9 +385,14 @@ class TriangleTable:
 def build_triangles(
     direction: FloatArray, pairs: PairTable, chosen: BoolArray, widest: float, shape: Shape
 ) -> TriangleTable:
-    """Return the triangles of the `chosen` guide stars (n,) with all sides up to `widest` rad.
+    """Return the table of all triangles of selected guide stars whose sides are at most `widest`.
 
-    `direction` (n, 3) are the guide stars to which `pairs` refers.
+    Args:
+        direction: (n, 3) unit vectors to the guide stars.
+        pairs: table of pairs of these guide stars.
+        chosen: (n,) whether each guide star is selected.
+        widest: largest side of a triangle, rad.
+        shape: function that returns areas and polar moments of triangles.
     """
     corners = ordered(direction, _triangles(pairs, chosen, widest))
     area, moment = shape(direction[corners])
@@ -365,29 +403,29 @@ def build_triangles(
 
 
 def locally_bright(pairs: PairTable, radius: float, rank: int) -> BoolArray:
-    """Return which guide stars (n,) have fewer than `rank` brighter ones within `radius` rad.
+    """Return for each guide star (n,) whether fewer than `rank` brighter stars lie within `radius`, rad.
 
-    A sparse part of the sky thus has as many stars as a dense one.
+    This selection has about the same star density in sparse and in dense regions of the sky.
     """
     start, stop = pairs.angle.ranges(0.0, radius)
-    # The second star of a pair has the larger index and is therefore the fainter one.
+    # The second star of a pair has the larger index and is therefore fainter than the first star.
     brighter = np.bincount(pairs.second[start[0] : stop[0]], minlength=pairs.stars)
     return np.asarray(brighter < rank)
 
 
 def ordered(direction: FloatArray, triangles: IntArray) -> IntArray:
-    """Return triangles (t, 3) with their corners opposite the shortest, the middle and the longest side."""
+    """Return triangles (t, 3) with the corners ordered by the length of the opposite side, shortest first."""
     sides = side_lengths(direction[triangles])
     return np.take_along_axis(triangles, np.argsort(sides, axis=-1, kind="stable"), axis=-1)
 
 
 def side_lengths(corners: FloatArray) -> FloatArray:
-    """Return the chords (..., 3) opposite each corner of triangles (..., 3, 3)."""
+    """Return the lengths (..., 3) of the sides (chords) opposite the corners of triangles (..., 3, 3)."""
     return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=-2) - np.roll(corners, 1, axis=-2), axis=-1))
 
 
 def _triangles(pairs: PairTable, chosen: BoolArray, widest: float) -> IntArray:
-    """Return all triangles (t, 3), in ascending order of the indices, whose three sides are pairs."""
+    """Return all triangles (t, 3) of selected guide stars whose three sides are in the pair table."""
     start, stop = pairs.angle.ranges(0.0, widest)
     first = pairs.first[start[0] : stop[0]].astype(np.int64)
     second = pairs.second[start[0] : stop[0]].astype(np.int64)
@@ -406,19 +444,19 @@ def _triangles(pairs: PairTable, chosen: BoolArray, widest: float) -> IntArray:
 
 GRID_CELLS = 40
 BUFFER = 0.15
-"""Minimum distance of the aligning star, in pattern radii, because the direction to a closer star is
-inaccurate."""
+"""Minimum distance of the aligning star in pattern radii. The direction to a closer star is inaccurate."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GridTable:
-    """Guide stars by occupied cell.
+    """Table of the grid patterns of all guide stars, which lists the guide stars for each occupied cell.
 
     Attributes:
-        radius: rad, of the patterns.
-        aligning: (n,) int32 guide star that aligns the pattern of each guide star; -1 without a neighbour.
-        begin: (cells + 1,) int64, index in `star` of the first star of each cell.
-        star: (m,) int32 guide stars, ordered by cell.
+        radius: radius of the patterns, rad.
+        aligning: (n,) index of the neighbour that aligns the pattern of each guide star; -1 without a
+            neighbour.
+        begin: (cells + 1,) index of the first entry of each cell in `star`.
+        star: (m,) indices of guide stars, ordered by cell.
     """
 
     radius: float
@@ -427,13 +465,19 @@ class GridTable:
     star: npt.NDArray[np.int32]
 
     def votes(self, cells: IntArray) -> IntArray:
-        """Return for each guide star (n,) the number of the `cells` (k,) that its pattern occupies."""
+        """Return for each guide star (n,) how many of the given cells (k,) its grid pattern occupies."""
         place, _ = members(self.begin[cells], self.begin[cells + 1])
         return np.bincount(self.star[place], minlength=len(self.aligning))
 
 
 def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable:
-    """Return the patterns, with a radius of `radius` rad, of all guide stars (n, 3)."""
+    """Return the table of the grid patterns of all guide stars.
+
+    Args:
+        direction: (n, 3) unit vectors to the guide stars.
+        tree: search tree of these directions.
+        radius: radius of the patterns, rad.
+    """
     pairs = tree.query_pairs(2.0 * np.sin(0.5 * radius), output_type="ndarray").astype(np.int64)
     centre = np.concatenate([pairs[:, 0], pairs[:, 1]])
     other = np.concatenate([pairs[:, 1], pairs[:, 0]])
@@ -454,7 +498,13 @@ def build_grid(direction: FloatArray, tree: cKDTree, radius: float) -> GridTable
 
 
 def tangent_positions(direction: FloatArray, centre: IntArray, others: FloatArray) -> FloatArray:
-    """Return the positions (k, 2) of directions `others` (k, 3) on tangent planes at stars `centre` (k,)."""
+    """Return the positions (k, 2) of stars on the tangent planes at other stars.
+
+    Args:
+        direction: (n, 3) unit vectors to all stars.
+        centre: (k,) indices of the stars at the origins of the tangent planes.
+        others: (k, 3) unit vectors to the projected stars.
+    """
     z = direction[centre]
     helper = np.where(np.abs(z[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     x = np.cross(helper, z)
@@ -465,7 +515,13 @@ def tangent_positions(direction: FloatArray, centre: IntArray, others: FloatArra
 
 
 def cells_of(place: FloatArray, along: FloatArray, radius: float) -> IntArray:
-    """Return the cells (k,) of positions (k, 2) in a plane rotated so that `along` (k, 2) is on +x."""
+    """Return the grid cells (k,) of positions in tangent planes.
+
+    Args:
+        place: (k, 2) positions on the tangent planes.
+        along: (k, 2) positions of the aligning stars, which define the +x axis of the grid.
+        radius: radius of the patterns, rad.
+    """
     unit = along / np.linalg.norm(along, axis=-1, keepdims=True)
     x = np.sum(place * unit, axis=-1)
     y = unit[:, 0] * place[:, 1] - unit[:, 1] * place[:, 0]
@@ -479,16 +535,19 @@ TRIANGLE_STARS_IN_FIELD = 9
 
 
 class KnownSky:
-    """The guide stars that a field of view shows, and the tables of their pairs, triangles and patterns.
+    """Guide stars for a given field of view, with the tables of their pairs, triangles and grid patterns.
 
     Attributes:
-        index: all guide stars; identifications refer to their indices.
-        half_width: (2,) tangents of half the field of view.
-        stars: the guide stars down to the magnitude at which a field shows 24 of them on average.
+        index: search index of all guide stars, to whose indices identifications refer.
+        half_width: (2,) tangents of half the angles of the field of view.
+        stars: guide stars brighter than the magnitude at which a field contains 24 guide stars on average.
     """
 
     def __init__(self, index: SkyIndex, half_width: tuple[float, float]) -> None:
-        """Use the guide stars of `index` for fields of `half_width` (2,), tangents of the half angles."""
+        """Use the guide stars of a search index for a field of view.
+
+        The argument `half_width` (2,) contains the tangents of half the angles of the field of view.
+        """
         self.index = index
         self.half_width = half_width
         x, y = half_width
@@ -499,37 +558,37 @@ class KnownSky:
 
     @property
     def widest(self) -> float:
-        """Largest angle between two stars in the field, rad: its diagonal."""
+        """Largest angle (rad) between two stars in the field of view, which is the diagonal of the field."""
         return 2.0 * math.atan(math.hypot(*self.half_width))
 
     @cached_property
     def pairs(self) -> PairTable:
-        """All pairs that fit into the field."""
+        """Table of all guide star pairs that fit into the field of view."""
         return build_pairs(self.stars, self.widest)
 
     @cached_property
     def tree(self) -> cKDTree:
-        """Search tree of the guide stars' directions."""
+        """Search tree of the directions to the guide stars."""
         return cKDTree(self.stars.direction)
 
     @cached_property
     def planar(self) -> TriangleTable:
-        """Triangles by plane area."""
+        """Table of planar triangles of guide stars."""
         return self._triangles(planar_shape)
 
     @cached_property
     def spherical(self) -> TriangleTable:
-        """Triangles by spherical area."""
+        """Table of spherical triangles of guide stars."""
         return self._triangles(spherical_shape)
 
     @cached_property
     def grid(self) -> GridTable:
-        """The pattern around each guide star."""
+        """Table of the grid patterns around all guide stars."""
         return build_grid(self.stars.direction, self.tree, math.atan(min(self.half_width)))
 
     def _triangles(self, shape: Shape) -> TriangleTable:
         side = 2.0 * math.atan(min(self.half_width))
-        # The radius of a circle with the solid angle of the field.
+        # This is the radius of a circle with the same solid angle as the field of view.
         radius = math.acos(1.0 - self.solid_angle / (2.0 * math.pi))
         chosen = locally_bright(self.pairs, radius, TRIANGLE_STARS_IN_FIELD)
         return build_triangles(self.stars.direction, self.pairs, chosen, side, shape)

@@ -1,1 +1,1 @@
-"""Attitude from directions: Wahba's problem and its solvers."""
+"""Attitude determination from measured directions: Wahba's problem and its solvers."""

@@ -1,14 +1,16 @@
-"""OLAE, the Optimal Linear Attitude Estimator: linear least squares for the Gibbs vector (Sease 4.1-4.7).
+"""OLAE (Optimal Linear Attitude Estimator): linear least squares for the Gibbs vector (Sease, eq. 4.1-4.7).
 
-With b = A r and g the Gibbs (Rodrigues) vector of A, [s x] g = d exactly, where s = b + r and d = b - r.
-`rotation_between` solves these equations; with r the starts and b the ends of streaks, A is the change of
-attitude over the exposure, and the mean rate is the rotation vector over the exposure, with the sign of
-v' = -omega x v (4.8-4.10 corrected).
+For an observed direction b = A r and the Gibbs (Rodrigues) vector g of A, the equation [s x] g = d is exact,
+where s = b + r and d = b - r. The function `rotation_between` solves these equations by least squares. If r
+are the starts and b the ends of star streaks, A is the rotation during the exposure. The mean rate is then
+the rotation vector divided by the exposure time, with the sign convention v' = -omega x v (Sease, eq.
+4.8-4.10, corrected).
 
-`solve` gives an attitude of any size: sequential rotation, started from TRIAD, keeps the angle at 120 deg or
-less, |g| below 1.74. An error e of b enters the equation as (1 + [g x]) e, larger than e by up to the root of
-1 + g^2 and different in each direction, so that the weights 1/sigma^2 are not the best ones. The result
-therefore differs from Wahba's by an amount of the order of the noise; the covariance is that of OLAE.
+The function `solve` computes attitudes with any rotation angle. A sequential rotation, based on the TRIAD
+attitude, limits the angle to 120 deg and |g| to 1.74. An error e of b enters the equation as (1 + [g x]) e,
+which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic, so that the weights 1/sigma^2 are
+not optimal. The difference from the solution of Wahba's problem is of the order of the noise. The returned
+covariance takes this into account.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, J. Guidance, Control, and Dynamics
 30 (2007).
@@ -38,14 +40,14 @@ _WORST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True)
 class OlaeSolution:
-    """The estimated rotation.
+    """Rotation estimated by OLAE.
 
     Attributes:
-        rodrigues: (3,) axis times tan of half the angle, g of 4.4.
-        quaternion: (4,) A(q) rotates `starts` into `ends` (4.5, 4.6).
-        residuals: (n, 3) [s x] g - d, of each pair; their lengths are 4.7.
-        sums: (n, 3) s = b + r of 4.1.
-        normal: (3, 3) sum of w [s x]^T [s x], minus twice the printed M of 4.3.
+        rodrigues: (3,) Gibbs vector g: rotation axis times the tangent of half the angle (Sease, eq. 4.4).
+        quaternion: (4,) quaternion whose attitude matrix rotates starts into ends (Sease, eq. 4.5 and 4.6).
+        residuals: (n, 3) residuals [s x] g - d of the pairs of directions (Sease, eq. 4.7).
+        sums: (n, 3) sums s = b + r of the pairs of directions (Sease, eq. 4.1).
+        normal: (3, 3) normal matrix, the sum of w [s x]^T [s x], which is -2 times M in Sease, eq. 4.3.
     """
 
     rodrigues: FloatArray
@@ -56,11 +58,11 @@ class OlaeSolution:
 
     @property
     def rotation_vector(self) -> FloatArray:
-        """The rotation as axis times angle (3,), rad."""
+        """Rotation vector (3,): rotation axis times angle, rad."""
         return to_rotation_vector(self.quaternion)
 
     def jacobian(self) -> FloatArray:
-        """Return d(rotation vector)/d(Rodrigues vector), (3, 3)."""
+        """Return the derivatives (3, 3) of the rotation vector with respect to the Gibbs vector."""
         tangent = float(np.linalg.norm(self.rodrigues))
         if tangent < 1e-12:
             return 2.0 * np.eye(3)
@@ -72,9 +74,15 @@ class OlaeSolution:
 
 
 def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) -> OlaeSolution:
-    """Return the rotation that best takes `starts` to `ends` (n, 3), with weights (n,): 4.1-4.7.
+    """Return the least-squares rotation between two sets of directions (Sease, eq. 4.1-4.7).
 
-    Raises numpy.linalg.LinAlgError when the directions do not fix a rotation (fewer than two distinct ones).
+    Raises numpy.linalg.LinAlgError if the directions do not determine a rotation, for example a single
+    direction.
+
+    Args:
+        starts: (n, 3) unit vectors before the rotation.
+        ends: (n, 3) unit vectors after the rotation.
+        weights: (n,) weights of the directions.
     """
     sums, differences = ends + starts, ends - starts
     cross = cross_matrices(sums)
@@ -89,7 +97,7 @@ def rotation_between(starts: FloatArray, ends: FloatArray, weights: FloatArray) 
 
 
 def gain(solution: OlaeSolution, weights: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) from the error of each d to the error of the rotation vector."""
+    """Return the derivatives (n, 3, 3) of the rotation vector with respect to each difference d = b - r."""
     cross = cross_matrices(solution.sums)
     inverse = np.linalg.inv(solution.normal)
     transposed = np.swapaxes(cross, 1, 2) * weights[:, None, None]
@@ -97,9 +105,14 @@ def gain(solution: OlaeSolution, weights: FloatArray) -> FloatArray:
 
 
 def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that rotates `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+    """Return the OLAE attitude that rotates reference directions into observed directions.
 
-    Raises AttitudeError when the directions fix no attitude.
+    Raises AttitudeError if the directions do not determine an attitude.
+
+    Args:
+        observed: (n, 3) observed unit vectors.
+        reference: (n, 3) reference unit vectors.
+        sigma: (n,) standard deviations of the observed directions, rad.
     """
     seen = sightings(observed, reference, sigma)
     rough = attitude_of_pair(seen, *best_pair(seen, sigma))
@@ -109,11 +122,11 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
     except np.linalg.LinAlgError as error:
         raise AttitudeError(f"no attitude: {error}") from error
     inverse = np.asarray(np.linalg.inv(found.normal), dtype=np.float64)
-    # Forming the normal equations costs digits; one step from the equations' own residuals restores them.
+    # One iterative refinement step restores the accuracy that the normal equations lose by rounding.
     gibbs = found.rodrigues - inverse @ (seen.weight @ np.cross(found.residuals, found.sums))
     quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), rotation))
-    # Each error e enters as (1 + [g x]) e, and has no part along its direction. The normal equations make a
-    # change dg of it, a small rotation of 2 (1 - [g x]) dg/(1 + g^2).
+    # An error e of a direction is perpendicular to that direction and enters the equation as (1 + [g x]) e.
+    # The change dg of the Gibbs vector is a small rotation of 2 (1 - [g x]) dg/(1 + g^2).
     square = 1.0 + gibbs @ gibbs
     across = np.cross(found.sums, gibbs)
     along = np.cross(found.sums, observed + np.cross(gibbs, observed))

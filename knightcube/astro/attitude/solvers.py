@@ -1,36 +1,45 @@
-"""Solvers of Wahba's problem, all of one signature, in the table `SOLVERS` (Michalski 3.4).
+"""Solvers of Wahba's problem with a common signature (Michalski, section 3.4).
 
-Most solvers compute the optimal quaternion from the attitude profile matrix B (3, 3), with weights that sum
-to one (`PROFILE_METHODS`); `knightcube.astro.attitude.wahba.refine` then recovers the digits that B lost.
-Davenport's q-method is the default: no angle is singular, no iteration can fail, and LAPACK decomposes a
-4 x 4 matrix faster than the interpreter evaluates the closed forms. Where the formula of a solver is
-singular, the reference frame is first rotated by 180 deg about one of its axes (sequential rotation).
+Most solvers (`PROFILE_METHODS`) compute the optimal quaternion from the attitude profile matrix B (3, 3),
+with weights that sum to one. The function `knightcube.astro.attitude.wahba.refine` then corrects the rounding
+errors of B. The default solver is Davenport's q-method, because it has no singularity and no iteration that
+can fail. It is also fast, because LAPACK decomposes a 4 x 4 matrix faster than Python evaluates the
+closed-form solutions. If the formula of a solver is singular, the reference frame is first rotated by 180 deg
+about one of its axes (sequential rotation).
 
-`weighted_fit` is the least-squares attitude for whole covariances instead of one sigma per direction.
+The function `weighted_fit` solves the least-squares problem with a full covariance matrix per direction.
 
-- Davenport (3.4.2, 69-75), the eigenvector of the largest eigenvalue of K.
-- Singular values of B (80-84 corrected: the determinants appear once, in the middle). Markley, Attitude
-  determination using vector observations and the singular value decomposition, J. Astronautical Sciences 36
-  (1988).
-- QUEST (3.4.4, 78, 79). Shuster and Oh, Three-axis attitude determination from vector observations, J.
-  Guidance and Control 4 (1981). Cheng and Shuster, J. Guidance, Control, and Dynamics 37 (2014), on the
-  digits that the root of Newton's method loses; here the Rayleigh quotient recovers them.
-- ESOQ2 (Sease chapter 3, text at 3.23). Mortari, ESOQ-2 single-point algorithm, Advances in the Astronautical
-  Sciences 95 (1997); Markley and Mortari, Quaternion attitude estimation using vector observations, J.
+- Davenport's q-method (Michalski, section 3.4.2, eq. 69-75): The quaternion is the eigenvector of the largest
+  eigenvalue of the matrix K.
+- Singular value decomposition of B (Michalski, eq. 80-84, corrected: the determinants occur only once, in the
+middle):
+  See Markley, Attitude determination using vector observations and the singular value decomposition, J.
+  Astronautical Sciences 36 (1988).
+- QUEST (Michalski, section 3.4.4, eq. 78 and 79): See Shuster and Oh, Three-axis attitude determination from
+vector
+  observations, J. Guidance and Control 4 (1981). The loss of accuracy of Newton's method (Cheng and Shuster,
+  J. Guidance, Control, and Dynamics 37, 2014) is avoided by the Rayleigh quotient.
+- ESOQ2 (Sease, chapter 3, text at eq. 3.23): See Mortari, ESOQ-2 single-point algorithm, Advances in the
+Astronautical
+  Sciences 95 (1997), and Markley and Mortari, Quaternion attitude estimation using vector observations, J.
   Astronautical Sciences 48 (2000).
-- FOAM (3.4.6). Markley, Attitude determination using vector observations: a fast optimal matrix algorithm, J.
-  Astronautical Sciences 41 (1993).
-- Predictive (3.4.1, named there without a formula). The predictive filter chooses at each step the body rate
-  for which the directions predicted to first order leave the smallest weighted residual. With measurements of
-  one instant the steps converge to Wahba's optimum. It uses residuals instead of B and loses no digits.
-  Crassidis and Markley, J. Guidance, Control, and Dynamics 20 (1997); Park and Crassidis, Navigation 53
-  (2006).
-- TRIAD (3.4.5), from the pair of directions whose covariance has the smallest trace; the first of the pair is
-  assumed exact. The covariance is that of Shuster and Oh. The result does not have the minimum loss.
-- OLAE, see `knightcube.astro.attitude.olae`.
+- FOAM (Michalski, section 3.4.6): See Markley, Attitude determination using vector observations: a fast
+optimal matrix
+  algorithm, J. Astronautical Sciences 41 (1993).
+- Predictive filter (Michalski, section 3.4.1, which gives no formula): In each step the filter chooses the
+body rate
+  that minimises the weighted residuals of the directions predicted to first order. For measurements of one
+  time, the steps converge to the solution of Wahba's problem. The filter uses residuals instead of B, which
+  avoids rounding errors. See Crassidis and Markley, J. Guidance, Control, and Dynamics 20 (1997), and Park
+  and Crassidis, Navigation 53 (2006).
+- TRIAD (Michalski, section 3.4.5): The attitude follows from the pair of directions whose covariance has the
+smallest
+  trace, and the first direction of the pair is assumed to be exact. The covariance is that of Shuster and Oh.
+  The result does not minimise the loss.
+- OLAE: See `knightcube.astro.attitude.olae`.
 
-The optimal estimate is efficient. The difference of TRIAD's or OLAE's attitude from the optimal one therefore
-has the difference of the two covariances.
+The optimal estimate is statistically efficient. The covariance of the difference between the TRIAD or OLAE
+attitude and the optimal attitude is therefore the difference of their covariances.
 """
 
 from __future__ import annotations
@@ -65,18 +74,23 @@ from knightcube.astro.quaternion import (
 
 _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
-"""Smallest product of the differences of the largest eigenvalue of K from the others. Two of the three are of
-the order of one in a narrow field."""
+"""Minimum product of the differences between the largest eigenvalue of K and the other three eigenvalues.
+
+In a narrow field of view, two of the three differences are of the order of one.
+"""
 
 
 def skew_part(profile: FloatArray) -> FloatArray:
-    """Return z (3,), the sum of w b x r (Michalski 72 corrected: its second component is B31 - B13)."""
+    """Return z (3,), the weighted sum of b x r, from the profile matrix B.
+
+    This is Michalski, eq. 72, in which the second component is corrected to B31 - B13.
+    """
     (_, xy, xz), (yx, _, yz), (zx, zy, _) = profile.tolist()
     return np.array([yz - zy, zx - xz, xy - yx])
 
 
 def davenport_matrix(profile: FloatArray) -> FloatArray:
-    """Return Davenport's K (4, 4), scalar last (Michalski 69)."""
+    """Return Davenport's matrix K (4, 4) for quaternions with the scalar last (Michalski, eq. 69)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = profile.tolist()
     s, t, u = xy + yx, xz + zx, yz + zy
     p, q, r = yz - zy, zx - xz, xy - yx
@@ -91,7 +105,10 @@ def davenport_matrix(profile: FloatArray) -> FloatArray:
 
 
 def _characteristic(profile: FloatArray) -> tuple[float, float, float]:
-    """Return b, c and d of the characteristic polynomial l^4 + b l^2 + c l + d of K (Markley's FOAM)."""
+    """Return the coefficients b, c and d of the characteristic polynomial l^4 + b l^2 + c l + d of K.
+
+    The formulas are those of Markley's FOAM algorithm.
+    """
     rows = profile.tolist()
     cofactors = adjugate(rows)
     square, cofactor_square = (sum(x * x for row in matrix for x in row) for matrix in (rows, cofactors))
@@ -101,9 +118,9 @@ def _characteristic(profile: FloatArray) -> tuple[float, float, float]:
 def largest_eigenvalue(profile: FloatArray) -> float:
     """Return the largest root of the characteristic polynomial of K.
 
-    Newton's method starts from 1, the sum of the weights, which no root exceeds. Beyond the largest root the
-    polynomial is convex, so that the steps descend to the root without passing it. The first step that does
-    not descend is due to rounding.
+    Newton's method starts from 1, the sum of the weights, which is an upper bound of all roots. The
+    polynomial is convex above the largest root, so that the iteration decreases monotonically towards this
+    root. The iteration ends when rounding prevents a further decrease.
     """
     b, c, d = _characteristic(profile)
     root = 1.0
@@ -119,11 +136,16 @@ def largest_eigenvalue(profile: FloatArray) -> float:
 def _by_eigenvalue(
     profile: FloatArray, quaternion_at: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
-    """Return the optimal quaternion (4,) by a formula of profile and largest eigenvalue.
+    """Return the optimal quaternion (4,) by a formula that needs the largest eigenvalue of K.
 
-    The error of the polynomial's root is the rounding error over the product of the eigenvalue differences,
-    large for two close directions. The Rayleigh quotient has the square of the quaternion's error. Raises
-    AttitudeError if the largest eigenvalue is double and the attitude undefined.
+    The error of the polynomial's root is the rounding error divided by the product of the eigenvalue
+    differences, which is large for two close directions. The eigenvalue is therefore improved by the Rayleigh
+    quotient, whose error is quadratic in the error of the quaternion. Raises AttitudeError if the largest
+    eigenvalue is double, so that the attitude is undefined.
+
+    Args:
+        profile: (3, 3) attitude profile matrix.
+        quaternion_at: function that returns the quaternion (4,) for the profile matrix and the eigenvalue.
     """
 
     def check(root: float) -> None:
@@ -142,32 +164,36 @@ def _by_eigenvalue(
 def _in_rotated_frame(
     profile: FloatArray, component: int, quaternion_at: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
-    """Return the quaternion (4,) of `_by_eigenvalue`, found in the reference frame after a half rotation."""
+    """Return the quaternion (4,) of `_by_eigenvalue`, computed in a reference frame rotated by 180 deg."""
     signs, rotation = half_rotation(component)
-    # The matrix of a half rotation is diagonal and its own inverse.
+    # The matrix of a rotation by 180 deg about a coordinate axis is diagonal and its own inverse.
     return multiply(_by_eigenvalue(profile * signs, quaternion_at), rotation)
 
 
 def davenport(profile: FloatArray) -> FloatArray:
-    """Return the optimal quaternion (4,) by decomposition of K."""
+    """Return the optimal quaternion (4,) by Davenport's q-method, an eigenvalue decomposition of K."""
     return np.asarray(np.linalg.eigh(davenport_matrix(profile))[1][:, 3])
 
 
 def singular_values(profile: FloatArray) -> FloatArray:
-    """Return the optimal quaternion (4,) of A = U diag(1, 1, det U det V) V^T, B = U S V^T."""
+    """Return the optimal quaternion (4,) by singular value decomposition of the profile matrix B.
+
+    With B = U S V^T, the attitude matrix is A = U diag(1, 1, det U det V) V^T.
+    """
     u, _, vt = np.linalg.svd(profile)
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
     return from_matrix(u @ vt)
 
 
 def quest(profile: FloatArray) -> FloatArray:
-    """Return the optimal quaternion (4,) from the Gibbs vector M^-1 z, M = l + t - S.
+    """Return the optimal quaternion (4,) by QUEST, from the Gibbs vector M^-1 z.
 
-    The Cayley-Hamilton theorem gives the adjugate of M without a division, so that 180 deg gives no infinity.
-    The quaternion still loses digits with det M. The frame is therefore rotated so that the smallest rotation
-    remains: det M is the square of the scalar part times the eigenvalue differences, and after each half
-    rotation that of another component. The trace of B is cheaper but does not contain the roll in a narrow
-    field.
+    The matrix is M = l + t - S, with the largest eigenvalue l of K, the trace t of B and S = B + B^T. The
+    adjugate of M is used instead of its inverse, so that a rotation by 180 deg causes no division by zero. A
+    small determinant of M still causes a loss of accuracy. The reference frame is therefore rotated by 180
+    deg such that the determinant is largest and the remaining rotation smallest. The determinant is
+    proportional to the square of the scalar part. The trace of B would be a cheaper criterion, but it does
+    not depend on the roll angle in a narrow field of view.
     """
 
     def gibbs_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:
@@ -185,12 +211,13 @@ def quest(profile: FloatArray) -> FloatArray:
 
 
 def esoq2(profile: FloatArray) -> FloatArray:
-    """Return the optimal quaternion (4,) from the rotation axis, found by cross products.
+    """Return the optimal quaternion (4,) by ESOQ2, which computes the rotation axis by cross products.
 
-    The axis is the null vector of (t - l)(B + B^T - t - l) - z z^T, which is symmetric of rank 2. The cross
-    products of its rows, the rows of its adjugate, all lie along the axis; the longest is the most precise.
-    The axis is undefined for small rotations, so the frame is rotated so that the largest rotation remains:
-    by the half rotation that gives B the smallest trace.
+    The axis is the null vector of the symmetric matrix (t - l)(B + B^T - t - l) - z z^T of rank 2, with the
+    largest eigenvalue l of K and the trace t of B. The cross products of the matrix rows are parallel to the
+    axis, and the longest cross product is the most accurate. The axis is undefined for small rotations. The
+    reference frame is therefore rotated by 180 deg such that the trace of B is smallest and the remaining
+    rotation largest.
     """
 
     def from_axis(profile: FloatArray, eigenvalue: float) -> FloatArray:
@@ -207,9 +234,10 @@ def esoq2(profile: FloatArray) -> FloatArray:
 
 
 def foam(profile: FloatArray) -> FloatArray:
-    """Return the optimal quaternion (4,) of [(k + |B|^2) B + l adj(B)^T - B B^T B] / (k l - det B).
+    """Return the optimal quaternion (4,) by FOAM, which has no singularity.
 
-    k is (l^2 - |B|^2)/2. No angle is singular.
+    The attitude matrix is [(k + |B|^2) B + l adj(B)^T - B B^T B] / (k l - det B), with the largest eigenvalue
+    l of K and k = (l^2 - |B|^2)/2.
     """
 
     def from_attitude_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:
@@ -226,13 +254,19 @@ def foam(profile: FloatArray) -> FloatArray:
 
 
 def predictive(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the optimal attitude by predictive steps from TRIAD's attitude. Raises AttitudeError."""
+    """Return the optimal attitude by the predictive filter, starting from the TRIAD attitude.
+
+    The arguments and exceptions are those of `Solver`.
+    """
     seen = sightings(observed, reference, sigma)
     return fix(seen, attitude_of_pair(seen, *best_pair(seen, sigma)))
 
 
 def triad(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude of the best pair; the loss is that of all directions. Raises AttitudeError."""
+    """Return the TRIAD attitude of the best pair of directions, with the loss of all directions.
+
+    The arguments and exceptions are those of `Solver`.
+    """
     seen = sightings(observed, reference, sigma)
     first, second = best_pair(seen, sigma)
     quaternion = upright(attitude_of_pair(seen, first, second))
@@ -254,7 +288,7 @@ PROFILE_METHODS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "quest": quest,
     "svd": singular_values,
 }
-"""Functions from an attitude profile matrix (3, 3) to the optimal quaternion (4,)."""
+"""Functions by name that return the optimal quaternion (4,) of an attitude profile matrix (3, 3)."""
 
 
 def _profile_solver(method: Callable[[FloatArray], FloatArray]) -> Solver:
@@ -276,15 +310,19 @@ DEFAULT = "davenport"
 
 
 def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude of the default solver; arguments and exceptions are those of every `Solver`."""
+    """Return the attitude by the default solver. The arguments and exceptions are those of `Solver`."""
     return SOLVERS[DEFAULT](observed, reference, sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VectorObservation:
-    """One direction: `observed` (3,) in body and `reference` (3,) in inertial axes, unit vectors.
+    """Observation of one direction with a full covariance matrix.
 
-    `covariance` (3, 3) rad^2 is that of `observed` in body axes; its part along the direction has no effect.
+    Attributes:
+        observed: (3,) observed unit vector in body axes.
+        reference: (3,) reference unit vector in inertial axes.
+        covariance: (3, 3) covariance of the observed vector in body axes, rad^2; the component along the
+            direction has no effect.
     """
 
     observed: FloatArray
@@ -293,16 +331,20 @@ class VectorObservation:
 
     @property
     def sigma(self) -> float:
-        """The mean sigma per axis across the direction, rad."""
+        """RMS standard deviation per axis perpendicular to the direction, rad."""
         along = float(self.observed @ self.covariance @ self.observed)
         return float(np.sqrt(0.5 * (np.trace(self.covariance) - along)))
 
 
 def field_observation(field: FloatArray, reference: FloatArray, covariance: FloatArray) -> VectorObservation:
-    """Return the direction of a field: `field` (3,) T, body, and its model `reference` (3,) T.
+    """Return the direction observation of a measured magnetic field.
 
-    The covariance (3, 3) T^2 must include the error of the magnetometer's bias. Raises AttitudeError for a
-    field so weak that the error of its direction exceeds one radian.
+    Raises AttitudeError for a field so weak that the error of its direction exceeds one radian.
+
+    Args:
+        field: (3,) measured magnetic field in body axes, T.
+        reference: (3,) magnetic field of the model in inertial axes, T.
+        covariance: (3, 3) covariance of the measured field, including the magnetometer bias, T^2.
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < strength:
@@ -313,10 +355,11 @@ def field_observation(field: FloatArray, reference: FloatArray, covariance: Floa
 
 
 def weighted_fit(observations: Sequence[VectorObservation]) -> AttitudeFix:
-    """Return the least-squares attitude under the whole covariances of the directions.
+    """Return the least-squares attitude of directions with full covariance matrices.
 
-    Gauss-Newton steps start from QUEST's attitude. Twice the loss is a chi-square of 2n - 3 degrees of
-    freedom. Raises AttitudeError when the directions fix no attitude.
+    Gauss-Newton iterations start from the QUEST attitude. Twice the loss has a chi-square distribution with
+    2n - 3 degrees of freedom for n directions. Raises AttitudeError if the directions do not determine an
+    attitude.
     """
     observed, reference = (
         np.array([getattr(o, name) for o in observations]) for name in ("observed", "reference")
@@ -326,7 +369,7 @@ def weighted_fit(observations: Sequence[VectorObservation]) -> AttitudeFix:
         information, moment, _ = _normal_equations(quaternion, observations)
         step = np.asarray(np.linalg.solve(information, moment), dtype=float)
         quaternion = normalise(multiply(from_rotation_vector(step), quaternion))
-        if float(step @ step) < 1e-9**2:  # rad; convergence is nearly quadratic
+        if float(step @ step) < 1e-9**2:  # rad; the convergence is nearly quadratic
             break
     information, _, loss = _normal_equations(quaternion, observations)
     return AttitudeFix(quaternion, np.asarray(np.linalg.inv(information), dtype=float), loss)
@@ -335,14 +378,14 @@ def weighted_fit(observations: Sequence[VectorObservation]) -> AttitudeFix:
 def _normal_equations(
     quaternion: FloatArray, observations: Sequence[VectorObservation]
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the information (3, 3) of small rotations, their moment (3,) and half the sum of squares."""
+    """Return the information matrix (3, 3) for small rotations, the right-hand side (3,) and the loss."""
     information, moment, loss = np.zeros((3, 3)), np.zeros(3), 0.0
     matrix = attitude_matrix(quaternion)
     for observation in observations:
         expected = matrix @ observation.reference
         across = tangent_basis(expected.tolist())
         weight = np.linalg.inv(across @ observation.covariance @ across.T)
-        # After a further small rotation e of the body the direction is A r + [A r x] e.
+        # A further small rotation e of the body changes the direction A r to A r + [A r x] e.
         rows = across @ cross_matrices(expected[None])[0]
         residual = across @ (observation.observed - expected)
         information += rows.T @ weight @ rows

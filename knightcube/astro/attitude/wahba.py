@@ -1,13 +1,14 @@
-"""Wahba's problem: the attitude A that best rotates reference directions r into observed ones b.
+"""Wahba's problem: the attitude A that best rotates reference directions r into observed directions b.
 
-The loss is half the sum of |b - A r|^2 / sigma^2 (Sease 3.22, 3.23; Michalski 77 corrected). Twice the
-minimum loss is a chi-square of 2n - 3 degrees of freedom if each sigma is the error of an observation, rad
-across its direction. All arrays are (n, 3) unit vectors and (n,) sigmas. Equal sigmas give the uniform
-weights 1/N of the thesis.
+The loss is half the sum of |b - A r|^2 / sigma^2 (Sease, eq. 3.22 and 3.23; Michalski, eq. 77, corrected).
+Each sigma is the standard deviation of an observed direction per axis, rad. Twice the minimum loss of n
+directions has a chi-square distribution with 2n - 3 degrees of freedom. Equal standard deviations give the
+uniform weights 1/N of Sease 2013.
 
-A solver that uses the profile matrix B loses digits to its rounding: two directions d rad apart differ in B
-by d^2, so the error of the quaternion is the rounding error over d^2. `refine` recovers the digits from the
-residuals, where the same two directions differ by d.
+Solvers based on the profile matrix B lose accuracy by rounding. Two directions with a separation of d rad
+change B only by terms of the order d^2, so that the error of the quaternion is the rounding error divided by
+d^2. The function `refine` restores the accuracy from the residuals of the directions, which depend linearly
+on d.
 """
 
 from __future__ import annotations
@@ -28,31 +29,35 @@ from knightcube.astro.quaternion import (
 from knightcube.errors import FlightError
 
 _MINIMUM_SPREAD = 1e-12
-"""Determinant of the information below which directions (within about 1e-6 rad of a line) fix no attitude."""
+"""Determinant of the information matrix below which the directions do not determine an attitude.
+
+This value corresponds to directions that are collinear within about 1e-6 rad.
+"""
 _UNIT_TOLERANCE = 1e-6
 _EYE = np.eye(3)
 _MAXIMUM_STEPS = 100
 _CONVERGED = 1e-11
-"""Length (rad) of the last Newton step: each step is at most a tenth of the one before."""
+"""Length (rad) of the last Newton step. Each step is at most a tenth of the previous step."""
 _ROUNDING = 3e-15
-"""Several times the rounding of the residuals. No step is smaller than this over the directions' spread."""
+"""Several times the rounding error of the residuals, which limits the smallest meaningful Newton step."""
 _CLOSE_FIT = 1e-2
-"""Largest square of the convergence ratio of Gauss-Newton steps."""
+"""Largest squared convergence ratio for which Gauss-Newton steps are used instead of Newton steps."""
 Rows = list[list[float]]
 
 
 class AttitudeError(FlightError):
-    """Directions that fix no attitude, or invalid ones."""
+    """Raised for directions that are invalid or do not determine an attitude."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeFix:
-    """A solver's attitude.
+    """Attitude determined from directions.
 
     Attributes:
-        quaternion: (4,) reference into the observer's frame, scalar part not negative.
-        covariance: (3, 3) rad^2, of small rotations about the observer's axes, from the given sigmas.
-        loss: half the sum of squared residuals over their sigmas.
+        quaternion: (4,) rotation of the reference frame into the observer's frame, with a scalar part of at
+            least 0.
+        covariance: (3, 3) covariance of small rotations about the observer's axes, rad^2.
+        loss: half the sum of squared normalised residuals.
     """
 
     quaternion: FloatArray
@@ -62,14 +67,15 @@ class AttitudeFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Checked directions that fix an attitude, and the sums that solvers share.
+    """Checked directions that determine an attitude, with quantities that all solvers need.
 
     Attributes:
-        observed, reference: (n, 3) unit vectors.
-        weight: (n,) 1/sigma^2, scaled to a sum of one.
+        observed, reference: (n, 3) unit vectors in the observer's frame and in the reference frame.
+        weight: (n,) weights 1/sigma^2, scaled to a sum of one.
         total: sum of 1/sigma^2, 1/rad^2.
-        profile: (3, 3) attitude profile matrix, the sum of weight b r^T.
-        covariance: (3, 3) rad^2, of small rotations of the optimal attitude about the observer's axes.
+        profile: (3, 3) attitude profile matrix, the weighted sum of b r^T.
+        covariance: (3, 3) covariance of the optimal attitude for small rotations about the observer's axes,
+            rad^2.
     """
 
     observed: FloatArray
@@ -80,15 +86,20 @@ class Sightings:
     covariance: FloatArray
 
     def loss(self, quaternion: FloatArray) -> float:
-        """Return half the sum of squared residuals over their sigmas at an attitude (4,)."""
+        """Return half the sum of squared normalised residuals for an attitude quaternion (4,)."""
         residual = self.observed - self.reference @ attitude_matrix(quaternion).T
         return 0.5 * self.total * float(np.vdot(residual * self.weight[:, None], residual))
 
 
 def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Sightings:
-    """Return checked directions (n, 3), (n, 3) with errors (n,) rad, ready to be solved.
+    """Check directions and return them with the quantities that all solvers need.
 
-    Raises AttitudeError for invalid directions and for directions that fix no attitude.
+    Raises AttitudeError for directions that are invalid or do not determine an attitude.
+
+    Args:
+        observed: (n, 3) observed unit vectors.
+        reference: (n, 3) reference unit vectors.
+        sigma: (n,) standard deviations of the observed directions, rad.
     """
     n = len(observed)
     if observed.shape != (n, 3) or reference.shape != (n, 3) or sigma.shape != (n,):
@@ -98,7 +109,7 @@ def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) ->
         )
     if n < 2:
         raise _on_one_line(n, "observed")
-    # A NaN fails the comparison too.
+    # The comparison is also false for NaN.
     if not (np.minimum.reduce(sigma) > 0.0 and np.vdot(sigma, sigma) < np.inf):
         raise AttitudeError(f"sigma {sigma}: each must be finite and positive, in rad")
     weight = 1.0 / (sigma * sigma)
@@ -107,7 +118,7 @@ def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) ->
     both = np.empty((n, 6))
     both[:, :3], both[:, 3:] = observed, reference
     _check_unit_length(both)
-    # One product contains B and, in its diagonal blocks, the two sums of weight v v^T.
+    # The product contains B and, in its diagonal blocks, the weighted sums of b b^T and r r^T.
     gram = (both * weight[:, None]).T @ both
     cofactors, volume = _cofactors(gram[:3, :3], n, "observed")
     _cofactors(gram[3:, 3:], n, "reference")
@@ -116,23 +127,33 @@ def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) ->
 
 
 def profile_matrix(observed: FloatArray, reference: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the attitude profile matrix (3, 3): the sum of w b r^T (Michalski 70)."""
+    """Return the attitude profile matrix (3, 3), the weighted sum of b r^T (Michalski, eq. 70)."""
     return np.asarray((observed * weights[:, None]).T @ reference)
 
 
 def fix(seen: Sightings, quaternion: FloatArray) -> AttitudeFix:
-    """Return the optimal attitude from a solver's `quaternion` (4,), with its covariance and loss (3.23)."""
+    """Return the refined optimal attitude with covariance and loss (Sease, eq. 3.23).
+
+    Args:
+        seen: checked directions.
+        quaternion: (4,) attitude computed by a solver.
+    """
     optimum, loss = refine(seen, quaternion)
     return AttitudeFix(upright(optimum), seen.covariance, loss)
 
 
 class Solver(Protocol):
-    """Computes an attitude from directions."""
+    """Function that computes an attitude from directions."""
 
     def __call__(self, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-        """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+        """Return the attitude that rotates reference directions into observed directions.
 
-        Raises AttitudeError when the directions fix no attitude.
+        Raises AttitudeError if the directions do not determine an attitude.
+
+        Args:
+            observed: (n, 3) observed unit vectors.
+            reference: (n, 3) reference unit vectors.
+            sigma: (n,) standard deviations of the observed directions, rad.
         """
         ...
 
@@ -142,23 +163,25 @@ _HALF_ROTATIONS = np.eye(4)
 
 
 def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
-    """Return the signs (3,) of the diagonal matrix of a half rotation, and its quaternion (4,).
+    """Return the matrix diagonal (3,) and the quaternion (4,) of a 180 deg rotation about a coordinate axis.
 
-    The axis is `component` 0, 1 or 2; 3 gives the identity. The rotation moves that component of a quaternion
-    into the scalar part: if it is the largest, at most 120 deg of rotation remain.
+    The index `component` is 0, 1 or 2 for the axes x, y and z, and 3 for the identity. The rotation moves
+    this component of a quaternion into the scalar part. If it is the largest component, the remaining
+    rotation is at most 120 deg.
     """
     return _SIGNS[component], _HALF_ROTATIONS[component]
 
 
 def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
-    """Return the indices of anchor and other direction of the pair that fixes the attitude best (TRIAD).
+    """Return the indices of the two directions that determine the TRIAD attitude most accurately.
 
-    Raises AttitudeError when all pairs lie on one line, in either frame.
+    The first direction is the one that TRIAD assumes to be exact. Raises AttitudeError if all directions are
+    collinear in one of the frames.
     """
     sines = np.minimum(_squared_sines(seen.observed), _squared_sines(seen.reference))
     squared = sigma**2
     with np.errstate(divide="ignore"):
-        # The trace of the covariance: sigma1^2 + (sigma1^2 + sigma2^2)/|b1 x b2|^2.
+        # The trace of the covariance is sigma1^2 + (sigma1^2 + sigma2^2)/|b1 x b2|^2.
         trace = squared[:, None] + (squared[:, None] + squared) / sines
     first, second = np.unravel_index(np.argmin(trace), trace.shape)
     if not sines[first, second] > 0.0:
@@ -167,13 +190,21 @@ def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
 
 
 def _squared_sines(vectors: FloatArray) -> FloatArray:
-    """Return the squared sines (n, n) of the angles between unit vectors (n, 3), zero on the diagonal."""
+    """Return the squared sines (n, n) of the angles between all pairs of unit vectors (n, 3)."""
     normal = np.cross(vectors[:, None], vectors)
     return np.asarray(np.einsum("ijk,ijk->ij", normal, normal))
 
 
 def attitude_of_pair(seen: Sightings, first: int, second: int) -> FloatArray:
-    """Return the quaternion (4,) that maps the first onto its observed, the second into their plane."""
+    """Return the TRIAD attitude quaternion (4,) of two directions.
+
+    The attitude rotates the first reference direction exactly into the first observed direction.
+
+    Args:
+        seen: checked directions.
+        first: index of the first direction.
+        second: index of the second direction.
+    """
 
     def triad(vectors: FloatArray) -> FloatArray:
         normal = np.cross(vectors[first], vectors[second])
@@ -184,22 +215,27 @@ def attitude_of_pair(seen: Sightings, first: int, second: int) -> FloatArray:
 
 
 def upright(quaternion: FloatArray) -> FloatArray:
-    """Return the quaternion (4,) of the same attitude whose scalar part is not negative."""
+    """Return the quaternion (4,) of the same attitude with a scalar part of at least 0."""
     return -quaternion if quaternion[3] < 0.0 else quaternion
 
 
 def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
-    """Return the attitude (4,) of minimum loss, by Newton's method from `quaternion` (4,), and that loss.
+    """Return the attitude quaternion (4,) of minimum loss, computed by Newton's method, and the minimum loss.
 
-    The second derivative of the loss differs from the information by at most sqrt(2 loss/total). If that
-    difference is small, the information is used (Gauss-Newton). The four stationary attitudes are the
-    eigenvectors of Davenport's K. Only one is a minimum, unless the largest eigenvalue is double, as for
-    mirrored directions: then a circle of attitudes has the minimum loss.
+    The second derivative of the loss differs from the information matrix by at most sqrt(2 loss/total). If
+    this difference is small, the information matrix is used instead (Gauss-Newton method). The four
+    stationary points of the loss are the eigenvectors of Davenport's matrix K, and only one of these is a
+    minimum. If the largest eigenvalue is double, for example for mirrored directions, the minimum is not
+    unique.
 
-    Raises AttitudeError if the method does not converge, or converges to a point that is not a minimum.
+    Raises AttitudeError if the iteration does not converge, or converges to a point that is not a minimum.
+
+    Args:
+        seen: checked directions.
+        quaternion: (4,) initial attitude.
     """
     weight = seen.weight[:, None]
-    # Of the order of the inverse square of the directions' spread, rad.
+    # This value is of the order of 1/spread^2, where spread (rad) is the angular extent of the directions.
     narrowness = seen.total * float(seen.covariance.trace())
     smallest = max(_CONVERGED**2, _ROUNDING**2 * narrowness)
     for _ in range(_MAXIMUM_STEPS):
@@ -207,7 +243,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         residual = seen.observed - rotated
         weighted = residual * weight
         loss = 0.5 * seen.total * float(np.vdot(weighted, residual))
-        # The skew part of the sum of w (b - A r)(A r)^T is the gradient of the loss, the sum of w (A r) x b.
+        # The gradient of the loss is the skew-symmetric part of the weighted sum of (b - A r)(A r)^T.
         moment = weighted.T @ rotated
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = moment.tolist()
         inverse, is_minimum = seen.covariance, True
@@ -224,13 +260,13 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         if not is_minimum:
             raise AttitudeError("the directions fit several attitudes equally well: they determine none")
         x, y, z = step.tolist()
-        # The length differs from one by the square of the step, which is below rounding.
+        # The quaternion is not normalised, because its length error is below the rounding error.
         return multiply(np.array([0.5 * x, 0.5 * y, 0.5 * z, 1.0]), quaternion), loss
     raise AttitudeError(f"no attitude within {_MAXIMUM_STEPS} steps: no attitude fits the directions")
 
 
 def adjugate(rows: Rows) -> Rows:
-    """Return the adjugate of a 3 x 3 matrix, its inverse times its determinant; faster than numpy."""
+    """Return the adjugate (inverse times determinant) of a 3 x 3 matrix, faster than numpy."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     return [
         [e * i - f * h, c * h - b * i, b * f - c * e],
@@ -246,10 +282,10 @@ def determinant(rows: Rows, adjugate_rows: Rows) -> float:
 
 
 def _check_unit_length(both: FloatArray) -> None:
-    """Raise AttitudeError unless both halves of the rows (n, 6) are of unit length."""
+    """Raise AttitudeError unless both halves (3,) of each row of an array (n, 6) are unit vectors."""
     vectors = both.reshape(-1, 2, 3)
     excess = np.einsum("nij,nij->ni", vectors, vectors) - 1.0
-    # This sum is small if all lengths are right; a NaN fails the comparison too.
+    # The sum is small if all vectors have unit length. The comparison is also false for NaN.
     if np.vdot(excess, excess) <= (2.0 * _UNIT_TOLERANCE) ** 2:
         return
     right = np.abs(excess) <= 2.0 * _UNIT_TOLERANCE
@@ -259,10 +295,11 @@ def _check_unit_length(both: FloatArray) -> None:
 
 
 def _cofactors(gram: FloatArray, n: int, name: str) -> tuple[Rows, float]:
-    """Return adjugate and determinant of 1 - gram (3, 3), the information for weights with a sum of one.
+    """Return the adjugate and determinant of the information matrix 1 - gram (3, 3) for normalised weights.
 
-    Its eigenvalues add up to 2 and none exceeds 1, so its determinant is within a factor of two of the
-    smallest eigenvalue. Raises AttitudeError if that eigenvalue is below rounding.
+    The eigenvalues of the information matrix add up to 2 and are at most 1. The determinant is therefore
+    within a factor of two of the smallest eigenvalue. Raises AttitudeError if the smallest eigenvalue is
+    below the rounding error.
     """
     rows = (_EYE - gram).tolist()
     cofactors = adjugate(rows)

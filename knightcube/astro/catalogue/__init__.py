@@ -1,11 +1,11 @@
-"""The star catalogue: Hipparcos to V 8.5, positions in ICRS at epoch J1991.25, proper motions, magnitudes.
+"""Star catalogue: Hipparcos stars to V 8.5 with ICRS positions at J1991.25, proper motions, magnitudes.
 
-The table `hipparcos.npz` holds integers, so that it is the same on every machine: milliarcseconds of right
-ascension and declination (at most 0.71 mas from the source), and the published proper motions in 0.01 mas per
-year and magnitudes in 0.01 mag. `knightcube.astro.catalogue.build` builds it.
+The table `hipparcos.npz` is built by `knightcube.astro.catalogue.build`. It contains integers, so that its
+content does not depend on the machine. Right ascension and declination are stored in milliarcseconds (rounded
+by at most 0.71 mas), proper motions in 0.01 mas per year, and magnitudes in 0.01 mag.
 
 Directions are in the Hipparcos frame, without parallax (at most 0.75") and aberration (20"). An unresolved
-close pair is one entry with the joint magnitude, as in Hipparcos.
+close pair of stars is one entry with the combined magnitude, as in Hipparcos.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ COLUMNS = {
     "proper_motion": np.int32,
     "magnitude": np.int16,
 }
-"""The table's columns: -, mas, mas, 0.01 mas/yr (n, 2) as mu_alpha cos(delta) and mu_delta, 0.01 mag."""
+"""Integer types of the table's columns.
+
+Right ascension and declination are in mas, and magnitudes in 0.01 mag. Proper motions (n, 2), mu_alpha
+cos(delta) and mu_delta, are in 0.01 mas/yr.
+"""
 
 _DAMAGED = (
     OSError,
@@ -44,18 +48,18 @@ _DAMAGED = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""Exceptions of a damaged archive; RuntimeError marks an unknown compression or encryption."""
+"""Exceptions that a damaged table can raise. RuntimeError indicates unknown compression or encryption."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarCatalogue:
-    """Stars in order of brightness, the brightest first; the arrays are read-only.
+    """Catalogue of stars in order of brightness, brightest first. The arrays are read-only.
 
     Attributes:
-        hip: (n,) int32 Hipparcos numbers.
-        direction: (n, 3) unit vectors, ICRS, at epoch J1991.25.
-        proper_motion: (n, 2) rad/yr: mu_alpha cos(delta) and mu_delta.
-        magnitude: (n,) Johnson V.
+        hip: (n,) Hipparcos numbers.
+        direction: (n, 3) ICRS unit vectors at epoch J1991.25.
+        proper_motion: (n, 2) proper motions mu_alpha cos(delta) and mu_delta, rad/yr.
+        magnitude: (n,) Johnson V magnitudes.
     """
 
     hip: npt.NDArray[np.int32]
@@ -67,10 +71,10 @@ class StarCatalogue:
         return len(self.hip)
 
     def directions_at(self, year: float) -> FloatArray:
-        """Return unit vectors (n, 3), ICRS, at Julian year `year`.
+        """Return ICRS unit vectors (n, 3) of the stars at a Julian year.
 
-        Each star keeps its speed along the tangent at J1991.25; its radial velocity is assumed zero
-        (ESA SP-1200, vol. 1, 1.5.5). Raises ValueError when `year` is not finite.
+        Stars are assumed to move uniformly along the tangent at J1991.25, with zero radial velocity (ESA
+        SP-1200, vol. 1, section 1.5.5). Raises ValueError if `year` is not finite.
         """
         if not np.isfinite(year):
             raise ValueError(f"year = {year!r}: a catalogue epoch is a finite Julian year, such as 2030.5")
@@ -83,7 +87,7 @@ class StarCatalogue:
         return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
     def brighter_than(self, magnitude: float) -> StarCatalogue:
-        """Return the stars with V below `magnitude`, without copying."""
+        """Return the stars with a V magnitude below `magnitude`, without copying the arrays."""
         count = int(np.searchsorted(self.magnitude, magnitude, side="left"))
         return StarCatalogue(
             self.hip[:count], self.direction[:count], self.proper_motion[:count], self.magnitude[:count]
@@ -92,7 +96,7 @@ class StarCatalogue:
 
 @cache
 def load(table: Path = TABLE) -> StarCatalogue:
-    """Return the catalogue, read once per process. Raises InputError if the table is missing or damaged."""
+    """Return the star catalogue, which is cached. Raises InputError if the table is missing or damaged."""
     try:
         with table.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             columns = {name: stored[name] for name in COLUMNS}
@@ -144,5 +148,7 @@ PROPER_NAMES: dict[int, str] = {
     112029: "Homam", 112122: "Tiaki", 112158: "Matar", 113368: "Fomalhaut", 113881: "Scheat",
     113963: "Markab",
 }  # fmt: skip
-"""Proper names of bright stars by Hipparcos number, as approved by the IAU Working Group on Star Names. Each
-Hipparcos number is the number of the star's brightest entry."""
+"""Proper names of bright stars by Hipparcos number, as approved by the IAU Working Group on Star Names.
+
+A star with several Hipparcos entries has the number of its brightest entry.
+"""

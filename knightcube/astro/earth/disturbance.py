@@ -1,12 +1,12 @@
-"""Models of the disturbance torques on a satellite: a constant one, and those by air and by sunlight.
+"""Disturbance torques on a satellite by air drag, solar radiation pressure, and a constant torque.
 
-The direction of each torque follows from the orbit; its size is estimated in flight. The drag of the air,
-which rotates with the Earth, is four times as strong below the diurnal bulge as at night (Montenbruck & Gill
-2000, 3.5.2: cos^4 of half the angle from an apex 30 deg behind the Sun). Sunlight presses away from the Sun.
-Each torque is c x d. c is a constant of the body, N m (force times the lever arm of the centre of pressure).
-d is the direction in body axes, times the strength and the exposed area. The areas are those of the
-homogeneous box that has the body's moments of inertia: a long body meets three times as much air across as
-along. A torque that is constant in body axes represents all other torques.
+The directions of the drag and radiation torques follow from the orbit. The magnitudes of all torques are
+estimated in flight. The atmosphere rotates with the Earth, and its density in the diurnal bulge is four times
+the density at night (Montenbruck & Gill 2000, section 3.5.2: cos^4 of half the angle from an apex 30 deg
+behind the Sun). Each torque is the cross product c x d. The vector c (N m) is a constant of the body: force
+times the lever arm of the centre of pressure. The vector d is the direction of the pressure in body axes,
+times its relative strength and the exposed area. The areas are those of a homogeneous box with the moments of
+inertia of the body. A constant torque in body axes represents all other torques.
 """
 
 from __future__ import annotations
@@ -23,30 +23,40 @@ from knightcube.astro.earth.orientation import ROTATION_RATE
 
 CONSTANT, AIR, LIGHT = slice(0, 3), slice(3, 6), slice(6, 9)
 SIZES = 9
-"""Number of torque sizes (N m): three each of the constant torque, of air and of sunlight."""
+"""Number of estimated torque components (N m): three each for the constant torque, air and sunlight."""
 _NIGHT, _DAY = 0.4, 1.6
-"""Relative density of the air at night and below the diurnal bulge."""
+"""Relative density of the air at night and in the diurnal bulge."""
 _LAG = math.radians(30.0)
-"""Angle (rad) of the diurnal bulge behind the Sun."""
+"""Angle (rad) by which the diurnal bulge lags behind the Sun."""
 _THINNEST = 0.02
-"""Smallest square of a side of the box, relative to the largest moment over a twelfth of the mass."""
+"""Minimum squared side of the box, relative to the largest moment of inertia divided by (mass / 12)."""
 _HEIGHT, _SCALE_HEIGHT = EARTH_RADIUS + 500e3, 65e3
-"""Distance (m) from the Earth's centre at which the density is one, and scale height (m) there."""
+"""Geocentric distance (m) at which the relative air density is one, and scale height (m) of the air."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pressures:
-    """Directions times strengths (n, 3), ICRS: of the motion through the air, and to the Sun (`light`)."""
+    """Pressure vectors: directions multiplied by relative strengths.
+
+    Attributes:
+        air: (n, 3) direction of the motion through the air times relative air density, ICRS axes.
+        light: (n, 3) direction to the Sun times visible fraction of the Sun's disc, ICRS axes.
+    """
 
     air: FloatArray
     light: FloatArray
 
     def until(self, count: int) -> Pressures:
-        """Return the pressures at the first `count` instants."""
+        """Return the pressures at the first `count` times."""
         return Pressures(self.air[:count], self.light[:count])
 
     def facing(self, areas: FloatArray, to_body: FloatArray) -> Pressures:
-        """Return the pressures times the area that a box of `areas` (3,) exposes, at attitudes (n, 3, 3)."""
+        """Return the pressures multiplied by the exposed area of a box.
+
+        Args:
+            areas: (3,) relative areas of the faces of the box.
+            to_body: (n, 3, 3) attitude matrices from ICRS to body axes.
+        """
         found = [
             vector * exposed_area(areas, np.einsum("nij,nj->ni", to_body, vector))
             for vector in (self.air, self.light)
@@ -55,7 +65,15 @@ class Pressures:
 
 
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
-    """Return the pressures at times (n,) s: of air about one at 500 km, of light one in full sunlight."""
+    """Return the pressures along an orbit.
+
+    The strength of the air pressure is about one at an altitude of 500 km. The strength of the light is one
+    in full sunlight.
+
+    Args:
+        ephemeris: predicted orbit.
+        times: (n,) times of the ephemeris, s.
+    """
     position, velocity = ephemeris.position_at(times), ephemeris.velocity_at(times)
     sun = ephemeris.sun_at(times)
     distance = np.linalg.norm(position, axis=1)
@@ -73,25 +91,38 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
 
 
 def box_areas(inertia: FloatArray) -> FloatArray:
-    """Return the areas (3,) of the faces of a homogeneous box, scaled to a mean projected area of one.
+    """Return the relative areas (3,) of the faces of a homogeneous box with a given inertia.
 
-    `inertia` (3, 3) kg m^2 has principal axes near the body's. If no homogeneous box has its moments, the
-    box is flat.
+    The areas are scaled to a mean projected area of one. If a homogeneous box cannot have these moments of
+    inertia, a flat box is used.
+
+    Args:
+        inertia: (3, 3) inertia matrix of the body, whose principal axes are close to the body axes, kg m^2.
     """
     moments = np.diag(inertia)
-    square = np.maximum(0.5 * moments.sum() - moments, _THINNEST * moments.max())  # sides, by mass / 12
+    square = np.maximum(0.5 * moments.sum() - moments, _THINNEST * moments.max())  # side^2 mass / 12
     areas = np.sqrt(square.prod() / square)
     return np.asarray(2.0 * areas / areas.sum())
 
 
 def exposed_area(areas: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return the projected area (n, 1) of a box of `areas` (3,) along directions (n, 3), body axes."""
+    """Return the projected areas (n, 1) of a box in given directions.
+
+    Args:
+        areas: (3,) relative areas of the faces of the box.
+        direction: (n, 3) directions in body axes, not necessarily unit vectors.
+    """
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     return np.asarray((np.abs(direction) @ areas)[:, None] / np.where(length > 0.0, length, 1.0))
 
 
 def shapes(found: Pressures, to_body: FloatArray) -> FloatArray:
-    """Return the torques (n, 3, 9) for one newton metre of each size; `to_body` (n, 3, 3) is from ICRS."""
+    """Return the derivatives (n, 3, 9) of the torque in body axes with respect to the torque components.
+
+    Args:
+        found: pressures multiplied by the exposed areas.
+        to_body: (n, 3, 3) attitude matrices from ICRS to body axes.
+    """
     torque = np.empty((len(to_body), 3, SIZES))
     torque[:, :, CONSTANT] = np.eye(3)
     # c x d = -[d x] c

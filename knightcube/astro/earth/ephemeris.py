@@ -1,11 +1,13 @@
-"""Predictions along an orbit: position, velocity, magnetic field and Sun.
+"""Predictions of position, velocity, geomagnetic field and Sun along an orbit.
 
-`predict` computes an `Ephemeris` outside the control loop (0.3 ms an instant): positions are interpolated by
-cubic Hermite polynomials, field and Sun linearly. Steps of 10 s leave errors of 1 mm and 3 nT.
+The function `predict` computes an `Ephemeris` outside the control loop, which takes 0.3 ms per time step.
+Positions are interpolated by cubic Hermite polynomials, and the field and the Sun linearly. With steps of 10
+s, the interpolation errors are 1 mm and 3 nT.
 
-`FieldAhead` predicts the field an hour ahead within the control loop. The whole model takes 0.3 ms an
-instant. Each call therefore adds a few nodes, a minute apart, between which the field is linear. Beyond the
-last node the field is that of the dipole alone, whose direction has an error of 9 deg rms.
+The class `FieldAhead` predicts the geomagnetic field up to an hour ahead within the control loop. Because the
+full model takes 0.3 ms per time, each call adds only a few nodes at intervals of one minute, between which
+the field is interpolated linearly. Beyond the last node a dipole model is used, whose direction has an error
+of 9 deg RMS.
 """
 
 from __future__ import annotations
@@ -23,18 +25,20 @@ from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
 
 STEP = 10.0
-"""Time between the instants, s."""
+"""Default time step of an ephemeris, s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ephemeris:
-    """Predictions at `times` (n,) s after `julian_date` UTC, all in ICRS axes.
+    """Predictions along an orbit at equidistant times. All vectors are in ICRS axes.
 
     Attributes:
-        position, velocity: (n, 3) m and m/s.
-        field: (n, 3) T.
-        sun: (n, 3) m, geocentric.
-        sunlit: (n,) share of the Sun's disc in view.
+        julian_date: Julian date UTC of the start of the prediction.
+        times: (n,) times after the start, s.
+        position, velocity: (n, 3) geocentric position, m, and velocity, m/s.
+        field: (n, 3) geomagnetic field, T.
+        sun: (n, 3) geocentric position of the Sun, m.
+        sunlit: (n,) visible fraction of the Sun's disc.
     """
 
     julian_date: float
@@ -46,7 +50,7 @@ class Ephemeris:
     sunlit: FloatArray
 
     def position_at(self, times: FloatArray) -> FloatArray:
-        """Return positions (m, 3) m at `times` (m,) s. Raises OrbitError outside the prediction."""
+        """Return the positions (m, 3), m, at times (m,), s. Raises OrbitError outside the prediction."""
         before, share, span = self._interval(times)
         s = share[:, None]
         start, end = self.position[before], self.position[before + 1]
@@ -55,7 +59,7 @@ class Ephemeris:
         return np.asarray(start + s * (end - start) + s * (1.0 - s) * bend)
 
     def velocity_at(self, times: FloatArray) -> FloatArray:
-        """Return velocities (m, 3) m/s at `times` (m,) s: the derivative of `position_at`."""
+        """Return the velocities (m, 3), m/s, at times (m,), s, as the derivative of `position_at`."""
         before, share, span = self._interval(times)
         s = share[:, None]
         start, end = self.position[before], self.position[before + 1]
@@ -66,16 +70,16 @@ class Ephemeris:
         )
 
     def field_at(self, times: FloatArray) -> FloatArray:
-        """Return the field (m, 3) T at `times` (m,) s."""
+        """Return the geomagnetic field (m, 3), T, at times (m,), s."""
         return self._linear(self.field, times)
 
     def sun_at(self, times: FloatArray) -> FloatArray:
-        """Return the Sun's direction (m, 3) from the satellite at `times` (m,) s."""
+        """Return the unit vectors (m, 3) from the satellite to the Sun at times (m,), s."""
         towards = self._linear(self.sun, times) - self.position_at(times)
         return np.asarray(towards / np.linalg.norm(towards, axis=1, keepdims=True))
 
     def sunlit_at(self, times: FloatArray) -> FloatArray:
-        """Return the visible share (m,) of the Sun's disc at `times` (m,) s."""
+        """Return the visible fraction (m,) of the Sun's disc at times (m,), s."""
         return self._linear(self.sunlit[:, None], times)[:, 0]
 
     def _linear(self, values: FloatArray, times: FloatArray) -> FloatArray:
@@ -86,7 +90,7 @@ class Ephemeris:
     def _interval(
         self, times: FloatArray
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], FloatArray, float]:
-        """Return the instant before each time, the share of the step since then, and the step, s."""
+        """Return interval index (m,) and fraction (m,) within the interval of each time, and the step, s."""
         times = np.atleast_1d(times)
         step = float(self.times[1] - self.times[0])
         position = (times - self.times[0]) / step
@@ -101,10 +105,15 @@ class Ephemeris:
 
 
 def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris:
-    """Return the ephemeris of the next `duration` s after a state of the orbit, under J2.
+    """Return the ephemeris for a time interval after an orbit state, including the oblateness term J2.
 
-    The neglected air and gravity move a satellite by a kilometre in two revolutions, 15 nT of its field.
-    Raises GeomagneticError outside the years of the field model.
+    The neglected drag and higher gravity terms shift a satellite by one kilometre in two revolutions, which
+    changes the field by 15 nT. Raises GeomagneticError outside the years of the field model.
+
+    Args:
+        state: orbit state at the start.
+        duration: duration of the prediction, s.
+        step: time step, s.
     """
     times: FloatArray = step * np.arange(np.ceil(duration / step) + 2.0)
     dates = state.julian_date + times / DAY
@@ -127,24 +136,29 @@ def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris
 
 
 _DIPOLE = 1e-9 * np.array([-1410.8, 4545.4, -29351.8])
-"""g11, h11 and g10 of WMM2025 (NOAA NCEI and British Geological Survey 2025), T, ITRS axes."""
+"""Dipole coefficients g11, h11 and g10 of WMM2025 (NOAA NCEI and British Geological Survey 2025), T."""
 _REFERENCE_RADIUS = 6_371_200.0
-"""Radius to which the coefficients refer, m."""
+"""Reference radius of the dipole coefficients, m."""
 _CORRECTION_TIME = 400.0
-"""Time (s) over which the correction of the dipole to the present field decays."""
+"""Time constant (s) with which the correction of the dipole to the current field decays."""
 NODE_STEP = 60.0
-"""Time between the nodes, s: the field rotates by 8 deg and is 0.2 % too weak between them."""
+"""Time between two nodes, s. The field rotates by 8 deg, and linear interpolation is 0.2 % too weak."""
 NODES_PER_CALL = 5
-"""Number of nodes that one call adds."""
+"""Maximum number of nodes that one call adds."""
 LARGEST_JUMP = 50e3
-"""Change (m) of the known orbit, as at the first fix after a wrong clock, that discards all nodes."""
+"""Change (m) of the known orbit above which all nodes are discarded, for example after a clock error."""
 
 
 def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) -> FloatArray:
-    """Return the field (n, 3) T, ICRS, at `times` (n,) s after a state, where the field is `field` (3,) T.
+    """Return the field (n, 3) in ICRS axes, T, predicted by a dipole model.
 
-    The dipole follows a circle with the satellite's present position, direction and angular rate. It is
-    rotated and scaled to the present field; this correction decays.
+    The satellite is assumed to move along a circle with its current position, direction and angular rate. The
+    dipole field is rotated and scaled to agree with the current field, and this correction decays with time.
+
+    Args:
+        state: current orbit state.
+        field: (3,) current field in ICRS axes, T.
+        times: (n,) times after the current state, s.
     """
     all_times = np.concatenate([[0.0], times])
     distance = float(np.linalg.norm(state.position))
@@ -159,7 +173,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
     along = np.einsum("ni,ni->n", dipole, direction)[:, None]
     found = np.asarray((_REFERENCE_RADIUS / distance) ** 3 * (3.0 * along * direction - dipole))
     first = found[0]
-    across = np.cross(field, first)  # rotates `first` into `field`, with the signs of attitude_matrix
+    across = np.cross(field, first)  # axis of the rotation of `first` into `field`
     length = float(np.linalg.norm(across))
     weight = np.exp(-times / _CORRECTION_TIME)[:, None]
     angle_off = math.atan2(length, float(first @ field))
@@ -169,7 +183,7 @@ def dipole_field_ahead(state: OrbitState, field: FloatArray, times: FloatArray) 
 
 
 class FieldAhead:
-    """Predicts the field along the orbit; keeps the nodes between calls."""
+    """Predictor of the geomagnetic field along an orbit, which stores the computed nodes between calls."""
 
     def __init__(self) -> None:
         self._begin = 0.0
@@ -177,9 +191,13 @@ class FieldAhead:
         self._fields: list[FloatArray] = []
 
     def along(self, state: OrbitState, times: FloatArray) -> FloatArray:
-        """Return the field (n, 3) T, ICRS, at increasing `times` (n,) s after a state of the orbit.
+        """Return the geomagnetic field (n, 3) in ICRS axes, T, along the orbit.
 
         Raises GeomagneticError if the state itself is outside the years of the model.
+
+        Args:
+            state: current orbit state.
+            times: (n,) increasing times after the current state, s.
         """
         since = self._restart(state)
         last = since + float(times[-1])
@@ -205,7 +223,10 @@ class FieldAhead:
         return NODE_STEP * (len(self._fields) - 1)
 
     def _restart(self, state: OrbitState) -> float:
-        """Discard nodes that are past or do not fit; return the time since the first node, s."""
+        """Discard past nodes, or all nodes if they contradict the state.
+
+        Returns the time (s) since the first node.
+        """
         since = (state.julian_date - self._begin) * DAY
         fits = 0.0 <= since <= self._span
         if fits:
@@ -224,7 +245,7 @@ class FieldAhead:
         return since
 
     def _extend(self) -> bool:
-        """Add one node; return False if it lies beyond the years of the model."""
+        """Add one node. Return False if the node is outside the years of the field model."""
         after = propagated(self._states[-1], NODE_STEP)
         try:
             there = field(self._begin + (self._span + NODE_STEP) / DAY, after[:3])

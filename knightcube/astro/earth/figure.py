@@ -1,4 +1,4 @@
-"""The Earth's gravity constants and its figure as an ellipsoid of revolution."""
+"""Gravity constants of the Earth and dimensions of the WGS 84 ellipsoid."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ SEMI_MINOR_AXIS = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
 
 
 def semi_axes(height: float = 0.0) -> FloatArray:
-    """Return the semi-axes (3,) m, pole last, of the ellipsoid `height` m above the WGS 84 one.
+    """Return the semi-axes (3,), m, of an ellipsoid at a height (m) above the WGS 84 ellipsoid, pole last.
 
-    Both axes are longer by the height; at 20 km this differs from the true surface of that height by
-    centimetres.
+    The height is added to all semi-axes. At a height of 20 km, this ellipsoid differs from the true surface
+    of constant height by centimetres.
     """
     return np.array([SEMI_MAJOR_AXIS, SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS]) + height

@@ -1,8 +1,9 @@
-"""The geomagnetic field in orbit: the World Magnetic Model of 2025.
+"""Geomagnetic field by the World Magnetic Model 2025 (WMM2025).
 
-NOAA NCEI and British Geological Survey, The US/UK World Magnetic Model for 2025-2030 (2025), degree 12,
-through pygeomag. It models the field of the core, without crust, ionosphere and ring current. Its stated
-error on the ground is 89 to 141 nT per component. It is valid until 2030.
+The model of degree 12 (NOAA NCEI and British Geological Survey, The US/UK World Magnetic Model for 2025-2030,
+2025) is evaluated by pygeomag. WMM2025 describes the field of the Earth's core, without crust, ionosphere and
+ring current. Its stated error on the ground is 89 to 141 nT per component. The model is valid from 2025 to
+2030.
 """
 
 from __future__ import annotations
@@ -27,13 +28,19 @@ NANOTESLA = 1e-9
 
 
 class GeomagneticError(FlightError):
-    """Raised for a time or a position outside the model."""
+    """Raised for a time or position outside the validity of the field model."""
 
 
 def field_on_ground_axes(year: float, latitude: float, longitude: float, height: float) -> FloatArray:
-    """Return the field (3,) T, north, east and down, at geodetic coordinates (rad, m over WGS 84).
+    """Return the north, east and down components (3,) of the geomagnetic field, T, at geodetic coordinates.
 
-    Raises GeomagneticError outside 2025.0..2030.0, for values that are not finite and for invalid latitudes.
+    Raises GeomagneticError for a year outside 2025.0 to 2030.0 and for an invalid position.
+
+    Args:
+        year: decimal year.
+        latitude: geodetic latitude, rad.
+        longitude: longitude, rad.
+        height: height above the WGS 84 ellipsoid, m.
     """
     if not FIRST_YEAR <= year <= LAST_YEAR:
         raise GeomagneticError(f"year {year:.2f}: WMM2025 is valid from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
@@ -41,16 +48,20 @@ def field_on_ground_axes(year: float, latitude: float, longitude: float, height:
         raise GeomagneticError(
             f"invalid position: latitude {latitude}, longitude {longitude} rad, height {height} m"
         )
-    # pygeomag takes longitudes in (-180, 180] deg and heights in km.
+    # pygeomag expects longitudes from -180 to 180 deg and heights in km.
     east = math.degrees(math.remainder(longitude, 2.0 * math.pi))
     found = _model().calculate(math.degrees(latitude), east, 1e-3 * height, year)
     return NANOTESLA * np.array([found.x, found.y, found.z])
 
 
 def field(julian_date: float, position: FloatArray) -> FloatArray:
-    """Return the field (3,) T, ICRS axes, at a Julian date UTC and a position (3,) m, ICRS.
+    """Return the geomagnetic field (3,) in ICRS axes, T, at a time and a geocentric position.
 
-    Takes 0.2 ms. Raises GeomagneticError outside the model's years.
+    A call takes 0.2 ms. Raises GeomagneticError outside the years of the model.
+
+    Args:
+        julian_date: Julian date UTC.
+        position: (3,) geocentric position in ICRS axes, m.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     longitude, latitude, height = (float(part) for part in geodetic(to_ground @ position))
@@ -62,5 +73,5 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 
 @cache
 def _model() -> GeoMag:
-    # The file is named, because pygeomag's default depends on its release.
+    # The coefficient file is stated explicitly, because the default of pygeomag depends on its version.
     return GeoMag(coefficients_file="wmm/WMM_2025.COF")

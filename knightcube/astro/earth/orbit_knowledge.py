@@ -1,8 +1,8 @@
-"""The satellite's position and velocity in ICRS, from the last GPS fix or from two-line elements.
+"""Position and velocity of the satellite in ICRS axes, from the last GPS fix or from two-line elements.
 
-A fix is propagated by Newton's law with the Earth's oblateness J2, in Runge-Kutta steps of at most 30 s.
-Two-line elements use SGP4 (Vallado, Crawford, Hujsak and Kelso, AIAA 2006-6753), accurate to one to three km
-near their epoch.
+A GPS fix is propagated with the gravity of a spherical Earth and the oblateness term J2, by Runge-Kutta steps
+of at most 30 s. Two-line elements are propagated by SGP4 (Vallado, Crawford, Hujsak and Kelso, AIAA
+2006-6753), with an error of one to three kilometres near the epoch of the elements.
 """
 
 from __future__ import annotations
@@ -27,12 +27,19 @@ _LONGEST_STEP = 30.0
 
 
 class OrbitError(FlightError):
-    """Raised if no orbit is known at a time: it has decayed, or the fix is too old."""
+    """Raised if the orbit is unknown at a time, because the last fix is too old or the orbit has decayed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitState:
-    """Position (3,) m and velocity (3,) m/s, ICRS, at a Julian date UTC; `sigma` m is the error per axis."""
+    """Position and velocity of the satellite at a given time.
+
+    Attributes:
+        julian_date: Julian date UTC.
+        position: (3,) geocentric position in ICRS axes, m.
+        velocity: (3,) geocentric velocity in ICRS axes, m/s.
+        sigma: standard deviation of the position per axis, m.
+    """
 
     julian_date: float
     position: FloatArray
@@ -41,16 +48,21 @@ class OrbitState:
 
     @property
     def nadir(self) -> FloatArray:
-        """The direction (3,) of the Earth's centre."""
+        """Unit vector (3,) from the satellite to the centre of the Earth."""
         return np.asarray(-self.position / np.linalg.norm(self.position))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsFix:
-    """A GPS receiver's fix, ITRS axes: position (3,) m, velocity (3,) m/s with respect to the ground.
+    """Fix of a GPS receiver.
 
-    `sigma` m is the error of the position, `velocity_sigma` m/s that of the velocity. The fix is not used
-    after `longest_age` s.
+    Attributes:
+        julian_date: Julian date UTC of the fix.
+        position: (3,) geocentric position in ITRS axes, m.
+        velocity: (3,) velocity with respect to the ground in ITRS axes, m/s.
+        sigma: standard deviation of the position per axis, m.
+        velocity_sigma: standard deviation of the velocity per axis, m/s.
+        longest_age: maximum time over which the fix is propagated, s.
     """
 
     julian_date: float
@@ -61,7 +73,7 @@ class GpsFix:
     longest_age: float = 1500.0
 
     def __post_init__(self) -> None:
-        """Raise OrbitError for values that no receiver in orbit measures."""
+        """Raise OrbitError for values that are not finite and for a position inside the Earth."""
         numbers = np.array([self.julian_date, *self.position, *self.velocity])
         if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
             raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
@@ -69,7 +81,7 @@ class GpsFix:
             raise OrbitError(f"fix at {self.julian_date}: {self.position} m is within the Earth")
 
     def at(self, julian_date: float) -> OrbitState:
-        """Return the state propagated to a Julian date UTC. Raises OrbitError for an old fix."""
+        """Return the orbit state propagated to a Julian date UTC. Raises OrbitError if the fix is too old."""
         age = (julian_date - self.julian_date) * DAY
         if not abs(age) <= self.longest_age:
             raise OrbitError(f"the last fix is {age:.0f} s old: fixes are used for {self.longest_age:g} s")
@@ -77,21 +89,30 @@ class GpsFix:
         with_ground = self.velocity + np.cross([0.0, 0.0, ROTATION_RATE], self.position)
         state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
         later = propagated(state, age)
-        # An along-track velocity error moves the satellite three times as far as in free space.
+        # In orbit, an along-track velocity error causes three times the position error of free space.
         sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
         return OrbitState(julian_date, later[:3], later[3:], sigma)
 
 
 class TwoLineElements:
-    """A two-line element set; its error `sigma` m per axis grows by `growth` m per day from its epoch."""
+    """Two-line element set, whose assumed position error grows linearly with the time since its epoch."""
 
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
-        """Read the two lines. Raises UsageError for invalid lines and for elements that describe no orbit."""
+        """Read a two-line element set.
+
+        Raises UsageError for invalid lines and for elements that do not describe an orbit.
+
+        Args:
+            first: first line of the element set.
+            second: second line of the element set.
+            sigma: standard deviation of the position per axis at the epoch of the elements, m.
+            growth: growth of the standard deviation with the time from the epoch, m per day.
+        """
         for number, line in (("1", first), ("2", second)):
             _check_line(number, line.rstrip())
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
         if not 1.0 <= self._satellite.epochdays < 367.0:
-            # SGP4 propagates resonant orbits from their epoch in steps of half a day: 1e12 days never end.
+            # SGP4 propagates resonant orbits from the epoch in steps of half a day, which would take forever.
             raise UsageError(f"{first.rstrip()!r}: the day of the year of its epoch must be from 1 to 366")
         code, *state = self._satellite.sgp4_tsince(0.0)
         if code or not np.all(np.isfinite(state)):
@@ -102,7 +123,7 @@ class TwoLineElements:
         self._sigma, self._growth = sigma, growth
 
     def at(self, julian_date: float) -> OrbitState:
-        """Return the state at a Julian date UTC. Raises OrbitError where SGP4 fails."""
+        """Return the orbit state at a Julian date UTC. Raises OrbitError if SGP4 fails."""
         whole = math.floor(julian_date)
         code, position, velocity = self._satellite.sgp4(whole, julian_date - whole)
         if code:
@@ -116,7 +137,10 @@ class TwoLineElements:
 
 
 def propagated(state: FloatArray, duration: float) -> FloatArray:
-    """Return position and velocity (6,), m and m/s, after `duration` s, by classical Runge-Kutta."""
+    """Return the position (m) and velocity (m/s), together (6,), after a duration (s).
+
+    The equations of motion are integrated by the classical Runge-Kutta method.
+    """
     steps = max(1, math.ceil(abs(duration) / _LONGEST_STEP))
     dt = duration / steps
     for _ in range(steps):
@@ -129,7 +153,7 @@ def propagated(state: FloatArray, duration: float) -> FloatArray:
 
 
 def _flow(state: FloatArray) -> FloatArray:
-    """Return velocity and acceleration (6,) under a spherical Earth and J2 (Sease 2.14)."""
+    """Return velocity and acceleration, together (6,), for a spherical Earth with J2 (Sease, eq. 2.14)."""
     position = state[:3]
     squared = float(position @ position)
     pull = -GRAVITATIONAL_PARAMETER / squared**1.5
@@ -140,7 +164,7 @@ def _flow(state: FloatArray) -> FloatArray:
 
 
 def _check_line(number: str, line: str) -> None:
-    """Raise UsageError unless `line` is that line of a two-line element set."""
+    """Raise UsageError unless `line` is valid as line `number` of a two-line element set."""
     if len(line) != 69 or not line.startswith(f"{number} "):
         raise UsageError(
             f"{line!r}: line {number} of a two-line element set has 69 columns and starts with {number}"

@@ -1,9 +1,9 @@
-"""The Earth's orientation: rotations between ICRS (GCRS, the stars) and ITRS (the ground), and time scales.
+"""Orientation of the Earth: rotations between celestial (ICRS) and terrestrial (ITRS) axes, and time scales.
 
-The model is IAU 2006/2000B through ERFA, with an error of a milliarcsecond of the pole. UT1 is assumed equal
-to UTC unless given (they differ by at most 0.9 s, 13" of rotation), and polar motion (0.3") zero. Julian
-dates are UTC; TT is 69.184 s ahead of UTC since 2017. A Julian date as a float has a resolution of 40 us,
-0.3 m along a low orbit.
+The precession-nutation model is IAU 2006/2000B, computed by ERFA, with an error of one milliarcsecond. UT1 is
+assumed to equal UTC unless the difference is given. The difference is at most 0.9 s, or 13" of Earth
+rotation. Polar motion (0.3") is neglected. Julian dates are UTC, and TT is 69.184 s ahead of UTC since 2017.
+A Julian date as a double-precision number has a resolution of 40 us, or 0.3 m along a low orbit.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.sun import DAY, J2000
 
 TT_MINUS_UTC = 69.184
-"""TT - UTC, s: 32.184 and 37 leap seconds (IERS Bulletin C 52 and later)."""
+"""Difference TT - UTC, s: 32.184 s plus 37 leap seconds (IERS Bulletin C 52 and later)."""
 ROTATION_RATE = 7.292115e-5
 """Rotation rate of the Earth, rad/s (WGS 84)."""
 JULIAN_YEAR = 365.25
@@ -24,19 +24,19 @@ JULIAN_YEAR = 365.25
 
 
 def terrestrial_time(julian_date: npt.ArrayLike) -> FloatArray:
-    """Return the Julian date TT (...) of a Julian date UTC (...)."""
+    """Return the Julian dates TT (...) for Julian dates UTC (...)."""
     return np.asarray(np.asarray(julian_date, dtype=float) + TT_MINUS_UTC / DAY)
 
 
 def julian_epoch(julian_date: npt.ArrayLike) -> FloatArray:
-    """Return the year (...), such as 2026.89, of a Julian date (...)."""
+    """Return the Julian epochs (...), such as 2026.89, of Julian dates (...)."""
     return np.asarray(2000.0 + (np.asarray(julian_date, dtype=float) - J2000) / JULIAN_YEAR)
 
 
 def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
     """Return the matrices (..., 3, 3) that rotate vectors from ICRS to ITRS at Julian dates UTC (...)."""
     date = np.asarray(julian_date, dtype=float)
-    # ERFA recommends TT and UT1 in two parts, whole and fraction.
+    # ERFA recommends to split a Julian date into whole days and fraction.
     whole = np.floor(date)
     day = date - whole
     return np.asarray(
@@ -47,8 +47,8 @@ def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 
 def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
     """Return the matrices (..., 3, 3) that rotate vectors from TEME, the frame of SGP4, to ICRS.
 
-    The rotation leads through ITRS, from which TEME differs by the mean sidereal time of 1982 only (Vallado,
-    Crawford, Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
+    The rotation is computed via ITRS, because TEME differs from ITRS only by the IAU 1982 mean sidereal time
+    (Vallado, Crawford, Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
     """
     date = np.asarray(julian_date, dtype=float)
     whole = np.floor(date)
@@ -68,18 +68,24 @@ def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float =
 
 
 def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return longitude (...) and geodetic latitude (...), rad, and height (...), m, over WGS 84.
+    """Return longitude (...), rad, geodetic latitude (...), rad, and height (...), m, above WGS 84.
 
-    `position` (..., 3) m is in ITRS.
+    Args:
+        position: (..., 3) geocentric positions in ITRS axes, m.
     """
     longitude, latitude, height = erfa.gc2gd(1, np.asarray(position, dtype=float))
     return np.asarray(longitude), np.asarray(latitude), np.asarray(height)
 
 
 def north_east_down(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> FloatArray:
-    """Return the matrices (..., 3, 3) whose rows are north, east and down in ITRS.
+    """Return matrices (..., 3, 3) whose rows are the unit vectors north, east and down in ITRS axes.
 
-    A geodetic latitude gives the axes of the ellipsoid, a geocentric latitude those of the sphere.
+    For a geodetic latitude, down is perpendicular to the ellipsoid. For a geocentric latitude, down points to
+    the centre of the Earth.
+
+    Args:
+        longitude: (...) longitudes, rad.
+        latitude: (...) latitudes, rad.
     """
     along, up = np.asarray(longitude, dtype=float), np.asarray(latitude, dtype=float)
     ca, sa, cu, su = np.cos(along), np.sin(along), np.cos(up), np.sin(up)

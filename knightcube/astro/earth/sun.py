@@ -1,10 +1,11 @@
-"""The Sun as seen from the Earth and from a satellite: position, constants, and the Earth's shadow.
+"""Position of the Sun relative to the Earth, Earth shadow, and astronomical constants.
 
-The Earth's position and velocity relative to the Sun are those of ERFA's epv00 (VSOP2000: Moisson &
-Bretagnon 2001), 0.35 ms a call.
+The Earth's position and velocity relative to the Sun are computed by the ERFA function epv00 (VSOP2000:
+Moisson & Bretagnon 2001), which takes 0.35 ms per call.
 
-The shadow is Sease 2.15 corrected: it is evaluated at the object's own position and by default includes the
-penumbra. The Earth is a sphere of its equatorial radius without an atmosphere.
+The shadow model is Sease, eq. 2.15, with two corrections: the shadow is evaluated at the position of the
+object, and the penumbra is included by default. The Earth is modelled as a sphere with its equatorial radius
+and without an atmosphere.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ DAY = 86_400.0
 
 
 def julian_date(utc: datetime) -> float:
-    """Return the Julian date of an instant, days; an instant without a time zone is UTC.
-
-    The result is a Julian date UTC. It differs from TT by about 69 s.
-    """
+    """Return the Julian date UTC, days, of a `datetime`, which is in UTC unless it has a time zone."""
     instant = utc.replace(tzinfo=UTC) if utc.tzinfo is None else utc
     return J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
 
 
 def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
-    """Return the Earth's position relative to the Sun (3,) m and its barycentric velocity (3,) m/s, ICRS.
+    """Return the Earth's heliocentric position (3,), m, and barycentric velocity (3,), m/s, in ICRS axes.
 
-    `julian_date` is TT. From 1900 to 2100 the errors against JPL's DE405 are below 12 km and 5 mm/s
-    (documentation of epv00).
+    From 1900 to 2100 the differences from the JPL ephemeris DE405 are below 12 km and 5 mm/s (documentation
+    of epv00).
+
+    Args:
+        julian_date: Julian date TT.
     """
-    # Imported here, because most users of this module need its constants only.
+    # ERFA is imported here, because most modules use only the constants of this module.
     import erfa  # noqa: PLC0415
 
     whole = math.floor(julian_date)
@@ -57,9 +58,10 @@ def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
 
 
 def earth_velocity(julian_date: float) -> FloatArray:
-    """Return the Earth's barycentric velocity (3,) m/s, ICRS, at a Julian date TT.
+    """Return the Earth's barycentric velocity (3,) in ICRS axes, m/s, at a Julian date TT.
 
-    It gives the annual aberration. The orbital velocity of a satellite, 7.6 km/s or 5", adds to it.
+    This velocity causes the annual aberration. The orbital velocity of a satellite in a low orbit (7.6 km/s)
+    causes an additional aberration of 5".
     """
     return earth_from_sun(julian_date)[1]
 
@@ -68,10 +70,15 @@ Shadow = Literal["conical", "cylindrical"]
 
 
 def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> FloatArray:
-    """Return the share (...) of the Sun's disc visible from `position` (..., 3) m: 0 in the umbra.
+    """Return the visible fraction (...) of the Sun's disc, which is 1 in sunlight and 0 in the Earth's umbra.
 
-    `sun` (..., 3) m is the geocentric position of the Sun. "conical" uses the overlap of the discs of Sun
-    and Earth (Montenbruck & Gill 2000, 3.4.2); "cylindrical" gives 0 or 1 (Sease 2.15 corrected).
+    The "conical" shadow model computes the overlap of the discs of Sun and Earth (Montenbruck & Gill 2000,
+    section 3.4.2). The "cylindrical" model returns 0 or 1 (Sease, eq. 2.15, corrected).
+
+    Args:
+        position: (..., 3) geocentric positions of the observer, m.
+        sun: (..., 3) geocentric positions of the Sun, m.
+        shadow: shadow model, "conical" or "cylindrical".
     """
     position, sun = np.asarray(position, dtype=float), np.asarray(sun, dtype=float)
     distance = np.linalg.norm(position, axis=-1)
@@ -87,17 +94,22 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
     sun_disc = np.arcsin(SUN_RADIUS / sun_distance)
     earth_disc = np.arcsin(np.minimum(1.0, EARTH_RADIUS / distance))
     cosine = -np.sum(position * to_sun, axis=-1) / (distance * sun_distance)
-    # By the cross product, because the arc cosine is imprecise near zero.
+    # The sine is computed by the cross product, because the arc cosine is inaccurate for small angles.
     sine = np.linalg.norm(np.cross(position, to_sun), axis=-1) / (distance * sun_distance)
     return 1.0 - _covered_share(sun_disc, earth_disc, np.arctan2(sine, cosine))
 
 
 def _covered_share(disc: FloatArray, cover: FloatArray, apart: FloatArray) -> FloatArray:
-    """Return the share (...) of a disc of radius `disc` that a disc of radius `cover` hides.
+    """Return the fraction (...) of one disc that is covered by another disc.
 
-    The centres are `apart`; all are angles, rad. The hidden area of two plane discs consists of the two
-    segments beyond their common chord. A plane is accurate enough because the Sun's disc is small and the
-    Earth's limb nearly straight across it.
+    The covered area of two plane discs consists of two circular segments along the common chord. The plane
+    approximation is sufficient, because the Sun's disc is small and the Earth's limb is nearly straight
+    across it.
+
+    Args:
+        disc: (...) angular radii of the covered disc, rad.
+        cover: (...) angular radii of the covering disc, rad.
+        apart: (...) angular distances of the centres, rad.
     """
     crossing = (apart < disc + cover) & (apart > np.abs(disc - cover))
     safe = np.where(crossing, apart, disc + cover)

@@ -1,6 +1,7 @@
-"""The thesis's method for streaks (Sease 2013, chapters 3 and 4).
+"""Body rate and attitude from star streaks by corner detectors (Sease 2013, chapters 3 and 4).
 
-`settings` holds settings and result, `estimator` the object that a configuration selects; neither imports
-scipy. `detectors` are the corner detectors by name, `rate` fits the rotation to the ends of the streaks,
-`two_ends` determines the attitudes at both ends of the exposure.
+The module `settings` defines settings and results, and `estimator` defines the object that a configuration
+selects. These two modules do not import scipy. The module `detectors` contains the corner detectors. The
+module `rate` fits a rotation to the ends of the streaks, and `two_ends` determines the attitudes at the start
+and end of the exposure.
 """

@@ -1,13 +1,15 @@
-"""The corner detectors of the thesis by name: an image of one region to its cornerness (Sease 3.1-3.13).
+"""Corner detectors, which compute the cornerness of each pixel in an image region (Sease, eq. 3.1-3.13).
 
-Harris's response and the structure tensor are those of `knightcube.vision.objects.streak_ends`. Trajkovic and
-Hedley: at a corner no line through the pixel keeps its intensity, so that the cornerness is the minimum over
-all directions of the squared changes towards both ends of a diameter. The intensity is interpolated linearly
-between two neighbouring diameters, for a closed form: with the squared changes r and r' along the two and t
-from 0 to 1, the change is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. B pairs the two ends of one
-diameter (3.12 corrected: the printed B1 mixes them).
+The Harris response and the structure tensor are computed by `knightcube.vision.objects.streak_ends`.
 
-Reference: Trajkovic and Hedley, Fast corner detection, Image and Vision Computing 16 (1998).
+The detector of Trajkovic and Hedley (Fast corner detection, Image and Vision Computing 16, 1998) uses the
+diameters of a small circle around a pixel. At a corner the intensity changes along every diameter. The
+cornerness is therefore the minimum, over all directions, of the sum of the squared intensity changes from the
+centre to both ends of a diameter. Between two neighbouring diameters the intensity is interpolated linearly
+with a parameter t from 0 to 1. With the squared changes r and r' along the two diameters, the squared change
+is A t^2 + 2 B t + C with C = r and A = r' - r - 2B. The coefficient B combines the two ends of the same
+diameter. Sease, eq. 3.12, is corrected in this respect, because the printed B1 mixes the ends of different
+diameters.
 """
 
 from __future__ import annotations
@@ -22,12 +24,12 @@ from knightcube.reference.corner_streaks.settings import StreakSettings
 from knightcube.vision.objects.settings import EndpointSettings
 from knightcube.vision.objects.streak_ends import StructureTensor, harris_cornerness, smoothed, tensor_of
 
-# One end (x, y) of each diameter, in order of direction.
+# The tuples are offsets (x, y) to one end of each diameter, in order of direction.
 _DIAMETERS = {4: ((1, 0), (0, 1)), 8: ((1, 0), (1, 1), (0, 1), (-1, 1))}
 
 
 def cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
-    """Return the response (rows, columns) of the detector that `settings`, of a `StreakSettings`, name."""
+    """Return the response (rows, columns) of the corner detector selected in a `StreakSettings` object."""
     assert isinstance(settings, StreakSettings)
     if settings.detector == "harris":
         return harris_cornerness(image, settings)
@@ -39,33 +41,38 @@ def cornerness(image: FloatArray, settings: EndpointSettings) -> FloatArray:
 
 
 def minimum_eigenvalue(tensor: StructureTensor) -> FloatArray:
-    """Return the smaller eigenvalue of the tensor at every pixel (3.6), never negative."""
+    """Return the smaller eigenvalue (rows, columns) of the structure tensor, at least 0 (Sease, eq. 3.6)."""
     half_trace = 0.5 * (tensor.xx + tensor.yy)
     larger = half_trace + np.hypot(0.5 * (tensor.xx - tensor.yy), tensor.xy)
     determinant = tensor.xx * tensor.yy - tensor.xy**2
-    # The determinant over the larger eigenvalue does not cancel where the smaller one is near zero.
+    # Dividing the determinant by the larger eigenvalue avoids cancellation if the smaller one is near zero.
     return np.asarray(np.maximum(determinant, 0.0) / np.where(larger > 0.0, larger, 1.0))
 
 
 class _Changes(NamedTuple):
-    """Intensities at the two ends of a diameter, minus the intensity of the centre; each (rows, columns)."""
+    """Intensity changes (rows, columns) from the centre pixel to the two ends of a diameter."""
 
     ahead: FloatArray
     behind: FloatArray
 
     @property
     def squared(self) -> FloatArray:
-        """The squared intensity change along the diameter, r_A or r_B of Sease 3.10."""
+        """Sum of the squared intensity changes along the diameter, r_A or r_B in Sease, eq. 3.10."""
         return np.asarray(self.ahead**2 + self.behind**2)
 
 
 def trajkovic_response(
     image: FloatArray, neighbours: int, coarse_relative: float, fine_relative: float
 ) -> FloatArray:
-    """Return the inter-pixel cornerness where it passes both thresholds, and zero elsewhere.
+    """Return the interpixel cornerness of pixels that pass both thresholds, and zero for other pixels.
 
-    T1 applies to the simple cornerness of the image at half scale, T2 to that of the image itself (Sease,
-    text at 3.10). Both are relative to the largest value in the image.
+    Both thresholds are relative to the largest simple cornerness in the image (Sease, text at eq. 3.10).
+
+    Args:
+        image: (rows, columns) image intensities.
+        neighbours: number of neighbour pixels used, 4 or 8.
+        coarse_relative: threshold T1 of the simple cornerness in the image at half scale.
+        fine_relative: threshold T2 of the simple cornerness in the image at full scale.
     """
     simple = simple_response(image, neighbours)
     likely = _coarse_corners(image, neighbours, coarse_relative)
@@ -74,27 +81,27 @@ def trajkovic_response(
 
 
 def simple_response(image: FloatArray, neighbours: int) -> FloatArray:
-    """Return the minimum squared intensity change over the diameters (Sease 3.9, 3.10).
+    """Return the simple cornerness: the minimum squared intensity change over the diameters.
 
-    They connect opposite pixels of 4 or 8 `neighbours`.
+    The diameters connect opposite pixels among 4 or 8 neighbours (Sease, eq. 3.9 and 3.10).
     """
     return np.asarray(np.min([changes.squared for changes in _changes(image, neighbours)], axis=0))
 
 
 def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
-    """Return the minimum squared intensity change over all directions (Sease 3.11-3.13, corrected).
+    """Return the interpixel cornerness: the minimum squared intensity change over all directions.
 
-    It is the minimum over all pairs of neighbouring diameters, which for four neighbours equals 3.11 with the
-    smaller of B1 and B2 as B.
+    The minimum is computed for each pair of neighbouring diameters (Sease, eq. 3.11-3.13, corrected). For
+    four neighbours this equals eq. 3.11 with the smaller of B1 and B2 as B.
     """
     ring = _changes(image, neighbours)
-    # The last diameter is followed by the first with its ends exchanged.
+    # The neighbour of the last diameter is the first diameter with exchanged ends.
     following = [*ring[1:], _Changes(ring[0].behind, ring[0].ahead)]
     return np.asarray(np.min([_least_between(*pair) for pair in zip(ring, following, strict=True)], axis=0))
 
 
 def _least_between(first: _Changes, second: _Changes) -> FloatArray:
-    """Return the minimum response (rows, columns) between two neighbouring diameters, both included."""
+    """Return the minimum squared change (rows, columns) over the directions from one diameter to the next."""
     r, r_second = first.squared, second.squared
     b = first.ahead * (second.ahead - first.ahead) + first.behind * (second.behind - first.behind)
     a = r_second - r - 2.0 * b
@@ -103,7 +110,7 @@ def _least_between(first: _Changes, second: _Changes) -> FloatArray:
 
 
 def _changes(image: FloatArray, neighbours: int) -> list[_Changes]:
-    """Return the intensity changes along each diameter; pixels at the border are repeated."""
+    """Return the intensity changes along each diameter. The image is extended by repeating border pixels."""
     rows, columns = image.shape
     padded = np.pad(image, 1, mode="edge")
 
@@ -114,7 +121,7 @@ def _changes(image: FloatArray, neighbours: int) -> list[_Changes]:
 
 
 def _coarse_corners(image: FloatArray, neighbours: int, relative: float) -> BoolArray:
-    """Return which pixels (rows, columns) lie at or beside a likely corner of the image at half scale."""
+    """Return a mask (rows, columns) of the pixels close to a likely corner in the image at half scale."""
     rows, columns = image.shape
     even = np.pad(image, ((0, rows % 2), (0, columns % 2)), mode="edge")
     half = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2).mean(axis=(1, 3))

@@ -1,4 +1,4 @@
-"""The estimator by corner detectors, as an object that a configuration selects and a job carries."""
+"""Streak estimator based on corner detectors, as an object that a configuration can select."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from knightcube.vision.streaks.streak_result import FrameMotion
 
 @dataclass(frozen=True, slots=True)
 class CornerEstimator:
-    """Implements `knightcube.vision.frame_job.StreakEstimator` by corner detectors.
+    """Streak estimator based on corner detectors.
 
-    The methods import scipy, which a process that only passes the estimator on does not need.
+    The class implements `knightcube.vision.frame_job.StreakEstimator`. Only the methods import scipy, so that
+    a process which only forwards this object does not load scipy.
     """
 
     settings: StreakSettings
@@ -30,7 +31,7 @@ class CornerEstimator:
         prior_sigma: float,
         previous_checksum: int | None,
     ) -> StreakResult:
-        """Return the motion over the exposure, see `rate.estimate_rate`."""
+        """Return the mean body rate over the exposure. The arguments are those of `rate.estimate_rate`."""
         from knightcube.reference.corner_streaks.rate import estimate_rate  # noqa: PLC0415
 
         return estimate_rate(
@@ -46,7 +47,10 @@ class CornerEstimator:
         settings: SolveSettings,
         prior: AttitudePrior | None,
     ) -> tuple[FrameSolution, FrameMotion]:
-        """Return attitude and rate from identified streaks, see `two_ends.solve_ends`."""
+        """Return attitude and rate from identified streaks.
+
+        The arguments are those of `two_ends.solve_ends`.
+        """
         from knightcube.reference.corner_streaks.two_ends import solve_ends  # noqa: PLC0415
 
         assert isinstance(found, StreakResult)

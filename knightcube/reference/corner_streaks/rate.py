@@ -1,11 +1,12 @@
-"""The mean rate over one exposure from the ends of its streaks: Sease chapters 3 and 4, corrected.
+"""Mean body rate over one exposure from the ends of the star streaks (Sease, chapters 3 and 4, corrected).
 
-The ends of the streaks come in no order. Every star rotates about one axis a, so that a.(v2 - v1) = 0 for
-each streak: the axis is the direction most nearly normal to all chords, up to its sign, and the sign of
-a.(v1 x v2) then orders each pair of ends (3.17-3.19 corrected). Unlike the projected centre of rotation, the
-vectors have no singular case. OLAE gives the rotation, and a median-based scale of its residuals rejects
-outliers (the thesis's "Combined Indicator" uses the standard deviation, which outliers widen). One frame does
-not distinguish omega from -omega; a prior decides.
+The order of the two ends of a streak is initially unknown. All stars rotate about a common axis a, so that
+a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis, except for its sign, is the
+direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines the
+order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike the projected centre of rotation, this formulation
+has no singularity. OLAE computes the rotation, and a median-based scale of the residuals rejects outliers.
+The "Combined Indicator" of Sease uses the standard deviation instead, which outliers increase. A single frame
+cannot distinguish omega from -omega, so that a prior rate must decide.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ from knightcube.vision.objects.streak_ends import (
 )
 from knightcube.vision.streaks.streak_result import StreakStatus, admit, in_time, validate
 
-# Number of the strongest streaks whose pairs propose axes.
+# Pairs of this number of the strongest streaks are used to propose rotation axes.
 _MOST_PROPOSERS = 24
 _PARALLEL = 1e-12
-# Minimum fraction of the measured streaks that agree on one rotation.
+# A rotation is accepted if at least this fraction of the measured streaks agrees with it.
 _LEAST_AGREEMENT = 0.5
-# Minimum robust scale of the residuals, relative to the expected errors.
+# The robust scale of the residuals, relative to the expected errors, is at least this value.
 _LEAST_SCALE = 0.3
 _MOST_ROUNDS = 10
 
@@ -49,19 +50,21 @@ def estimate_rate(
     prior_sigma: float = 0.0,
     previous_checksum: int | None = None,
 ) -> StreakResult:
-    """Return the mean rate over one exposure from the star streaks in `pixels`.
+    """Return the mean body rate over one exposure from the star streaks in an image.
 
     Args:
-        pixels: (rows, columns) raw counts, of an unsigned integer type.
-        pinhole: camera, of the same shape.
+        pixels: (rows, columns) raw pixel values of an unsigned integer type.
+        pinhole: model of the camera.
         exposure: exposure time, s.
-        settings: thresholds, kernels, compensation.
-        prior_rate: (3,) rad/s, camera axes; determines only the sense of rotation. None: unknown.
-        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
-        previous_checksum: checksum of the previous frame; equal pixels indicate a frozen camera.
+        settings: settings of the estimation.
+        prior_rate: (3,) prior body rate in camera axes, rad/s, which determines only the sense of rotation;
+            None if unknown.
+        prior_sigma: standard deviation of each component of the prior rate, rad/s.
+        previous_checksum: checksum of the previous frame, by which a frozen camera is detected; None if there
+            is none.
 
-    Raises FlightError for an invalid frame, exposure or prior. The status of the result tells why a frame has
-    no rate.
+    Raises FlightError for an invalid frame, exposure or prior. The status of the result states why a frame
+    has no rate.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -76,7 +79,7 @@ def estimate_rate(
         return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
     typical = _typical_length(segmented.regions, settings)
     if typical < settings.least_length:
-        # The stars are nearly at rest, and the apparent streaks are blends.
+        # The stars hardly move, so that the apparent streaks are blends of stars.
         return replace(result, status=StreakStatus.TOO_SHORT, length=typical)
     return result
 
@@ -84,7 +87,7 @@ def estimate_rate(
 def _rate(
     streaks: Streaks, pinhole: Pinhole, exposure: float, settings: StreakSettings, seen: StreakResult
 ) -> StreakResult:
-    """Return `seen` with the rate of the streaks, up to its sign, or with the reason for its absence."""
+    """Return the result `seen` completed by the rate, except for its sign, or by the reason of failure."""
     seen = replace(
         seen,
         endpoints=streaks.endpoints,
@@ -114,7 +117,7 @@ def _rate(
 
 
 def _typical_length(regions: Regions, settings: StreakSettings) -> float:
-    """Return the median length (px) of the brightest regions, infinity for too few regions."""
+    """Return the median length (px) of the brightest image regions, infinity for too few regions."""
     if len(regions) < settings.least_streaks:
         return float("inf")
     brightest = np.argsort(-regions.flux, kind="stable")[: settings.most_streaks]
@@ -124,15 +127,16 @@ def _typical_length(regions: Regions, settings: StreakSettings) -> float:
 def rotation_axis(
     first: FloatArray, second: FloatArray, tolerance: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the axis (3,) of arbitrary sign that most streaks agree on, and which streaks (n,) agree.
+    """Return the rotation axis (3,) with which most streaks agree, and flags (n,) of the agreeing streaks.
 
-    Pairs of streaks propose axes, and least squares over the streaks that agree refines the best one. Fewer
-    than about half of the streaks may be outliers. The result is deterministic.
+    The sign of the axis is arbitrary. Each pair of streaks defines an axis. The axis with the best agreement
+    is refined by least squares over the streaks that agree. Up to about half of the streaks may be outliers.
+    The result is deterministic.
 
     Args:
-        first: (n, 3) unit vectors of one end of each streak, strongest streaks first.
-        second: (n, 3) unit vectors of the other end.
-        tolerance: (n,) rad, error allowed in the direction of each chord.
+        first: (n, 3) unit vectors to one end of each streak, strongest streak first.
+        second: (n, 3) unit vectors to the other end of each streak.
+        tolerance: (n,) tolerated error of the direction of each chord, rad.
 
     Raises ValueError for fewer than two streaks.
     """
@@ -145,7 +149,7 @@ def rotation_axis(
     size = np.linalg.norm(proposal, axis=-1, keepdims=True)
     proposal = proposal / np.maximum(size, _PARALLEL)
     missed = np.minimum((proposal @ chord.T / tolerance) ** 2, 1.0).sum(axis=-1)
-    # The null vector of parallel chords would agree with everything.
+    # Parallel chords are excluded, because their zero cross product would agree with all streaks.
     missed[size[:, 0] < _PARALLEL] = np.inf
     axis = proposal[np.argmin(missed)]
     for _ in range(3):
@@ -157,9 +161,14 @@ def rotation_axis(
 
 
 def rotation_angles(first: FloatArray, second: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the angles (n,) rad of the rotations about `axis` from `first` to `second`, both (n, 3).
+    """Return the rotation angles (n,), rad, about an axis between the two ends of each streak.
 
-    The sign is that of axis.(v1 x v2), 3.19 corrected: streaks of one sign have the same order of ends.
+    Streaks with the same sign of the angle have the same order of ends (Sease, eq. 3.19, corrected).
+
+    Args:
+        first: (n, 3) unit vectors to the first ends.
+        second: (n, 3) unit vectors to the second ends.
+        axis: (3,) unit vector along the rotation axis.
     """
     sine = np.cross(first, second) @ axis
     cosine = np.sum(first * second, axis=-1) - (first @ axis) * (second @ axis)
@@ -168,14 +177,15 @@ def rotation_angles(first: FloatArray, second: FloatArray, axis: FloatArray) -> 
 
 @dataclass(frozen=True, slots=True)
 class RotationFit:
-    """The rotation of the camera over one exposure, up to the direction of time.
+    """Rotation of the camera over one exposure, with unknown sign.
 
     Attributes:
-        rotation_vector: (3,) rad, camera axes, from the first ends to the second ends.
-        covariance: (3, 3) rad^2.
-        endpoints: (n, 2, 2) px, compensated; all first ends are simultaneous, and all second ends.
-        used: (n,) which streaks determine the rotation.
-        residual: rad, rms error of one end according to the residuals (4.7) of the streaks used.
+        rotation_vector: (3,) rotation vector from the first ends to the second ends in camera axes, rad.
+        covariance: (3, 3) covariance of the rotation vector, rad^2.
+        endpoints: (n, 2, 2) end positions corrected for bias, px; the ends are ordered consistently for all
+            streaks.
+        used: (n,) whether each streak is used in the rotation.
+        residual: RMS error of one end, from the residuals of the used streaks (Sease, eq. 4.7), rad.
     """
 
     rotation_vector: FloatArray
@@ -188,10 +198,15 @@ class RotationFit:
 def fit_rotation(
     raw: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
 ) -> RotationFit | None:
-    """Return the rotation that most streaks share, None if fewer than half or `least_streaks` agree.
+    """Return the rotation with which most streaks agree.
 
-    `raw` (n, 2, 2) px are endpoints without compensation, strongest streak first; `sigma` (n,) px are their
-    expected errors.
+    Returns None if fewer than half of the streaks, or fewer than `least_streaks`, agree.
+
+    Args:
+        raw: (n, 2, 2) endpoints without bias correction, strongest streak first, px.
+        sigma: (n,) expected errors of the endpoints, px.
+        pinhole: model of the camera.
+        settings: settings of the estimation.
     """
     needed = max(settings.least_streaks, _LEAST_AGREEMENT * len(raw))
     outward = chord_outward(raw)
@@ -199,7 +214,7 @@ def fit_rotation(
     raw = np.where(swapped[:, None, None], raw[:, ::-1], raw)
     outward = chord_outward(raw)
     errors = np.sqrt(2.0) * sigma / pinhole.focal_length
-    # The second pass moves the ends along the arcs of the first: streaks near the axis are curved.
+    # The second pass corrects the bias along the arcs of the first rotation, because streaks can be curved.
     for _ in range(2):
         if np.count_nonzero(used) < needed:
             return None
@@ -220,7 +235,7 @@ def fit_rotation(
 def _consensus(
     endpoints: FloatArray, sigma: FloatArray, pinhole: Pinhole, settings: StreakSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Return which streaks (n,) have their ends in the opposite order, and which agree approximately."""
+    """Return flags (n,) of the streaks with reversed ends, and of the streaks that agree approximately."""
     vectors = pinhole.unit_vectors(endpoints)
     length = np.linalg.norm(endpoints[:, 1] - endpoints[:, 0], axis=-1)
     allowed = np.maximum(settings.axis_tolerance, settings.outlier_sigmas * sigma)
@@ -228,7 +243,7 @@ def _consensus(
     angle = rotation_angles(vectors[:, 0], vectors[:, 1], axis)
     size = np.abs(angle)
     common = np.median(size[agree]) if agree.any() else np.nan
-    # Twice the tolerance, for two ends and for an axis that is poorly known when normal to the boresight.
+    # The tolerance is doubled, because both ends have errors and the axis may be inaccurate.
     agree &= np.abs(size - common) * length <= 2.0 * allowed * size
     return np.asarray(angle < 0.0), np.asarray(agree)
 
@@ -236,9 +251,10 @@ def _consensus(
 def _reject_and_solve(
     vectors: FloatArray, errors: FloatArray, used: BoolArray, settings: StreakSettings
 ) -> tuple[OlaeSolution, BoolArray]:
-    """Return the rotation and its streaks, rejected and re-admitted by residual until the set is stable.
+    """Return the rotation and flags (n,) of the used streaks after iterative rejection of outliers.
 
-    Raises numpy.linalg.LinAlgError if the remaining streaks do not determine a rotation.
+    In each iteration streaks are rejected or accepted again by their residuals, until the set of used streaks
+    does not change. Raises numpy.linalg.LinAlgError if the used streaks do not determine a rotation.
     """
     weights = 1.0 / errors**2
     solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
@@ -254,7 +270,7 @@ def _reject_and_solve(
 
 
 def _components(vectors: FloatArray, solution: OlaeSolution) -> tuple[FloatArray, FloatArray]:
-    """Return the residuals [s x] g - d of streaks (n, 2, 3) along and across their motion, (n,) rad each."""
+    """Return the OLAE residuals (n,) of streaks along their motion, and (n,) across their motion, rad."""
     starts, ends = vectors[:, 0], vectors[:, 1]
     residual = np.cross(starts + ends, solution.rodrigues) - (ends - starts)
     along, across = _motion_axes(starts + ends, solution.rodrigues)
@@ -262,7 +278,7 @@ def _components(vectors: FloatArray, solution: OlaeSolution) -> tuple[FloatArray
 
 
 def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors (n, 3) along the motion at mid-streak, v' = -omega x v, and across it."""
+    """Return unit vectors (n, 3) along the star motion at mid-streak, and (n, 3) across the motion."""
     along = np.cross(sums, rodrigues)
     along = along / np.linalg.norm(along, axis=-1, keepdims=True)
     across = np.cross(sums, along)
@@ -270,7 +286,7 @@ def _motion_axes(sums: FloatArray, rodrigues: FloatArray) -> tuple[FloatArray, F
 
 
 def _arc_outward(endpoints: FloatArray, rotation: FloatArray, pinhole: Pinhole) -> FloatArray:
-    """Return the pixel directions (n, 2, 2) out of each streak along its arc, backwards at the first end."""
+    """Return the outward directions (n, 2, 2) in the image at both ends of each streak, along its arc."""
     v = pinhole.unit_vectors(endpoints)
     velocity = -np.cross(rotation, v)
     image = velocity[..., :2] * v[..., 2:] - v[..., :2] * velocity[..., 2:]
@@ -284,11 +300,12 @@ def _covariance(
     pinhole: Pinhole,
     settings: StreakSettings,
 ) -> FloatArray:
-    """Return the covariance (3, 3) rad^2 of the rotation vector.
+    """Return the covariance (3, 3) of the rotation vector, rad^2.
 
-    Errors along and across the streaks have separate scales, from the residuals over their degrees of
-    freedom, widened by nu/(nu - 2) for the uncertainty of the scale (Student). The bias of the detector does
-    not show in the residuals and is added from `endpoint_bias_sigma`.
+    The variances along and across the streaks are estimated separately from the residuals. Each variance is
+    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its uncertainty (Student's t
+    distribution). The bias of the detector does not affect the residuals. Its uncertainty
+    `endpoint_bias_sigma` is therefore added.
     """
     weights = 1.0 / errors**2
     cross = cross_matrices(solution.sums)

@@ -1,4 +1,7 @@
-"""Settings and result of the estimator by corner detectors; importing them loads no scipy."""
+"""Settings and result of the streak estimator based on corner detectors.
+
+This module does not import scipy.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +17,22 @@ DetectorName = Literal["harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic
 
 @dataclass(frozen=True, slots=True)
 class StreakSettings(EndpointSettings):
-    """How a frame is turned into a rate; `of` returns the settings that were tuned for a detector.
+    """Settings of the rate estimation. The method `of` returns the settings tuned for a corner detector.
 
     Attributes:
-        saturated_fraction: fraction of saturated pixels from which a frame is rejected.
+        saturated_fraction: fraction of saturated pixels above which a frame is rejected.
         detector: name of the corner detector.
-        coarse_relative: T1 of Trajkovic's detector, relative to the largest simple cornerness at half scale.
-        fine_relative: T2 of Trajkovic's detector, relative to the largest simple cornerness at full scale.
-        endpoint_bias_sigma: px, uncertainty of `endpoint_bias`, an error common to all streaks.
-        axis_tolerance: px, error of an endpoint that is allowed in the search for the axis.
-        outlier_sigmas: robust standard deviations from which a streak is rejected.
-        worst_residual: px, largest rms of an endpoint. Fragments that agree by chance leave 1 to 4 px, stars
-            0.6 px at most (campaign `streaks`).
-        sign_sigmas: ratio of the prior's projection on the axis to its standard deviation from which the
-            prior decides the sense of rotation.
+        coarse_relative: threshold T1 of Trajkovic's detector, relative to the largest simple cornerness at
+            half scale.
+        fine_relative: threshold T2 of Trajkovic's detector, relative to the largest simple cornerness at full
+            scale.
+        endpoint_bias_sigma: uncertainty of `endpoint_bias`, which is an error common to all streaks, px.
+        axis_tolerance: tolerated error of an endpoint in the search for the rotation axis, px.
+        outlier_sigmas: number of robust standard deviations above which a streak is rejected.
+        worst_residual: largest accepted RMS residual of the endpoints, px; stars have at most 0.6 px, and
+            fragments that agree by chance 1 to 4 px (campaign `streaks`).
+        sign_sigmas: minimum ratio of the prior rate along the rotation axis to its standard deviation for
+            which the prior decides the sense of rotation.
     """
 
     saturated_fraction: float = 0.25
@@ -42,18 +47,19 @@ class StreakSettings(EndpointSettings):
 
     @classmethod
     def of(cls, detector: DetectorName, **changes: Any) -> StreakSettings:
-        """Return the settings of `detector` for a point spread of 1 px, with some of them changed."""
+        """Return the settings tuned for a corner detector and a point spread of 1 px, with some changes."""
         return cls(**{"detector": detector, **_OF_DETECTOR[detector], **changes})
 
 
 _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
-    # For point spreads of 0.7 and 1.5 px the endpoint bias is -0.14 and 0.40 px with Harris, 0.34 and 0.71 px
-    # with the minimum eigenvalue, 1.23 and 1.68 px with Trajkovic-4, 0.93 and 1.24 px with Trajkovic-8.
+    # The endpoint biases for point spreads of 0.7 and 1.5 px are -0.14 and 0.40 px with Harris's detector.
+    # They are 0.34 and 0.71 px with the minimum eigenvalue.
+    # They are 1.23 and 1.68 px with Trajkovic-4, and 0.93 and 1.24 px with Trajkovic-8.
     "harris": {},
-    # The response grows with the square of the brightness, not with its fourth power.
+    # The minimum eigenvalue grows with brightness squared, Harris's response with its fourth power.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},
-    # A slanting streak is a row of corners to four neighbours. Smoothing and a high threshold leave only the
-    # ends, of about half of all streaks.
+    # With four neighbours, all pixels of a diagonal streak are detected as corners.
+    # Smoothing and a high threshold suppress these detections, but also half of the streak ends.
     "trajkovic-4": {
         "smoothing_sigma": 1.0,
         "peak_relative": 0.4,
@@ -76,10 +82,10 @@ DETECTOR_NAMES: tuple[DetectorName, ...] = tuple(_OF_DETECTOR)
 
 @dataclass(frozen=True, slots=True)
 class StreakResult(FrameMotion):
-    """The motion by corner detectors.
+    """Body rate from star streaks by corner detectors.
 
     Attributes:
-        sigma: (found,) px, expected error of an endpoint.
+        sigma: (found,) expected error of the endpoints of each streak, px.
     """
 
     sigma: FloatArray = field(default_factory=no_rows())

@@ -1,11 +1,11 @@
-"""The attitudes at both ends of an exposure and the rate between them: the thesis's method (3.22-3.29).
+"""Attitudes at the start and end of an exposure, and the rate between them (Sease, eq. 3.22-3.29).
 
-The middles of the streaks, which a constant bias of the ends does not move, are identified. The first ends
-then give the attitude at the start of the exposure and the second ends the attitude at its end, each by
-ESOQ2. The rotation between the two over the exposure is the mean rate. A star fixed in the sky moves with
-v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T x]) and the axis is that of Delta^T - Delta
-(3.24, 3.26 and 3.27 corrected). The angle is taken from the quaternion, because the arc cosine of the trace
-(3.25) loses half of the digits at small angles.
+The stars are identified by the midpoints of the streaks, which do not depend on a constant bias of the ends.
+The first ends then give the attitude at the start of the exposure, and the second ends the attitude at the
+end, each by ESOQ2. The mean rate is the rotation between the two attitudes divided by the exposure time. A
+fixed star moves as v' = -omega x v, so that Delta = A_end A_start^T = exp(-[omega T x]), and the rotation
+axis follows from Delta^T - Delta (Sease, eq. 3.24, 3.26 and 3.27, corrected). The angle is computed from the
+quaternion, because the arc cosine of the trace (Sease, eq. 3.25) is inaccurate for small angles.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from knightcube.vision.startracker.solve import (
     solve_places,
 )
 
-# Minimum error (px) of an endpoint; smaller residuals are chance agreement of few streaks.
+# This is the minimum error (px) of an endpoint; smaller residuals are a chance agreement of few streaks.
 _LEAST_SIGMA_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class TwoAttitudes:
-    """The attitudes at the two ends of one exposure and the mean rate between them.
+    """Attitudes at the start and end of an exposure, and the mean rate between them.
 
     Attributes:
-        start: attitude at the start, reference frame into camera axes.
-        end: attitude at the end.
-        rotation_vector: (3,) rad, camera axes: principal axis times principal angle (3.25, 3.26).
-        rate: (3,) rad/s, camera axes, of the camera with respect to the stars (3.27 with identity R_cam).
-        covariance: (3, 3) rad^2/s^2 of `rate`, for independent errors of the two ends.
+        start: attitude at the start of the exposure, reference frame into camera axes.
+        end: attitude at the end of the exposure, reference frame into camera axes.
+        rotation_vector: (3,) rotation axis times angle in camera axes, rad (Sease, eq. 3.25 and 3.26).
+        rate: (3,) rate of the camera with respect to the stars in camera axes, rad/s (Sease, eq. 3.27).
+        covariance: (3, 3) covariance of the rate for independent errors of the two attitudes, rad^2/s^2.
     """
 
     start: AttitudeFix
@@ -63,14 +63,14 @@ class TwoAttitudes:
 def attitudes_of_ends(
     endpoints: FloatArray, reference: FloatArray, sigma: FloatArray, pinhole: Pinhole, exposure: float
 ) -> TwoAttitudes:
-    """Return attitudes and rate from identified streaks.
+    """Return the attitudes at the start and end of an exposure, and the mean rate, from identified streaks.
 
     Args:
-        endpoints: (n, 2, 2) px, streak, end, (x, y), without bias; the first ends are the earlier ones.
-        reference: (n, 3) unit vectors of the streaks' stars, in the reference frame of the attitudes.
-        sigma: (n,) px, error of an endpoint.
-        pinhole: the camera.
-        exposure: s.
+        endpoints: (n, 2, 2) positions (x, y) of the start and end of each streak, corrected for bias, px.
+        reference: (n, 3) unit vectors to the stars of the streaks, in the reference frame of the attitudes.
+        sigma: (n,) standard deviations of the endpoints, px.
+        pinhole: model of the camera.
+        exposure: exposure time, s.
 
     Raises AttitudeError if the stars do not determine an attitude, FlightError for an invalid exposure.
     """
@@ -82,7 +82,7 @@ def attitudes_of_ends(
     end = SOLVERS["esoq2"](vectors[:, 1], reference, errors)
     turn = multiply(end.quaternion, conjugate(start.quaternion))
     rotation = to_rotation_vector(turn)
-    # The error at the start is rotated into the axes at the end; both errors then change the rotation vector.
+    # The start error is rotated into the camera axes at the end, to which the rotation vector refers.
     propagated = attitude_matrix(turn)
     jacobian = _turn_to_vector(rotation)
     covariance = jacobian @ (end.covariance + propagated @ start.covariance @ propagated.T) @ jacobian.T
@@ -97,10 +97,18 @@ def solve_ends(
     settings: SolveSettings,
     prior: AttitudePrior | None = None,
 ) -> tuple[FrameSolution, StreakResult]:
-    """Return the attitude at mid-exposure, and `found` with the rate between the attitudes of its ends.
+    """Return the attitude at mid-exposure, and a streak result with the rate between start and end attitude.
 
-    If the streaks cannot be identified, `found` is returned unchanged. The covariance of the rate is not
-    changed: it comes from the same ends, with separate errors along and across the streaks.
+    If the streaks cannot be identified, the streak result is returned unchanged. The covariance of the rate
+    is never changed, because it already describes the errors of the streak ends along and across the streaks.
+
+    Args:
+        found: streak result of the frame.
+        camera: model of the camera.
+        scale: range of the relative image scale.
+        sky: search index of the guide stars.
+        settings: settings of the star identification.
+        prior: prior attitude, None if unknown.
     """
     ends, sigma = _brightest_first(found, camera)
     covariance = 0.5 * sigma[:, None, None] ** 2 * np.eye(2)
@@ -129,16 +137,16 @@ def solve_ends(
 
 
 def _turn_to_vector(rotation: FloatArray) -> FloatArray:
-    """Return the derivatives (3, 3) of the rotation vector with respect to a small rotation after it."""
+    """Return the derivatives (3, 3) of the rotation vector with respect to an additional small rotation."""
     angle = float(np.linalg.norm(rotation))
     cross = cross_matrices(rotation[None])[0]
-    # Both terms of the coefficient diverge at zero, where it is 1/12.
+    # The coefficient has the limit 1/12 for an angle of zero, at which both of its terms diverge.
     second = 1.0 / 12.0 if angle < 1e-3 else 1.0 / angle**2 - 1.0 / (2.0 * angle * np.tan(0.5 * angle))
     return np.asarray(np.eye(3) + 0.5 * cross + second * cross @ cross)
 
 
 def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArray, FloatArray]:
-    """Return ends (n, 2, 2) px and errors (n,) px of the streaks used, in order of increasing error."""
+    """Return the ends (n, 2, 2) and errors (n,), px, of the used streaks, in order of increasing error."""
     used = np.flatnonzero(found.used)
     used = used[np.argsort(found.sigma[used], kind="stable")]
     sigma = found.sigma[used]
@@ -149,10 +157,15 @@ def _brightest_first(found: StreakResult, camera: CameraModel) -> tuple[FloatArr
 
 
 def _scatter(both: TwoAttitudes, count: int) -> float:
-    """Return the ratio of the residuals' variance to the assumed one, for `count` stars.
+    """Return the ratio of the observed variance of the residuals to the assumed variance.
 
-    Each end has two components per star and three parameters of its attitude. The ratio is widened by
-    nu/(nu - 2) for its own uncertainty (Student).
+    Each of the two attitudes has two residual components per star and three parameters. The ratio is
+    multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its own uncertainty (Student's t
+    distribution).
+
+    Args:
+        both: attitudes at the start and end.
+        count: number of stars.
     """
     freedom = 4 * count - 6
     squares = 2.0 * (both.start.loss + both.end.loss)
