@@ -33,7 +33,6 @@ STEP = 20.0
 SETTLED_S, OVERSHOOT = 8.7, 0.008
 _BAND = 0.05
 _PENALTY = 20.0
-_SEARCH = {"maxfev": 800, "xatol": 1e-3, "fatol": 1e-3}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Two true worlds for the campaign `consistency`: sim_hal's testbed, and a body free in orbit.
+"""Two true worlds to test the filter's covariance: sim_hal's testbed, and a body free in orbit.
 
 Both carry the noise that the filter must live with: coil currents off by a uniform draw each cycle while they
 are driven, a torque that the filter does not know of. The free body is integrated here, by classical
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import about_axis_y, normalise
@@ -195,3 +196,9 @@ def _actual(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return what the coils carry: off by a uniform draw where they are driven at all."""
     noise = rng.uniform(-CURRENT_BOUND, CURRENT_BOUND, 3)
     return np.asarray(np.where(currents != 0.0, currents + noise, 0.0))
+
+
+def band(degrees: int, share: float = 0.95) -> tuple[float, float]:
+    """Return the quantile `share` of a chi-square over its degrees of freedom."""
+    tail = 0.5 * (1.0 - share)
+    return float(chi2.ppf(tail, degrees)) / degrees, float(chi2.isf(tail, degrees)) / degrees

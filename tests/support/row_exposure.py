@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.arrays import FloatArray, Image, IntArray
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from sim_hal.star_camera import StarCameraModel, image
 from tests.support.scenes import catalogue
@@ -26,8 +26,6 @@ _LIMIT = 7.0
 _STEP = 0.25
 _REACH = 5.5
 _SAMPLES = 65
-# Stars with this part of their path in the frame are listed.
-_SEEN = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,11 +74,6 @@ def _places(camera: StarCameraModel, directions: FloatArray, attitudes: FloatArr
     """Return pixels (m, n, 2) of stars (n, 3) at attitudes (m, 4); NaN behind the camera."""
     seen = directions @ attitude_matrix(attitudes).swapaxes(-1, -2)
     return camera.pinhole.project(seen.reshape(-1, 3)).reshape(*seen.shape[:2], 2)
-
-
-def _inside(camera: StarCameraModel, places: FloatArray, margin: float = 0.0) -> BoolArray:
-    """Return which places (m, n, 2) are on the detector or within `margin` px of it."""
-    return camera.pinhole.contains(places.reshape(-1, 2), margin).reshape(places.shape[:2])
 
 
 def _add(

@@ -192,49 +192,6 @@ def _by_turn(results: Sequence[Result]) -> list[dict[str, Any]]:
     return rows
 
 
-def _lines(facts: dict[str, Any]) -> list[str]:
-    verdicts = ", ".join(f"{count} {name}" for name, count in facts["verdicts"].items())
-    lines = [
-        f"{facts['frames']} frames ({facts['skies']} skies drawn): {verdicts}",
-        f"wrong, beyond {WRONG_SIGMAS:g} sigma and {100 * WRONG_SHARE:g} %: {facts['wrong']}"
-        f" (beyond {WRONG_SIGMAS:g} sigma {facts['beyond_sigmas']}, beyond {100 * WRONG_SHARE:g} %"
-        f" {facts['beyond_share']})   asked: 0",
-        f"refused with stars that move: {facts['refused']} of {facts['frames']}   asked: at most 2 of 1000",
-    ]
-    nees = facts["nees"]
-    if nees is not None:
-        lines.append(
-            f"NEES of 3: mean {nees['mean']:.2f} (honest: 3), median {nees['median']:.2f} (2.37), largest"
-            f" {nees['largest']:.1f}, beyond the 5 % limit {100 * nees['beyond_5%']:.1f} %, beyond the 0.1 %"
-            f" limit {100 * nees['beyond_0.1%']:.1f} %"
-        )
-    lines += [
-        "",
-        "turn, %   frames  refused  wrong  vector %, median   ms of processor: median  p95  p99  max",
-    ]
-    rows = [*facts["by_turn"], {"from": 0, "to": TURNS[-1], **_whole(facts)}]
-    for row in rows:
-        error = "-" if row["vector_median"] is None else f"{100 * row['vector_median']:.3f}"
-        lines.append(
-            f"{row['from']:2d} to {row['to']:2d}  {row['frames']:6d}  {row['refused']:7d}  {row['wrong']:5d}"
-            f"  {error:>16}   {row['p50']:23.0f}  {row['p95']:3.0f}  {row['p99']:3.0f}  {row['largest']:3.0f}"
-        )
-    lines += ["", "run  verdict      theta  turn %  T, s  usable  length px  NEES      why"]
-    for one in facts["failures"]:
-        nees_text = "-" if one["nees"] is None else f"{one['nees']:.1f}"
-        lines.append(
-            f"{one['seed'][1]:4d} {one['verdict']:11} {one['theta']:6.2f}  {one['percent']:6.2f}"
-            f"  {one['exposure']:4.1f}  {one['usable']:6d}  {one['length']:9.1f}  {nees_text:8}"
-            f"  {'; '.join([one['reason'] or 'no failure', *one['warnings']])}"
-        )
-    return lines
-
-
-def _whole(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the row of all turns together."""
-    return {**facts, **facts["milliseconds"], "vector_median": None}
-
-
 FAILURES = Campaign(
     "failures",
     "random frames: right, refused, wrong; NEES and time of the likelihood estimator",

@@ -25,7 +25,6 @@ Encoder = Callable[[FloatArray], Image]
 """Makes whole numbers of an unsigned type of counts (rows, columns)."""
 
 TOP = 4095.0
-_PEDESTAL = 100.0
 
 
 def _twelve_bits(counts: FloatArray) -> Image:

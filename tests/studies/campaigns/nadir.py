@@ -119,17 +119,6 @@ def row(results: Sequence[Result]) -> dict[str, Any]:
     }
 
 
-def _line(one: dict[str, Any]) -> str:
-    errors = [one[name] for name in ("rms_deg", "p99_deg", "worst_deg")]
-    written = "  ".join("    -" if error is None else f"{error:.4f}" for error in errors)
-    nees = "-" if one["nees"] is None else f"{0.5 * one['nees']:.2f}"
-    return (
-        f"{one['view']:11} {one['air']:7}  {one['frames']:6d}  {one['right']:5d}  {one['wrong']:5d}"
-        f"  {one['ambiguous']:9d}  {one['refused']:7d}  {one['no-horizon']:4d}   {written}  {nees:>6}"
-        f"   {one['median_ms']:9.1f}  {one['p95_ms']:4.1f}  {one['most_ms']:5.1f}  {one['pixels_read']:8.0f}"
-    )
-
-
 def _worth_a_line(result: Result) -> bool:
     """Return whether a frame is to be looked at: wrong, none, far beyond its covariance, or warned."""
     return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])

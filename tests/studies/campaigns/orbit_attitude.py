@@ -21,9 +21,9 @@ from knightcube.astro.quaternion import conjugate, multiply
 from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
 from knightcube.gnc.estimation.estimate import ATTITUDE, BIAS, Estimate
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
-from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, DeterminationSettings
 from tests.support import orbit_world
+from tests.support.consistency_worlds import band
 from tests.support.orbit_geometry import suite as suite_of
 from tests.support.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
 from tests.support.sensor_suite import SensorSuite

@@ -145,15 +145,6 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     return summary(facts)
 
 
-def _cell(own: Sequence[Result]) -> str:
-    exercised = [r for r in own if r["exercised"]]
-    if not exercised:
-        return "-" if own else ""
-    if any(r["told_s"] is None for r in exercised):
-        return "!"
-    return f"{max(r['told_s'] for r in exercised):.2f}"
-
-
 def _named(result: Result) -> str:
     """Return a flight with all that is needed to fly it again."""
     span = f"{result['at']:.2f} to {result['end']:.2f} s"

@@ -39,10 +39,10 @@ from knightcube.vision.sun import SunOfCameras, SunSettings, sun_of_cameras
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.emulators.solar_cells import SolarCellsModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
-from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.direction_filter import AttitudeDetermination, Report, begin
 from tests.studies.campaigns.orbit_attitude import SECOND, errors_of, settings_of
 from tests.support import orbit_world
+from tests.support.consistency_worlds import band
 from tests.support.limb_frames import camera_model, finder_settings, random_air
 from tests.support.orbit_geometry import suite as suite_of
 from tests.support.orbit_world import STEP, World
@@ -288,10 +288,6 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             continue
         facts[variant] = _row(mine)
     return summary(facts)
-
-
-def _pair(values: tuple[float, float] | None) -> str:
-    return "-" if values is None else f"{values[0]:.4f} ({values[1]:.4f})"
 
 
 def _row(results: Sequence[Result]) -> dict[str, Any]:

@@ -185,13 +185,6 @@ def _figures(results: Sequence[Result]) -> Result:
     }
 
 
-def _line(row: Result) -> str:
-    start = f"{row['row']:20} {row['trail']:5g} {row['attitudes']:4} /{row['frames']:3}"
-    if not row["attitudes"]:
-        return start
-    return f"{start} {row['nees']:7.2f} {row['worst']:11.1f}  {row['off']:.4f}, {row['claim']:.4f}"
-
-
 RESTING = Campaign(
     "resting",
     "attitudes of frames whose stars hardly move: claims of cameras like and unlike the model",

@@ -32,7 +32,6 @@ from tests.studies.campaigns.rso import (
     ends_error,
     look,
     match,
-    number,
 )
 from tests.support.opportunities import (
     Opportunity,
@@ -209,31 +208,6 @@ def weakest(rows: Sequence[dict[str, Any]]) -> float | None:
             break
         found = row["magnitude"]
     return found
-
-
-def _lines(facts: dict[str, Any]) -> list[str]:
-    total = sum(facts["opportunities"])
-    lines = [
-        f"opportunities in ten orbits: thesis 14 | here {', '.join(map(str, facts['opportunities']))}",
-        "",
-        f"Table 4.4, magnitude {TABLE_MAGNITUDE:g}: correct / overlapping streak / false",
-        f"{'':24} thesis, of 14 | 2.5 sigma of the frame | with lower bounds   (here of {total})",
-    ]
-    for index, row in enumerate(ROWS):
-        shown = [THESIS[index], facts["strict"][index], facts["bounded"][index]]
-        lines.append(f"{row:24} " + " | ".join("{} / {} / {}".format(*three) for three in shown))
-    lines.append(f"{'judge of pixels':24} - | " + "{} / {} / {}".format(*facts["judge"]))
-    lines += ["", "magnitude  found        ends px (median)  false"]
-    for row in facts["by_magnitude"]:
-        share = f"{row['found']} of {row['frames']}"
-        lines.append(f"{row['magnitude']:9.1f}  {share:12} {number(row['error_px'], 2):16}  {row['false']}")
-    return [
-        *lines,
-        f"weakest magnitude found at 95 %: {number(facts['weakest_at_95'], 1)}",
-        f"false: {facts['false']} in {facts['frames']} frames",
-        f"processor time of a frame: median {number(facts['seconds_median'], 2)} s, "
-        f"largest {number(facts['seconds_largest'], 2)} s",
-    ]
 
 
 RSO_ORBITS = Campaign(

@@ -10,8 +10,8 @@ import pytest
 from knightcube.astro.quaternion import attitude_matrix
 from tests.studies.campaigns import coverage, orbit_attitude
 from tests.studies.campaigns.campaign import Case, Result
-from tests.studies.campaigns.consistency import band
 from tests.support import orbit_world
+from tests.support.consistency_worlds import band
 from tests.support.orbit_geometry import limb, limb_in_daylight, revolution, suite
 
 SEED = 20_261_121

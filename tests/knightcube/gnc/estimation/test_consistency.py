@@ -1,13 +1,12 @@
-"""A small slice of the campaign `consistency`, with its own seed: honest figures pass, false ones do not."""
+"""Errors and innovations of short flights against the covariance that the filter states."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
-from tests.studies.campaigns import consistency
-from tests.studies.campaigns.campaign import Case, Result
+from tests.knightcube.gnc.estimation import consistency_flights as consistency
+from tests.knightcube.gnc.estimation.consistency_flights import Result
+from tests.support.consistency_worlds import band
 
 SEED = 20_261_121
 SECONDS = 12
@@ -15,8 +14,7 @@ SECONDS = 12
 
 def fly(scene: str, runs: int, **parameters: float) -> list[Result]:
     """Return the results of short runs."""
-    parameters_: dict[str, Any] = {"scene": scene, "seconds": SECONDS, **parameters}
-    return [consistency.run(Case(str(run), (SEED, run), parameters_)) for run in range(runs)]
+    return [consistency.run(scene, (SEED, run), SECONDS, **parameters) for run in range(runs)]
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +31,13 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says(
     results = flown[scene]
     runs = len(results)
     facts = consistency.scene_facts(results)
-    low, high = consistency.band(runs * facts["degrees"], 0.999)
+    low, high = band(runs * facts["degrees"], 0.999)
     assert low < facts["nees_final"] < high
     assert facts["nis"]["gyro"]["mean"] == pytest.approx(1.0, abs=0.04)
     assert facts["nis"]["unit attitude"]["mean"] == pytest.approx(1.0, abs=0.04)
     assert facts["nis"]["streaks"]["measurements"] >= runs
     streaks = facts["nis"]["streaks"]
-    low, high = consistency.band(streaks["measurements"] * results[0]["nis_degrees"], 0.999)
+    low, high = band(streaks["measurements"] * results[0]["nis_degrees"], 0.999)
     assert low < streaks["mean"] < high
     assert sum(facts["refused"].values()) <= 1
     assert facts["bias_worst_sigmas"] < 4.0
@@ -48,7 +46,7 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says(
 def test_variances_that_are_claimed_too_small_are_found_out() -> None:
     """The unit's noise said to be half of what it is."""
     facts = consistency.scene_facts(fly("testbed", 8, claimed=0.25))
-    assert facts["nees_final"] > consistency.band(8 * facts["degrees"], 0.999)[1]
+    assert facts["nees_final"] > band(8 * facts["degrees"], 0.999)[1]
     assert facts["nis"]["gyro"]["mean"] > 2.0
 
 
