@@ -76,7 +76,7 @@ docs: $(TOOLS)  ## the documentation site, strict, into build/site
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
 	$(RUN) -m tests.docs.built_site build/site
 
-house: $(TOOLS) ## packages, layers, imports and sizes, drawn from the source
+house: $(TOOLS) ## sizes of files, classes and functions
 	$(RUN) -m tests.studies.house
 
 unit: $(TOOLS)  ## the tests, on all cores

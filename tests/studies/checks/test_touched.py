@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from knightcube.astro import quaternion
-from tests.studies.house.touched import LIMITS, Touched, measure
+from tests.studies.house import LIMITS, Touched, measure
 
 
 def test_a_cycle_an_opening_and_a_star_fix_enter_few_files() -> None:

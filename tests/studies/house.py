@@ -1,0 +1,202 @@
+"""Sizes of the product's files, classes and functions, and files that a piece of work enters.
+
+`python -m tests.studies.house [--touched]`. Layers and cycles are import-linter's (pyproject.toml).
+
+With `--touched` it flies and solves an image, and counts the files of the product that one control cycle, the
+opening of a flight and a star fix enter. A file counts if one of its functions is called; the execution of a
+module or of a class body does not count. The flight is the step demonstration in lock-step. Its emulated
+devices stand for the far end of the wires: `sim_hal`, and whatever `sim_hal` calls, does not count. A job
+that the lock-step runner runs in the calling thread belongs to a worker and does not count either.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import inspect
+import json
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from flight.app import flight as application
+from flight.app.run import RunRequest
+from flight.loop.control_cycle import ControlCycle
+from flight.loop.executive import Cycle, LockStepRunner
+from flight.loop.flight_loop import FlightLoop
+from knightcube import StarTracker
+from sim_hal.star_camera import StarCameraModel
+from tests.support.scenes import exposed
+
+ROOT = Path(__file__).resolve().parents[2]
+PRODUCT = ("knightcube", "flight", "ground", "hal", "sim_hal")
+MOST_LINES = {"file": 900, "class": 350, "function": 50}
+"""Lines of a piece; a class may be longer if its docstring says why ("... lines: ...")."""
+MOST_LONG_FUNCTIONS = 20
+_REASON = re.compile(r"\blines\b", re.IGNORECASE)
+LIMITS = {"control cycle": 30, "opening of a flight": 51, "star fix": 20}
+"""Largest number of files of each piece of work; the aims are 30, 45 and 25."""
+_FIRST, _LAST = 400, 440
+"""Control cycles that are measured: one second of steady flight, after the first plan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A file, class or function with its length in lines; `excused` if its docstring gives a reason."""
+
+    kind: str
+    name: str
+    lines: int
+    excused: bool = False
+
+    @property
+    def long(self) -> bool:
+        """Whether it is longer than its kind may be."""
+        return self.lines > MOST_LINES[self.kind] and not self.excused
+
+    def __str__(self) -> str:
+        return f"{self.kind:9} {self.lines:4} {self.name}"
+
+
+def pieces(root: Path = ROOT) -> list[Piece]:
+    """Return all files, classes and functions of the product, the longest first.
+
+    A function within a function belongs to the outer one.
+    """
+    found = []
+    for path in sorted(path for package in PRODUCT for path in (root / package).rglob("*.py")):
+        text, name = path.read_text(encoding="utf-8"), path.relative_to(root).as_posix()
+        found += [Piece("file", name, text.count("\n")), *_definitions(ast.parse(text), name)]
+    return sorted(found, key=lambda piece: -piece.lines)
+
+
+def _definitions(node: ast.AST, place: str) -> Iterator[Piece]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            name, lines = f"{place}:{child.name}", (child.end_lineno or child.lineno) - child.lineno + 1
+            if isinstance(child, ast.ClassDef):
+                yield Piece("class", name, lines, bool(_REASON.search(ast.get_docstring(child) or "")))
+                yield from _definitions(child, name)
+            else:
+                yield Piece("function", name, lines)
+        elif not isinstance(child, ast.expr):
+            yield from _definitions(child, place)
+
+
+class Touched:
+    """The files of the product entered while a block is measured, relative to `ROOT`."""
+
+    def __init__(self) -> None:
+        self.files: set[str] = set()
+        self._outside = 0  # nested calls into and below code that does not count
+
+    def _profile(self, frame: FrameType, event: str, _: Any) -> None:
+        if event not in {"call", "return"}:
+            return
+        code = frame.f_code
+        outside = code.co_filename.startswith(f"{ROOT}/sim_hal/") or code is LockStepRunner.submit.__code__
+        if event == "return":
+            self._outside -= bool(self._outside and outside)
+            return
+        self._outside += outside
+        if self._outside or not code.co_flags & inspect.CO_OPTIMIZED:
+            return
+        if code.co_filename.startswith((f"{ROOT}/flight/", f"{ROOT}/hal/", f"{ROOT}/knightcube/")):
+            self.files.add(code.co_filename.removeprefix(f"{ROOT}/"))
+
+    @contextmanager
+    def measured(self) -> Iterator[None]:
+        """Collect the files that the block enters."""
+        self._outside = 0
+        sys.setprofile(self._profile)
+        try:
+            yield
+        finally:
+            sys.setprofile(None)
+
+
+def of_flight() -> dict[str, set[str]]:
+    """Return the files of opening a flight, from its request to its first cycle, and of a control cycle.
+
+    The control cycle is the one that enters the most files in a second of flight.
+    """
+    opening, cycles = Touched(), [Touched()]
+    fly, run = FlightLoop.run, ControlCycle.run
+
+    def fly_on(loop: FlightLoop, epoch_ns: int, label: Any) -> str:
+        sys.setprofile(None)
+        return fly(loop, epoch_ns, label)
+
+    def run_measured(control: ControlCycle, cycle: Cycle) -> Any:
+        if not _FIRST <= cycle.slot < _LAST:
+            return run(control, cycle)
+        cycles.append(Touched())
+        with cycles[-1].measured():
+            return run(control, cycle)
+
+    with (
+        patch.object(FlightLoop, "run", fly_on),
+        patch.object(ControlCycle, "run", run_measured),
+        tempfile.TemporaryDirectory() as folder,
+        opening.measured(),
+    ):
+        configuration, duration = ROOT / "config/step_demo.yaml", 0.025 * (_LAST + 1)
+        application.fly(RunRequest(configuration, Path(folder) / "run", duration=duration))
+    largest = max((cycle.files for cycle in cycles), key=len)
+    return {"control cycle": largest, "opening of a flight": opening.files}
+
+
+def of_star_fix() -> dict[str, set[str]]:
+    """Return the files between an image of stars at rest and its attitude."""
+    camera = StarCameraModel(field_of_view=np.radians(12.0))
+    scene = exposed(camera, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.2, np.random.default_rng(1))
+    touched, tracker = Touched(), StarTracker(fov_deg=12.0)
+    with touched.measured():
+        solution = tracker.solve(scene.pixels)
+    assert solution, solution.reason
+    return {"star fix": touched.files}
+
+
+def measure() -> dict[str, set[str]]:
+    """Return the files that each piece of work in `LIMITS` enters."""
+    return of_flight() | of_star_fix()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print sizes and files; return 1 when a limit is not kept."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.house", description=__doc__)
+    parser.add_argument("--touched", action="store_true", help="also count the files that are entered")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    measured = pieces()
+    long = [piece for piece in measured if piece.long]
+    files = [piece.lines for piece in measured if piece.kind == "file"]
+    entered = {name: sorted(found) for name, found in (measure() if options.touched else {}).items()}
+    if options.json:
+        facts = {"lines": sum(files), "files": len(files), "long": [asdict(piece) for piece in long]}
+        sys.stdout.write(json.dumps(facts | {"touched": entered}) + "\n")
+    else:
+        lines = [f"{sum(files)} lines in {len(files)} files, {files[len(files) // 2]} in the median one"]
+        lines += ["longer than the limit:", *map(str, long)]
+        for name, found in entered.items():
+            lines += [f"files of a {name}: {len(found)}, at most {LIMITS[name]}", *found]
+        sys.stdout.write("\n".join(lines) + "\n")
+    return int(not kept(long) or any(len(found) > LIMITS[name] for name, found in entered.items()))
+
+
+def kept(long: Sequence[Piece]) -> bool:
+    """Return whether only functions are too long, and not too many."""
+    return all(piece.kind == "function" for piece in long) and len(long) <= MOST_LONG_FUNCTIONS
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
