@@ -151,7 +151,6 @@ def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
 def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
     demonstration: Run, tmp_path: Path
 ) -> None:
-    """`python -m tests.studies.bench demonstration` holds flight and report to a minute of one core."""
     output = command("report", demonstration.folder, "--figures", tmp_path / "figures")
     assert "steady-state error" in output
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7

@@ -9,6 +9,8 @@ work on the machine lengthens some of them.
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -19,8 +21,9 @@ import numpy as np
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from ground.telemetry import Run, read_run
-from tests.studies.bench.demonstration import command_s
+from tests.pace import ORDINARY_PACE_S, pace_s
 
+ROOT = Path(__file__).resolve().parents[3]
 WANTED_CYCLE_MS = 0.5
 WHOLE_S = 6000.0
 MODES = (Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT)
@@ -66,3 +69,24 @@ def figures(run: Run) -> str:
             f"{worker:8}{len(taken):5} jobs, {1e3 * float(taken.sum()) / span:6.1f} ms a second of flight"
         )
     return "\n".join(lines) + "\n"
+
+
+def command_s(*arguments: str) -> float:
+    """Return the processor time of a command with its child processes, s of an ordinary machine."""
+    begun, paces = _children_s(), [pace_s()]
+    words = [sys.executable, "-m", "flight", *arguments]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        while process.poll() is None:
+            try:
+                process.wait(timeout=2.0)
+            except subprocess.TimeoutExpired:
+                paces.append(pace_s())
+    if process.returncode:
+        raise SystemExit(f"{' '.join(arguments)}: exit status {process.returncode}")
+    pace = sum(paces) / len(paces)
+    return (_children_s() - begun) / max(1.0, pace / ORDINARY_PACE_S)
+
+
+def _children_s() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime

@@ -29,6 +29,7 @@ from knightcube.vision.camera.images import read_image
 from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers
+from tests.studies.campaigns.campaign import show
 from tests.support.photographs import (
     _HIGHEST_DEG,
     _LOWEST_DEG,
@@ -196,58 +197,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rows = [row_of(length, _OBLIQUE, options.frames) for length in _STREAKS_PX]
     rows += [row_of(length, _ACROSS, options.frames) for length in _STREAKS_PX if length]
     peers = peer_rows(options) if options.peers else []
-    if options.json:
-        told = {"photographs": [asdict(one) for one in pictures], "frames": rows, "peers": peers}
-        sys.stdout.write(json.dumps(told) + "\n")
-    else:
-        sys.stdout.write(_table(pictures, rows) + _peer_table(peers))
+    right = sum(one.solved and one.arcsec <= RIGHT_ARCSEC for one in pictures)
+    wrong = sum(one.solved for one in pictures) - right
+    facts = {"photographs": [asdict(one) for one in pictures], "right": right, "wrong": wrong}
+    show(facts | {"frames": rows, "peers": peers}, options.json)
     return 0
-
-
-def _table(pictures: list[Photograph], rows: list[dict[str, Any]]) -> str:
-    lines = [f"{'photograph':26s} {'field':8s} {'off':>8s} {'stars':>6s} {'ms':>6s}"]
-    for one in pictures:
-        off = f'{one.arcsec:7.1f}"' if one.solved else " refused"
-        known = "known" if one.known else "unknown"
-        lines.append(f"{one.name:26s} {known:8s} {off} {one.stars:6d} {one.ms:6.1f}")
-    told = [one for one in pictures if one.solved]
-    right = sum(one.arcsec <= RIGHT_ARCSEC for one in told)
-    lines.append(f'right to {RIGHT_ARCSEC:.0f}": {right} of {len(pictures)}, wrong {len(told) - right}')
-    for across in (False, True):
-        lines.append(
-            f"\naxis {'across the boresight' if across else '30 to 90 deg off the boresight'}\n"
-            f"{'streak px':>9s} {'right':>9s} {'wrong':>6s} {'median':>8s} {'worst':>8s} {'over bound':>10s}"
-            f" {'NEES':>6s} {'rate rms %':>11s} {'worst %':>8s} {'bound %':>8s} {'ms':>6s} {'p95':>6s}"
-            f" {'track':>6s}"
-        )
-        lines += [_line(row) for row in rows if row["across"] == across]
-    return "\n".join(lines) + "\n"
-
-
-def _line(row: dict[str, Any]) -> str:
-    return (
-        f"{row['length_px']:9.0f} {row['right']:4d}/{row['frames']:<4d} {row['wrong']:6d}"
-        f' {row["median_arcsec"]:7.2f}" {row["worst_arcsec"]:7.2f}" {row["over_bound"]:10.2f}'
-        f" {row['nees']:6.2f} {row['rate_rms_percent']:11.3f} {row['rate_worst_percent']:8.3f}"
-        f" {row['rate_bound_percent']:8.3f} {row['median_ms']:6.1f} {row['p95_ms']:6.1f}"
-        f" {row['tracking_ms']:6.1f}"
-    )
-
-
-def _peer_table(rows: list[dict[str, Any]]) -> str:
-    lines = []
-    for peer in dict.fromkeys(row["peer"] for row in rows):
-        lines.append(
-            f"\n{peer:28s} {'frames':>6s} {'right':>6s} {'wrong':>6s} {'refused':>8s} {'median':>8s}"
-            f" {'ms':>7s} {'p95':>7s}"
-        )
-        lines += [
-            f"{row['configuration']:28s} {row['frames']:6d} {row['right']:6d} {row['wrong']:6d}"
-            f' {row["refused"]:8d} {row["median_arcsec"]:7.2f}" {row["median_ms"]:7.1f} {row["p95_ms"]:7.1f}'
-            for row in rows
-            if row["peer"] == peer
-        ]
-    return "".join(line + "\n" for line in lines)
 
 
 if __name__ == "__main__":

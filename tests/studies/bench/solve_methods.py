@@ -9,7 +9,6 @@ identification, image fit and solver, and of finding and measuring the stars.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -25,6 +24,7 @@ from knightcube.vision.startracker.detection.survey import CENTROIDS, Method
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.campaign import show
 from tests.support.scenes import YEAR, exposed
 
 _SEED = 41_207
@@ -106,17 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     options = parser.parse_args(arguments)
-    rows = compare(options.frames, options.seed)
-    if options.json:
-        sys.stdout.write(json.dumps({"rows": [asdict(row) for row in rows]}) + "\n")
-        return 0
-    sys.stdout.write(f"{options.frames} frames, seed {options.seed}; arcsec rms of an axis; CPU ms\n")
-    sys.stdout.write("centroid   attitude    solved   across   about   NEES   solve  detect\n")
-    for row in rows:
-        sys.stdout.write(
-            f"{row.centroid:10} {row.attitude:10} {row.solved:4d}/{row.frames:<4d}{row.across:7.3f}"
-            f"{row.about:8.2f}{row.nees:7.2f}{row.solve_ms:8.2f}{row.detect_ms:8.1f}\n"
-        )
+    rows = [asdict(row) for row in compare(options.frames, options.seed)]
+    show({"frames": options.frames, "seed": options.seed, "rows": rows}, options.json)
     return 0
 
 

@@ -32,6 +32,7 @@ from knightcube.vision.startracker.attitude_fit import MatchStatus, refine
 from knightcube.vision.startracker.index.build import default_index
 from knightcube.vision.startracker.index.sky_index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import identify
+from tests.studies.campaigns.campaign import show
 from tests.support.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 
 _SEED = 271_828
@@ -265,34 +266,6 @@ def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> di
     }
 
 
-def _print(figures: dict[str, Any]) -> None:
-    head = "right wrong refused   median    p95    max ms   error  over bound"
-    for solver in figures["megabytes"]:
-        rows = [row for row in figures["rows"] if row["solver"] == solver]
-        sys.stdout.write(f"\n{solver}: catalogue and index {figures['megabytes'][solver]:.1f} MB\n")
-        sys.stdout.write(f"{'':34} {head}\n")
-        for row in rows:
-            error = (
-                "" if row["error_arcsec"] is None else f"{row['error_arcsec']:7.2f} {row['over_bound']:9.3f}"
-            )
-            sys.stdout.write(
-                f"{row['kind']:34} {row['right']:5d} {row['wrong']:5d} {row['refused']:7d}"
-                f" {row['median_ms']:8.2f} {row['p95_ms']:6.2f} {row['max_ms']:7.2f} {error}\n"
-            )
-        known = rows[: len(configurations())]
-        total = sum(row["lists"] for row in known)
-        right, wrong = (sum(row[what] for row in known) for what in ("right", "wrong"))
-        over = figures["over_bound"].get(solver, float("nan"))
-        sys.stdout.write(
-            f"field known: {right} of {total} right ({100 * right / total:.2f} %), {wrong} wrong,"
-            f" pointing error {over:.3f} of the bound\n"
-        )
-    for peer, ratio in figures["time_over_peer"].items():
-        sys.stdout.write(
-            f"our time over {peer}'s, field known: median {ratio['median']:.2f}, p95 {ratio['p95']:.2f}\n"
-        )
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables; 1 when a list was named wrongly."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -305,10 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="one JSON object instead of the tables")
     options = parser.parse_args(arguments)
     figures = measure(options)
-    if options.json:
-        sys.stdout.write(json.dumps(figures) + "\n")
-    else:
-        _print(figures)
+    show(figures, options.json)
     return 1 if any(row["wrong"] for row in figures["rows"] if row["solver"] == "flight") else 0
 
 

@@ -11,7 +11,6 @@ on the same lists.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from knightcube.vision.startracker.index.sky_index import GuideStars, SkyIndex
 from knightcube.vision.startracker.lost_in_space import identify
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
+from tests.studies.campaigns.campaign import show
 from tests.support.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
 
 _SEED = 314_159
@@ -181,22 +181,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
     parser.add_argument("--peer", choices=tuple(PEERS), help="another program on the same lists")
     parser.add_argument("--peer-python", default=sys.executable, metavar="PYTHON", help="that it is in")
-    parser.add_argument("--json", action="store_true", help="one JSON object a row instead of the table")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
     options = parser.parse_args(arguments)
     sky = default_index()
-    wrong = 0
-    if not options.json:
-        sys.stdout.write(f"{'':42} right wrong refused   median    p95    max ms   peer right\n")
-    for name in (name for name in hardships() if options.only in name):
-        row = measured(name, options.lists, sky, options.seed, options.peer, options.peer_python)
-        wrong += row["wrong"]
-        text = (
-            f"{name:42} {row['right']:5d} {row['wrong']:5d} {row['refused']:7d} {row['median_ms']:8.1f}"
-            f" {row['p95_ms']:6.1f} {row['max_ms']:6.1f}   {row.get('peer_right', '')}"
-        )
-        sys.stdout.write((json.dumps(row) if options.json else text) + "\n")
-        sys.stdout.flush()
-    return 1 if wrong else 0
+    rows = [
+        measured(name, options.lists, sky, options.seed, options.peer, options.peer_python)
+        for name in hardships()
+        if options.only in name
+    ]
+    show({"rows": rows}, options.json)
+    return int(any(row["wrong"] for row in rows))
 
 
 if __name__ == "__main__":

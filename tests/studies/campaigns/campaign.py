@@ -109,6 +109,11 @@ def summary(facts: dict[str, Any]) -> Summary:
     return Summary("\n".join(lines).lstrip("\n") + "\n", facts)
 
 
+def show(facts: dict[str, Any], as_json: bool = False) -> None:
+    """Print facts as tables, or as one JSON object."""
+    sys.stdout.write(json.dumps(facts) + "\n" if as_json else summary(facts).text)
+
+
 def _table(rows: Sequence[Result]) -> list[str]:
     """Return rows as aligned columns under their keys."""
     keys = list(dict.fromkeys(key for row in rows for key in row))

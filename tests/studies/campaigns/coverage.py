@@ -20,7 +20,7 @@ from knightcube.astro.almanac import apparent_sun
 from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.orbit_geometry import (
     SUITES,
     Pass,
@@ -181,7 +181,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         for shape in ("square", "cone")
     }
     facts["uw_sun_over_year"] = _over_year(orbits, tables)
-    return Summary("\n".join(_lines(facts)) + "\n", facts)
+    return summary(facts)
 
 
 def _mean_shares(orbits: Sequence[Result]) -> dict[str, Any]:
@@ -212,36 +212,6 @@ def _over_year(orbits: Sequence[Result], tables: Sequence[Result]) -> dict[str, 
         )
         for shape in ("square", "cone")
     }
-
-
-def _lines(facts: dict[str, Any]) -> list[str]:
-    lines = [f"{facts['orbits']} revolutions at 380 km, 51.6 deg; {100 * facts['sunlit']:.0f} % of it sunlit"]
-    lines.append(
-        f"{'':20}share of time with the horizon in 0, 1, 2, ... cameras, %  lit, in sunlight, %   Sun, %"
-    )
-    for key, found in facts["suites"].items():
-        horizon = " ".join(f"{100 * share:5.1f}" for share in found["horizon"])
-        lit = " ".join(f"{100 * share:5.1f}" for share in found["lit horizon"])
-        lines.append(f"{key:20}{horizon:33}{lit:33}{100 * found['sun']:6.1f}")
-    tilt = facts["vt_all_three_up_to_deg"]
-    lines.append(f"VT: the horizon is in all three cameras up to {tilt:.1f} deg of tilt, whichever way")
-    lines.append(
-        "    (15 deg in 4.1; a limb 19.3 deg down and 15 deg of tilt are past the field's edge at 33.5)"
-    )
-    lines.append("UW, level, Sun in a camera, % of the sunlit orbit, square field and (cone), side cameras:")
-    lines.append(f"{'beta, deg':>12}" + "".join(f"{heading:>22}" for heading in HEADINGS))
-    for beta, shares in facts["uw_sun_by_beta"].items():
-        cells = (
-            f"{100 * shares[heading]['square']:14.1f} ({100 * shares[heading]['cone']:5.1f})"
-            for heading in HEADINGS
-        )
-        lines.append(f"{beta:>12}" + "".join(cells))
-    year = facts["uw_sun_over_year"]
-    lines.append(f"    over the drawn orbits, {BEST}: {100 * year['square']:.1f} ({100 * year['cone']:.1f})")
-    for shape, found in facts["betas_of_paper"].items():
-        where = ", ".join(f"{beta:g} deg with {heading}" for heading, beta in found)
-        lines.append(f"    the paper's 74 +- 3 %, {shape} field: beta of {where}")
-    return lines
 
 
 COVERAGE = Campaign(

@@ -177,7 +177,7 @@ class DarkFlight(PointingFlight):
     def __init__(self, craft: str, seed: int, storm: float = 0.0) -> None:
         """`storm` T of an axis is added to the field."""
         self._storm, self._weather = storm, np.random.default_rng([seed, 0x570])
-        super().__init__({"craft": craft, "share": SHARE, "law": "whole", "target": "nadir"}, seed)
+        super().__init__({"craft": craft, "share": SHARE, "target": "nadir"}, seed)
         config = as_orbit(configuration.load(CONFIG.parent / CRAFT[craft]))
         noise = filter_settings(config).coil_noise / math.sqrt(CYCLE - PAUSE)
         self.flight.coil_noise = noise

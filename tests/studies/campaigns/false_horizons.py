@@ -22,7 +22,7 @@ from knightcube.vision.horizon.nadir import find_nadir
 from knightcube.vision.horizon.settings import HorizonKnowledge, HorizonSettings
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.limbless import MAKERS, photographed
 from tests.support.earth_truth import ideal_counts, limb_truth, radiance_of, sun_point
 from tests.support.limb_frames import camera_model, coarse_knowledge, finder_settings
@@ -159,25 +159,22 @@ def _limb(kind: str, generator: np.random.Generator) -> list[Result]:
     return answers
 
 
+VERDICTS = ("right", "wrong", "ambiguous", "refused", "no-horizon")
+
+
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return how often a horizon was found, of each kind of picture and knowledge."""
     rows = []
-    lines = ["picture      limb  known     pictures  right  wrong  ambiguous  refused  no horizon"]
     for limb, kind in dict.fromkeys((r["limb"], r["kind"]) for r in results):
         of = [r for r in results if (r["limb"], r["kind"]) == (limb, kind)]
         for known in KNOWN:
             counts = Counter(a["verdict"] for r in of for a in r["answers"] if a["known"] == known)
-            verdicts = [counts[each] for each in ("right", "wrong", "ambiguous", "refused", "no-horizon")]
-            rows.append({"limb": limb, "kind": kind, "known": known, "pictures": len(of), **counts})
-            lines.append(
-                f"{kind:12} {'yes' if limb else 'no':4}  {known:8}  {len(of):8d}  {verdicts[0]:5d}"
-                f"  {verdicts[1]:5d}  {verdicts[2]:9d}  {verdicts[3]:7d}  {verdicts[4]:10d}"
-            )
+            rows.append({"limb": limb, "kind": kind, "known": known, "pictures": len(of)})
+            rows[-1] |= {verdict: counts[verdict] for verdict in VERDICTS}
     wrong = [r["seed"] for r in results if any(a["verdict"] == "wrong" for a in r["answers"])]
     false = sum(any(a["verdict"] == "wrong" for a in r["answers"]) for r in results if not r["limb"])
     empty = sum(not r["limb"] for r in results)
-    lines += ["", f"{false} of {empty} pictures without a limb gave a horizon", f"seeds of wrong: {wrong}"]
-    return Summary("\n".join(lines) + "\n", {"rows": rows, "false": false, "empty": empty, "wrong": wrong})
+    return summary({"rows": rows, "false": false, "empty": empty, "wrong": wrong})
 
 
 FALSE_HORIZONS = Campaign(

@@ -30,7 +30,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.support.scenes import FIELD, catalogue, noise_floor
 from tests.support.supersampled import Attitudes, Sky, light
@@ -223,21 +223,8 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
         for row, percent in rows
     ]
     total = _figures(results)
-    lines = [
-        f"{'imperfection':20} {'turn':>5} {'answers':>9} {'worst sigma':>11} {'NEES':>8} "
-        f"{'worst error':>11} {'claimed':>8}"
-    ]
-    lines += [
-        _line(row["row"], f"{row['percent']:.0f} %", row)
-        for row in [*table, {"row": "all", "percent": 0.0, **total}]
-    ]
-    lines.append(
-        f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond_sigmas']}; "
-        f"more than {100 * WRONG_SHARE:.0f} % wrong: {total['beyond_share']}; "
-        f"of {total['answers']} from {total['frames']} frames"
-    )
     worst = sorted((r for r in results if r["nees"] is not None), key=lambda r: -r["nees"])[:10]
-    return Summary("\n".join(lines) + "\n", {"rows": table, "all": total, "worst": worst})
+    return summary({"rows": table, "all": total, "worst": worst})
 
 
 def _figures(results: Sequence[Result]) -> dict[str, Any]:
@@ -255,16 +242,6 @@ def _figures(results: Sequence[Result]) -> dict[str, Any]:
         "beyond_share": int(np.count_nonzero(share > WRONG_SHARE)),
         "milliseconds": float(np.median([r["milliseconds"] for r in results])),
     }
-
-
-def _line(name: str, turn: str, row: dict[str, Any]) -> str:
-    start = f"{name:20} {turn:>5} {row['answers']:4} /{row['frames']:3}"
-    if not row["answers"]:
-        return start
-    return (
-        f"{start} {row['worst_sigmas']:11.1f} {row['nees']:8.1f} {100 * row['worst_share']:9.3f} % "
-        f"{100 * row['claimed']:6.3f} %"
-    )
 
 
 MISMATCH = Campaign(

@@ -65,7 +65,7 @@ class ObjectChase(PointingFlight):
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
         """`wanted`: craft, orbit, share of the worst disturbances, rate_deg, magnitude, gap (s or None)."""
         self._draw = np.random.default_rng([seed, 23])
-        super().__init__({**wanted, "law": "whole", "target": PointingTarget(Goal.OBJECT)}, seed)
+        super().__init__({**wanted, "target": PointingTarget(Goal.OBJECT)}, seed)
         self.told: list[str] = []
         self.refused = 0
         self.shown: list[FloatArray] = []

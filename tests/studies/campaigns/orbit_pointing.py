@@ -7,8 +7,7 @@ or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts
 comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
 LOST deg off at the end. A turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
 so only the error of three axes has it. `share` multiplies the torques that the coils can not cancel at once:
-drag, sunlight, and the turn of the principal axes; the residual dipole is always whole. Laws: `whole`;
-`plain` without feed-forward; `pd`, the magnetic proportional-derivative law (`orbit_pointing_flight`).
+drag, sunlight, and the turn of the principal axes; the residual dipole is always whole.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight
 
@@ -32,27 +31,18 @@ ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
 SPIN = 0.3
 """deg/s at the start of a turn."""
 HOLDS = (
-    ("cubesat_3u", 0.1, "whole", 0.4),
-    ("cubesat_3u", 0.3, "whole", 1.2),
-    ("cubesat_3u", 1.0, "whole", None),
-    ("cubesat_3u", 0.1, "plain", None),
-    ("knightcube", 0.1, "whole", 2.0),
-    ("knightcube", 0.3, "whole", 5.0),
+    ("cubesat_3u", 0.1, 0.4),
+    ("cubesat_3u", 0.3, 1.2),
+    ("cubesat_3u", 1.0, None),
+    ("knightcube", 0.1, 2.0),
+    ("knightcube", 0.3, 5.0),
 )
-"""Craft, share, law, and deg rms wanted of issue 19."""
+"""Craft, share, and deg rms wanted of issue 19."""
 DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
 """Craft and share."""
 DAY = 86_400.0
-TURNS = tuple(
-    (craft, share, law)
-    for craft, share, laws in (
-        ("cubesat_3u", 0.1, ("whole", "pd")),
-        ("knightcube", 0.1, ("whole", "pd")),
-        ("cubesat_3u", 1.0, ("whole",)),
-        ("knightcube", 1.0, ("whole",)),
-    )
-    for law in laws
-)
+TURNS = tuple((craft, share) for share in (0.1, 1.0) for craft in ("cubesat_3u", "knightcube"))
+"""Craft and share."""
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -61,16 +51,16 @@ def cases(runs: int, seed: int) -> list[Case]:
     for run in range(runs):
         turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))
         target = list(TARGETS)[run % len(TARGETS)]
-        for craft, share, law, _ in HOLDS:
-            same = {"kind": "hold", "craft": craft, "share": share, "law": law, "target": "nadir"}
-            found.append(Case(f"hold/{craft}/{share}/{law}/{run}", (seed, run), same))
+        for craft, share, _ in HOLDS:
+            same = {"kind": "hold", "craft": craft, "share": share, "target": "nadir"}
+            found.append(Case(f"hold/{craft}/{share}/{run}", (seed, run), same))
         for craft, share in DAYS if 4 * run < max(runs, 4) else ():
-            same = {"kind": "day", "craft": craft, "share": share, "law": "whole", "target": "nadir"}
-            found.append(Case(f"day/{craft}/{share}/whole/{run}", (seed, run), same | {"seconds": DAY}))
-        for craft, share, law in TURNS:
-            same = {"kind": "turn", "craft": craft, "share": share, "law": law, "target": target}
+            same = {"kind": "day", "craft": craft, "share": share, "target": "nadir"}
+            found.append(Case(f"day/{craft}/{share}/{run}", (seed, run), same | {"seconds": DAY}))
+        for craft, share in TURNS:
+            same = {"kind": "turn", "craft": craft, "share": share, "target": target}
             start = {"turn_deg": turn, "speed_deg": SPIN}
-            found.append(Case(f"turn/{craft}/{share}/{law}/{run}", (seed, run), same | start))
+            found.append(Case(f"turn/{craft}/{share}/{run}", (seed, run), same | start))
     return found
 
 
@@ -138,92 +128,55 @@ def _rms(values: FloatArray) -> float | None:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return pointing errors and arrivals by craft, share and law."""
-    facts: dict[str, Any] = {}
-    lines = [*_holds(results, facts), "", *_turns(results, facts)]
-    return Summary("\n".join(lines) + "\n", facts)
+    """Return pointing errors and arrivals by craft and share."""
+    facts: dict[str, Any] = {"hold": {}, "turn": {}}
+    held = [("hold", *cell) for cell in HOLDS] + [("day", *cell, None) for cell in DAYS]
+    for kind, craft, share, wanted in held:
+        mine = _of(results, kind, craft, share)
+        if judged := [r for r in mine if "rms" in r]:
+            facts["hold"][f"{kind}/{craft}/{share}"] = {**_held(mine, judged, WATTS[craft]), "wanted": wanted}
+    for craft, share in TURNS:
+        if mine := _of(results, "turn", craft, share):
+            facts["turn"][f"turn/{craft}/{share}"] = _turned(mine, WATTS[craft])
+    return summary(facts)
 
 
 def _of(results: Sequence[Result], *cell: Any) -> list[Result]:
-    """Return the results of a cell: its kind, craft, share and law."""
-    return [r for r in results if (r["kind"], r["craft"], r["share"], r["law"]) == cell]
+    """Return the results of a cell: its kind, craft and share."""
+    return [r for r in results if (r["kind"], r["craft"], r["share"]) == cell]
 
 
-def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
-    """Return the table of the cells `hold`; add their facts."""
-    heads = (
-        "runs",
-        "lost",
-        "median",
-        "worst run",
-        "nadir",
-        "at most",
-        "largest",
-        "known",
-        "NEES",
-        "dipole",
-        "mW",
-        "wanted",
-    )
-    lines = [f"{'hold: craft, share, law':30}" + "".join(f"{head:>10}" for head in heads)]
-    held = [("hold", *cell) for cell in HOLDS] + [("day", *cell, "whole", None) for cell in DAYS]
-    for kind, craft, share, law, wanted in held:
-        mine = _of(results, kind, craft, share, law)
-        judged = [r for r in mine if "rms" in r]
-        if not judged:
-            continue
-        rms = [r["rms"] for r in judged]
-        found = {
-            "runs": len(mine),
-            "lost": sum(r["lost"] for r in mine),
-            "median": float(np.median(rms)),
-            "worst_run": float(max(rms)),
-            "nadir": float(np.median([r["nadir_rms"] for r in judged])),
-            "nadir_most": float(max(r["nadir_worst"] for r in judged)),
-            "largest": float(max(r["worst"] for r in judged)),
-            "known": float(np.median([r["knowledge_rms"] for r in judged])),
-            "nees": float(np.mean([r["nees"] for r in judged])),
-            "dipole": float(np.median([r["dipole_missing"][0] for r in judged if r["dipole_missing"][0]])),
-            "milliwatts": 1e3 * WATTS[craft] * float(np.median([r["mean_square"] for r in judged])),
-            "wanted": wanted,
-        }
-        facts[f"{kind}/{craft}/{share}/{law}"] = found
-        row = [f"{found[name]:10.3g}" for name in list(found)[2:11]]
-        name = f"{craft}, {share}, {law}{', day' * (kind == 'day')}"
-        counts = f"{name:30}{found['runs']:10d}{found['lost']:10d}"
-        lines.append(counts + "".join(row) + f"{wanted or '':>10}")
-    return [
-        *lines,
-        "deg rms of three axes and of nadir alone, its largest and that of three, deg known; "
-        "A m^2 not known in sunlight",
-    ]
+def _held(mine: Sequence[Result], judged: Sequence[Result], watts: float) -> dict[str, Any]:
+    """Return deg rms of three axes and of nadir, the largest, deg known, and A m^2 not known in sunlight."""
+    rms = [r["rms"] for r in judged]
+    return {
+        "runs": len(mine),
+        "lost": sum(r["lost"] for r in mine),
+        "median": float(np.median(rms)),
+        "worst_run": float(max(rms)),
+        "nadir": float(np.median([r["nadir_rms"] for r in judged])),
+        "nadir_worst_run": float(max(r["nadir_rms"] for r in judged)),
+        "nadir_most": float(max(r["nadir_worst"] for r in judged)),
+        "largest": float(max(r["worst"] for r in judged)),
+        "known": float(np.median([r["knowledge_rms"] for r in judged])),
+        "nees": float(np.mean([r["nees"] for r in judged])),
+        "dipole": float(np.median([r["dipole_missing"][0] for r in judged if r["dipole_missing"][0]])),
+        "milliwatts": 1e3 * watts * float(np.median([r["mean_square"] for r in judged])),
+    }
 
 
-def _turns(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
-    """Return the table of the cells `turn`; add their facts."""
-    heads = ("runs", "lost", "arrived", "median", "worst", "end", "mW")
-    lines = [f"{'turn: craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
-    for cell in TURNS:
-        mine = _of(results, "turn", *cell)
-        if not mine:
-            continue
-        times = [r["arrived"] for r in mine if r["arrived"] is not None]
-        found = {
-            "runs": len(mine),
-            "lost": sum(r["lost"] for r in mine),
-            "arrived": len(times),
-            "median": float(np.median(times)) if times else None,
-            "worst": max(times, default=None),
-            "end": float(np.median([r["end_rms"] for r in mine])),
-            "milliwatts": 1e3 * WATTS[cell[0]] * float(np.median([r["mean_square"] for r in mine])),
-        }
-        craft, share, law = cell
-        facts[f"turn/{craft}/{share}/{law}"] = found
-        row = [f"{'':>10}" if value is None else f"{value:10.3g}" for value in list(found.values())[3:]]
-        counts = "".join(f"{found[name]:10d}" for name in ("runs", "lost", "arrived"))
-        lines.append(f"{f'{craft}, {share}, {law}':26}" + counts + "".join(row))
-    within = ", ".join(f"{name} {angle:g} deg" for name, angle in ARRIVED.items())
-    return [*lines, f"s to within {within} and staying; deg rms of the last half hour"]
+def _turned(mine: Sequence[Result], watts: float) -> dict[str, Any]:
+    """Return s until the axis arrived and stayed, and deg rms of the last half hour."""
+    times = [r["arrived"] for r in mine if r["arrived"] is not None]
+    return {
+        "runs": len(mine),
+        "lost": sum(r["lost"] for r in mine),
+        "arrived": len(times),
+        "median": float(np.median(times)) if times else None,
+        "worst": max(times, default=None),
+        "end": float(np.median([r["end_rms"] for r in mine])),
+        "milliwatts": 1e3 * watts * float(np.median([r["mean_square"] for r in mine])),
+    }
 
 
 ORBIT_POINTING = Campaign(

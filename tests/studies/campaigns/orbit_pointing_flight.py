@@ -4,8 +4,6 @@ The tables are those of the planner worker (`pointing_job`): a slew from far off
 pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
 held still (`knightcube.gnc.control.pointing_law`). The coils
 pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
-Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
-lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
 """
 
 from __future__ import annotations
@@ -73,8 +71,6 @@ CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
 """Body axis of the star camera; no cone is kept here."""
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
 """N m and N m per sqrt(s), as the configurations have them: what the filter expects of each shape."""
-BANDWIDTH = {"knightcube": 4e-3, "cubesat_3u": 4e-3}
-"""rad/s of the magnetic proportional-derivative law."""
 
 
 class PointingFlight:
@@ -86,7 +82,7 @@ class PointingFlight:
     """
 
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
-        """`wanted`: craft, share of the worst disturbances, law, target, and the first turn, deg, if any."""
+        """`wanted`: craft, share of the worst disturbances, target, and the first turn, deg, if any."""
         self._wanted = wanted
         target = wanted["target"]
         self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
@@ -135,7 +131,7 @@ class PointingFlight:
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
         self._astray.update(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
-        if self._wanted["law"] != "pd" and time >= COAST and self._is_due(time):
+        if time >= COAST and self._is_due(time):
             self._plan(time)
         around = self._around(time)
         flight.act(np.zeros(3))
@@ -173,35 +169,21 @@ class PointingFlight:
     def _command(self, time: float, around: FilterEnvironment) -> FloatArray:
         """Return the dipole (3,) A m^2 until the end of the cycle."""
         found, flight = self._filter, self.flight
-        law = self._wanted["law"]
         if time < COAST:
             return np.zeros(3)
         field = attitude_matrix(found.quaternion) @ around.field
-        residual = found.residual_dipole(around.sunlit) * (law != "plain")
-        if law == "pd":
-            dipole = self._proportional(time, field) - residual
-        else:
-            assert self._law is not None
-            sizes = found.torque_sizes * (law != "plain")
-            since = time - self._begun
-            command = self._law.command(since, found.quaternion, found.rate, field, residual, sizes)
-            self._turn, dipole = command.rotation, command.dipole
-            if self._astray.since is not None:
-                dipole = damping_dipole(np.diag(flight.inertia), found.rate, field) - residual
+        residual = found.residual_dipole(around.sunlit)
+        assert self._law is not None
+        since = time - self._begun
+        command = self._law.command(since, found.quaternion, found.rate, field, residual, found.torque_sizes)
+        self._turn, dipole = command.rotation, command.dipole
+        if self._astray.since is not None:
+            dipole = damping_dipole(np.diag(flight.inertia), found.rate, field) - residual
         dipole = dipole * CYCLE / (CYCLE - PAUSE)
         dipole = dipole * min(1.0, flight.limit / float(np.abs(dipole).max()))
         if round(time / CYCLE) % 5 == 0:
             self._note(time, float(dipole @ dipole))
         return np.asarray(dipole)
-
-    def _proportional(self, time: float, field: FloatArray) -> FloatArray:
-        """Return the dipole of the magnetic proportional-derivative law."""
-        found, speed = self._filter, self._wanted.get("bandwidth", BANDWIDTH[self._wanted["craft"]])
-        wanted = self._law_at(time, found.quaternion)
-        turn = to_rotation_vector(multiply(found.quaternion, conjugate(wanted[0])))
-        missed = found.rate - attitude_matrix(from_rotation_vector(turn)) @ wanted[1]
-        torque = -self.flight.inertia @ (speed**2 * turn + 2.0 * speed * missed)
-        return np.asarray(np.cross(field, torque) / float(field @ field))
 
     def _law_at(self, time: float, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return attitude and rate of the target at a time; of a free roll, that of the attitude."""
@@ -262,7 +244,7 @@ class PointingFlight:
             self._target,
             found.quaternion,
             found.rate,
-            found.torque_sizes * (self._wanted["law"] != "plain"),
+            found.torque_sizes,
             flight.limit * (CYCLE - PAUSE) / CYCLE,
         )
 

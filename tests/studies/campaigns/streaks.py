@@ -25,7 +25,7 @@ from knightcube.vision.streaks.estimate import estimate_motion
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, summary
 from tests.support.attitude_errors import attitude_error, error_in_pixels
 from tests.support.scenes import FIELD, Scene, noise_floor, slew, usable
 from tests.support.streak_bound import rate_bound
@@ -158,8 +158,8 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
             here = [r for r in results if r["theta"] == theta and r["percent"] == percent]
             cells.append({"theta": theta, "percent": percent, "frames": len(here), **_cell(here)})
     overall = _overall(results)
-    lines = [*_cell_lines(cells), "", *_overall_lines(overall), "", *_thesis_lines(results)]
-    return Summary("\n".join(lines) + "\n", {"cells": cells, "overall": overall, "exposure_s": EXPOSURE})
+    table = _table_3_1(results)
+    return summary({"cells": cells, "overall": overall, "table_3_1": table, "exposure_s": EXPOSURE})
 
 
 def _cell(results: Sequence[Result]) -> dict[str, Any]:
@@ -211,17 +211,6 @@ def _overall(results: Sequence[Result]) -> list[dict[str, Any]]:
     return rows
 
 
-def _overall_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
-    lines = ["likelihood, all theta: rms error over the Cramer-Rao bound, NEES (3 is honest)"]
-    for row in rows:
-        lines.append(
-            f"turn {row['percent']:2d} %: {row['rates']} rates of {row['frames']}, {row['wrong']} wrong, "
-            f"magnitude {_number(row['ratio_magnitude'])}, vector {_number(row['ratio_vector'])} x bound, "
-            f"NEES {_number(row['nees'])}, attitude {_number(row['across_px_median'])} px median"
-        )
-    return lines
-
-
 def _rms(values: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
@@ -235,39 +224,21 @@ def _ratio(errors: Sequence[float], bound: FloatArray) -> float | None:
     return _rms(np.array(errors) / bound) if len(errors) else None
 
 
-def _cell_lines(cells: Sequence[dict[str, Any]]) -> list[str]:
-    head = "theta  turn %  frames   bound: magn. %  vector %"
-    lines = [
-        head
-        + "".join(f" | {name}: rates  magn. %  x bound  vector %  x bound" for name in (LIKELIHOOD, "harris"))
-    ]
-    for cell in cells:
-        line = f"{cell['theta']:5d}  {cell['percent']:6d}  {cell['frames']:6d}"
-        line += f"  {_percent(cell['bound_magnitude']):>14}  {_percent(cell['bound_vector']):>8}"
-        for name in (LIKELIHOOD, "harris"):
-            row = cell[name]
-            line += f" | {row['rates']:>{len(name) + 7}d}  {_percent(row['magnitude']):>7}"
-            line += f"  {_number(row['ratio_magnitude']):>7}  {_percent(row['vector']):>8}"
-            line += f"  {_number(row['ratio_vector']):>7}"
-        lines.append(line)
-    return lines
+def _table_3_1(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return Table 3.1: the largest mean error within each detector's precise region, thesis and here.
 
-
-def _thesis_lines(results: Sequence[Result]) -> list[str]:
-    """Return Table 3.1: the largest mean error within each detector's precise region, thesis and here."""
-    lines = ["Table 3.1 (mean absolute error, largest over theta in the precise region)      thesis | here"]
+    Of the rate in parts, here, and in percent in the thesis; of the attitude in px.
+    """
+    rows = []
     for name in ESTIMATORS:
-        thesis = THESIS.get(name)
-        least = thesis[4] if thesis else 0
-        row = f"{name:20} theta >= {least:2d}"
-        for column, percent in enumerate((10, 50)):
-            here = _worst_mean(results, name, percent, least, "magnitude")
-            row += f"   rate {percent} %: {thesis[column] if thesis else '-':>5} | {_percent(here)} %"
-        for column, percent in enumerate((10, 50)):
-            here = _worst_mean(results, name, percent, least, "across_px")
-            row += f"   attitude {percent} %: {thesis[2 + column] if thesis else '-':>5} | {_number(here)} px"
-        lines.append(row)
-    return lines
+        *thesis, least = THESIS.get(name, (None, None, None, None, 0))
+        row: dict[str, Any] = {"estimator": name, "theta_from": least}
+        asked = [(key, percent) for key in ("magnitude", "across_px") for percent in (10, 50)]
+        for (key, percent), printed in zip(asked, thesis, strict=True):
+            row[f"{key} {percent} %"] = _worst_mean(results, name, percent, least, key)
+            row[f"{key} {percent} %, thesis"] = printed
+        rows.append(row)
+    return rows
 
 
 def _worst_mean(results: Sequence[Result], name: str, percent: int, least: int, key: str) -> float | None:
@@ -281,14 +252,6 @@ def _worst_mean(results: Sequence[Result], name: str, percent: int, least: int, 
         if theta >= least and values:
             means.append(float(np.mean(values)))
     return max(means, default=None)
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.3f}"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 STREAKS = Campaign(

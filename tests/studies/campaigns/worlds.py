@@ -35,7 +35,7 @@ def cases(runs: int, seed: int) -> list[Case]:
         case
         for run in range(runs)
         for case in orbit_pointing.cases(runs, seed)
-        if case.key == f"hold/{('cubesat_3u', 'knightcube')[run % 2]}/{SHARE}/whole/{run}"
+        if case.key == f"hold/{('cubesat_3u', 'knightcube')[run % 2]}/{SHARE}/{run}"
     ]
     return [
         Case(

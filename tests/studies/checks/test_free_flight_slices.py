@@ -42,7 +42,7 @@ def test_a_body_that_did_not_stop_is_counted_as_lost(tmp_path: Path) -> None:
 
 def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_path: Path) -> None:
     """A KnightCube begins 60 deg off nadir; the planner's slew of 300 s brings it there, as in the loop."""
-    parameters = {"craft": "knightcube", "share": 0.1, "law": "whole", "target": "nadir"}
+    parameters = {"craft": "knightcube", "share": 0.1, "target": "nadir"}
     start = {"kind": "turn", "turn_deg": 60.0, "speed_deg": 0.1, "seconds": 340.0}
     turn = orbit_pointing.run(Case("turn", (20_261_123, 1), parameters | start))
     assert not turn["lost"]
@@ -64,7 +64,7 @@ def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_pa
         "mean_square": 1e-6,
     }
     found = orbit_pointing.summarise([hold, turn], tmp_path)
-    assert found.facts["hold/knightcube/0.1/whole"]["runs"] == 1
-    assert found.facts["turn/knightcube/0.1/whole"]["median"] is None
-    assert found.facts["turn/knightcube/0.1/whole"]["arrived"] == 0, "a flight of six minutes shows no stay"
-    assert "turn: craft, share, law" in found.text
+    assert found.facts["hold"]["hold/knightcube/0.1"]["runs"] == 1
+    assert found.facts["turn"]["turn/knightcube/0.1"]["median"] is None
+    assert found.facts["turn"]["turn/knightcube/0.1"]["arrived"] == 0, "a flight of six minutes shows no stay"
+    assert "turn/knightcube/0.1" in found.text

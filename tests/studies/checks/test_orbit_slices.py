@@ -63,7 +63,7 @@ def test_the_summary_names_the_headings_that_give_the_paper_s_figure(
     seen: list[Result], tmp_path: Path
 ) -> None:
     summary = coverage.summarise(seen, tmp_path)
-    assert "the paper's 74 +- 3 %, cone field: beta of 15 deg with two to the Sun's side" in summary.text
+    assert (coverage.BEST, 15.0) in summary.facts["betas_of_paper"]["cone"]
     assert summary.facts["suites"]["usu/tipped 90 deg"]["least_cameras"] >= 2
 
 

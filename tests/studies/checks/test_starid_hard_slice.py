@@ -54,7 +54,7 @@ def test_an_answer_to_strewn_points_is_wrong_and_none_is_refused() -> None:
 
 def test_the_command_prints_a_row_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert starid_hard.main(["--lists", "2", "--only", "known, mirrored", "--json"]) == 0
-    row = json.loads(capsys.readouterr().out.splitlines()[0])
+    (row,) = json.loads(capsys.readouterr().out)["rows"]
     assert row["lists"] == 2
     assert row["right"] + row["wrong"] + row["refused"] == 2
 
