@@ -34,12 +34,7 @@ from tests.support.flights import demo_config, demo_world, fly, thesis_config
 from tests.support.ideal_power import clairvoyant_power
 
 DURATION = 700.0
-FIGURES = (
-    ("steady_state_deg", "steady, deg"),
-    ("overshoot_percent", "overshoot, %"),
-    ("rise_s", "rise, s"),
-    ("settling_s", "settling, s"),
-)
+FIGURES = ("steady_state_deg", "overshoot_percent", "rise_s", "settling_s")
 THESIS_W = {"thesis": 0.10, "thesis, raw readings": 0.10, "pid": 0.15, "adaptive": 0.66}
 
 
@@ -152,7 +147,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         own = [result for result in results if result["controller"] == name]
         heat = float(np.mean([result["heat_w"] for result in own]))
         supply = float(np.mean([result["supply_w"] for result in own]))
-        worst = {key: float(max(result[key] for result in own)) for key, _ in FIGURES}
+        worst = {key: float(max(result[key] for result in own)) for key in FIGURES}
         facts["controllers"][name] = {
             "seeds": len(own),
             "supply_w": supply,

@@ -41,13 +41,6 @@ AXES: dict[str, tuple[float, ...]] = {
     "field_deg": (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0),
     "magnitude_error": (0.0, 0.2, 0.4, 0.7, 1.0),
 }
-LABELS = {
-    "noise_px": "centroid noise, px",
-    "false_stars": "false stars",
-    "lost": "part of the stars missing",
-    "field_deg": "field of view, deg",
-    "magnitude_error": "error of the magnitudes, mag",
-}
 _RIGHT_DEG = 0.05
 _RIGHT_SHARE = 0.8
 BODY_RATE = float(np.deg2rad(1.0))

@@ -23,8 +23,8 @@ from tests.studies.campaigns.orbit_fault_flights import DURATION
 CYCLE = 0.025
 REPORTED_WITHIN = 20.0
 """s after the end of a fault: later events have another cause."""
-BLIND_GRACE, FIELD_GRACE, LOST_GRACE = 0.1, 5.0, 1.0
-"""s within which the coils are at zero: after the last reading, the last good field, the loss of attitude."""
+BLIND_GRACE, FIELD_GRACE = 0.1, 5.0
+"""s within which the coils are at zero: after the last reading, and after the last good field."""
 ZERO, DRIVEN = 1e-3, 6e-3
 """A: a coil that is off carries less; a coil that drives carries more."""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)

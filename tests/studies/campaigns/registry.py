@@ -36,7 +36,6 @@ from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.safe_sun import SAFE_SUN
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
-from tests.studies.campaigns.step_robust import STEP_ROBUST
 from tests.studies.campaigns.streaked import STREAKED
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
 from tests.studies.campaigns.unlike_inertia import UNLIKE_INERTIA
@@ -63,7 +62,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         FALSE_HORIZONS,
         HORIZON_METHODS,
         CONTROLLERS_CAMPAIGN,
-        STEP_ROBUST,
         ROBUST_CONTROLLERS,
         PLANNER_EDGE,
         FAULTS,

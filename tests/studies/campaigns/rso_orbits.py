@@ -55,7 +55,6 @@ WANTED = 0.95
 # Another star this near lies on a streak, if it is not fainter by more than this.
 NEAR_PX = 6.0
 FAINTER_MAG = 4.0
-ROWS = ("Center of Rotation", "Magnitude of Rotation", "Combined Indicator")
 # Table 4.4: correct, overlapping streak, false.
 THESIS = ((12, 0, 3), (10, 2, 0), (12, 2, 0))
 RULES = ("strict", "bounded")

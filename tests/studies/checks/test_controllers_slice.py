@@ -8,7 +8,8 @@ import pytest
 
 from flight.schema import reader as configuration
 from sim_hal.settings import Thread
-from tests.studies.campaigns import controllers, step_robust
+from tests.studies.campaigns import controllers, robust_controllers
+from tests.studies.campaigns.campaign import Case
 from tests.support.flights import demo_config, demo_world
 from tests.support.ideal_power import clairvoyant_power
 
@@ -33,7 +34,7 @@ def test_every_controller_flies_its_own_configuration() -> None:
 
 
 def test_worlds_differ_and_stay_within_their_bounds() -> None:
-    worlds = [step_robust.draw(case.seed) for case in step_robust.cases(200, 1)]
+    worlds = [robust_controllers.draw((1, run)) for run in range(200)]
     for name, low, high in (
         ("inertia", 0.8, 1.2),
         ("field", 0.9, 1.1),
@@ -46,13 +47,13 @@ def test_worlds_differ_and_stay_within_their_bounds() -> None:
         assert low <= min(values) < low + 0.05 * (high - low) + 1e-9
         assert high - 0.05 * (high - low) - 1e-9 < max(values) <= high
     assert max(span for world in worlds for _, span in world["dropouts_s"]) <= 1.0
-    assert step_robust.draw((1, 0)) == worlds[0]
+    assert robust_controllers.draw((1, 0)) == worlds[0]
 
 
 @pytest.mark.slow
 def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
-    """Seed 1, world 1: what `python -m tests.studies.campaigns step-robust` begins with."""
-    result = step_robust.run(step_robust.cases(2, 1)[1])
+    """Seed 1, world 1, under this loop."""
+    result = robust_controllers.run(Case("this loop/1", (1, 1), {"controller": "this loop"}))
     assert not result["lost"]
     assert result["settling_s"] < 12.0
     assert result["steady_state_deg"] < 0.15
@@ -61,10 +62,12 @@ def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
 
 
 def test_the_table_counts_the_lost_and_shows_the_percentile(tmp_path: Path) -> None:
-    world = step_robust.draw((1, 0))
+    world = robust_controllers.draw((1, 0))
     results = [
         {
             "world": world,
+            "controller": "pid",
+            "heat_w": 0.02,
             "steady_state_deg": 0.01 * k,
             "excursion_deg": 0.02 * k,
             "settling_s": 8.0 + 0.01 * k if k < 99 else float("inf"),
@@ -74,7 +77,7 @@ def test_the_table_counts_the_lost_and_shows_the_percentile(tmp_path: Path) -> N
         }
         for k in range(100)
     ]
-    summary = step_robust.summarise(results, tmp_path)
-    assert summary.facts["lost"] == 1
-    assert summary.facts["steady_state_deg"]["p95"] == pytest.approx(0.94)
-    assert summary.facts["settling_s"]["worst"] is None
+    facts = robust_controllers.summarise(results, tmp_path).facts["pid"]
+    assert facts["lost"] == 1
+    assert facts["steady_state_deg"][1] == pytest.approx(0.94)
+    assert facts["settling_s"][2] is None
