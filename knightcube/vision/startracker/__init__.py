@@ -1,7 +1,8 @@
 """The star tracker: identifies the stars of a frame and determines its attitude (Michalski chapter 3).
 
-`detection` finds and measures stars. `lost_in_space` and `verification` identify them with the guide stars of
-`index`, without and with a prior attitude; `attitude_fit` fits the attitude to the identified directions.
-`image_fit` determines the attitude from the positions in the image. `solve` combines these steps, and
-`catalogue_refit` refits the streaks of an identified frame. `sky_map` converts between pixels and directions.
+`detection` finds and measures stars. `lost_in_space` identifies the stars without a prior attitude, and
+`verification` with a prior attitude; both use the guide stars of `index`. `attitude_fit` fits the attitude to
+the directions of identified stars, and `image_fit` to their positions in the image. `solve` combines these
+steps. `catalogue_refit` refits the streaks of an identified frame. `sky_map` converts between pixels and
+directions.
 """

@@ -1,18 +1,19 @@
 """Least-squares fits of attitude, scale and radial distortion to matched stars.
 
 `refine` solves Wahba's problem with one more unknown, the scale k, which multiplies all tangents x/z and y/z
-to correct the assumed focal length. Gauss-Newton minimises the residuals e = b(k) - A r. For a small rotation
-d about the camera axes and a small change of ln k they change by -[A r x] d + s dlnk, with s = (x z^2, y z^2,
--z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood estimate for directions
-with errors of sigma rad along either axis across them.
+to correct the assumed focal length. A Gauss-Newton iteration minimises the residuals e = b(k) - A r, where b
+is an observed unit vector, A the attitude matrix and r the unit vector from the catalogue. A small rotation d
+about the camera axes and a small change of ln k change e by -[A r x] d + s dlnk, with s = (x z^2, y z^2,
+-z (x^2 + y^2)). The minimum of the sum of |e|^2 / sigma^2 is the maximum likelihood estimate if sigma, rad,
+is the standard deviation of a direction along each of the two axes normal to it.
 
-`fit_with_distortion` adds radial distortion, for a lens that is not calibrated. Such a lens shifts stars by
-some percent of their distance from the axis: a pinhole then fits a group of neighbours and misses the other
-stars, and its attitude error is larger than its residuals suggest. An image at the tangent t of the true
-direction appears at t (1 + c (t / R)^2), where R is the tangent of the corner (Brown 1966, the first radial
-term); c has the prior `PRIOR`. The match starts with the stars that match without distortion and grows
-outwards while c is determined. If the stars do not determine c, the covariance of the attitude includes the
-uncertainty of c.
+`fit_with_distortion` also fits the radial distortion of an uncalibrated lens. Such a lens displaces stars by
+some per cent of their distance from the axis. Without distortion, the fit agrees only with a group of
+neighbouring stars, and its attitude error is larger than the residuals suggest. A star whose true direction
+has the tangent t appears at the tangent t (1 + c (t / R)^2), where R is the tangent of the image corner
+(first radial term of Brown 1966). The distortion c has the prior standard deviation `PRIOR`. The match starts
+with the stars that match without distortion and grows outwards as c is determined. The covariance of the
+attitude includes the uncertainty of c.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from knightcube.vision.startracker.index.sky_index import SkyIndex
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarField:
-    """The observed points of a frame, the brightest first; some of them may not be stars.
+    """The observed points of a frame, the brightest first; some points may not be stars.
 
     Attributes:
-        direction: unit vectors (n, 3) in the camera frame, for the assumed focal length.
+        direction: unit vectors to the points (n, 3), camera frame, for the assumed focal length.
         sigma: standard deviation of each direction along one axis (n,), rad.
-        half_width: tangents of half the field of view along x and y (2,).
-        scale: lowest and highest factor by which the tangents x/z, y/z must be multiplied for the true focal
+        half_width: tangents of half the field of view along x and along y (2,).
+        scale: lowest and highest possible factor that corrects the tangents x/z, y/z for the true focal
             length; (1, 1) for a calibrated camera.
-        magnitude: instrumental magnitudes (n,), up to a common constant; None if only the order is known.
+        magnitude: instrumental magnitudes of the points (n,); None if only their order is known.
     """
 
     direction: FloatArray
@@ -53,7 +54,7 @@ class StarField:
         return len(self.direction)
 
     def rescaled(self, factor: float) -> StarField:
-        """Return the field with all tangents multiplied by `factor`, and the range of the scale adapted."""
+        """Return the field with its tangents multiplied by `factor` and its limits of scale divided by it."""
         stretched = self.direction * np.array([factor, factor, 1.0])
         return replace(
             self,
@@ -64,17 +65,17 @@ class StarField:
         )
 
     def mirrored(self) -> StarField:
-        """Return the mirrored field: left and right are exchanged about the boresight."""
+        """Return the field with left and right exchanged about the boresight."""
         return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
 
     def subset(self, chosen: IntArray) -> StarField:
-        """Return the field of the stars with the indices `chosen` (k,), in this order."""
+        """Return the field with only the points whose indices are in `chosen` (k,), in this order."""
         magnitude = None if self.magnitude is None else self.magnitude[chosen]
         return replace(self, direction=self.direction[chosen], sigma=self.sigma[chosen], magnitude=magnitude)
 
 
 class MatchStatus(Enum):
-    """The outcome of an identification."""
+    """The outcome of an identification of stars."""
 
     IDENTIFIED = "identified"
     TOO_FEW_STARS = "too-few-stars"
@@ -84,22 +85,22 @@ class MatchStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarMatch:
-    """The guide stars assigned to the observed stars, and the attitude that follows.
+    """The guide stars assigned to the observed points, and the resulting attitude.
 
     Attributes:
-        status: the other attributes are valid for IDENTIFIED only.
-        star: indices of the guide stars (n,); -1 for an observed point without a guide star.
+        status: outcome of the identification; the other attributes are valid for IDENTIFIED only.
+        star: index of the guide star of each point (n,); -1 for a point without a guide star.
         fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
-        scale: factor by which the tangents of the observed directions had to be multiplied.
+        scale: factor that corrects the tangents of the observed directions for the true focal length.
         scale_sigma: standard deviation of the scale; 0 if the scale was given.
         log10_false_alarm: log10 of the probability that random stars would match as well anywhere in the sky;
             0 if unknown.
-        distortion: fitted distortion of the lens, as the relative shift of a star in the corner
-            (`attitude_fit`); 0 if the stars matched without distortion.
+        distortion: fitted distortion of the lens, as the relative displacement of a star in the image corner;
+            0 if the stars matched without distortion.
         from_lens: part of the covariance of `fix` that is due to the uncertainty of `distortion` (3, 3),
             rad^2.
-        mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the
-            attitude of that field.
+        mirrored: whether the stars were identified in the mirrored field (`StarField.mirrored`). In this case
+            `fix` is the attitude of the mirrored field.
     """
 
     status: MatchStatus
@@ -113,16 +114,15 @@ class StarMatch:
     mirrored: bool = False
 
 
-# The rows of v @ _CROSS, reshaped to (3, 3), are the matrix [v x].
+# The product v @ _CROSS, reshaped to (3, 3), is the cross-product matrix [v x].
 _CROSS = np.array(
     [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0.0]]
 )
-# Step (rad) at which the iteration ends.
-# A step d leaves an error of about d^2, 0.002 arcsec.
+# Step (rad) below which the iteration ends; a step d leaves an error of about d^2, or 0.002 arcsec.
 _SETTLED = 1e-4
 _MOST_STEPS = 6
-# Minimum reciprocal condition number.
-# The rotation about a line is undefined if all directions are within 1e-6 rad of it.
+# Minimum reciprocal condition number of the normal equations.
+# It is reached if all stars lie within 1e-6 rad of one direction.
 _LEAST_INFORMATION = 1e-12
 
 
@@ -131,11 +131,11 @@ class Refinement:
     """The attitude and scale of a least-squares fit.
 
     Attributes:
-        matrix: attitude matrix A (3, 3), ICRS to camera.
-        scale: factor of the tangents.
-        covariance: of the rotation about the camera axes, rad^2, and of ln scale (4, 4); (3, 3) if the scale
-            was fixed.
-        squares: |e|^2 / sigma^2 of each star (n,).
+        matrix: attitude matrix (3, 3) from ICRS to camera axes.
+        scale: factor that corrects the tangents of the observed directions.
+        covariance: covariance of the rotation about the camera axes, rad^2, and of ln scale (4, 4); without
+            ln scale (3, 3) if the scale was fixed.
+        squares: squared residual of each star divided by its variance (n,).
     """
 
     matrix: FloatArray
@@ -145,22 +145,22 @@ class Refinement:
 
     @property
     def scale_sigma(self) -> float:
-        """The relative standard deviation of the scale; 0 if it was fixed."""
+        """The relative standard deviation of the scale; 0 if the scale was fixed."""
         return math.sqrt(self.covariance[3, 3]) if len(self.covariance) == 4 else 0.0
 
     def fix(self) -> AttitudeFix:
-        """Return the attitude in the form of the solvers of Wahba's problem."""
+        """Return the attitude and its covariance in the form that solvers of Wahba's problem return."""
         turn = np.ascontiguousarray(self.covariance[:3, :3])
         return AttitudeFix(from_matrix(self.matrix), turn, 0.5 * float(self.squares.sum()))
 
     def widened(self) -> Refinement:
-        """Return the same fit with its covariance increased according to the residuals."""
+        """Return the fit with its covariance increased if the residuals exceed their standard deviations."""
         factor = inflation(self.squares, len(self.covariance))
         return replace(self, covariance=self.covariance * factor)
 
 
 def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
-    """Return `direction` (n, 3) with its tangents x/z, y/z multiplied by `scale`, a number or (n,)."""
+    """Return unit vectors (n, 3) with their tangents x/z, y/z multiplied by `scale`, a number or (n,)."""
     if isinstance(scale, float) and scale == 1.0:
         return direction
     x, y, z = direction.T
@@ -171,7 +171,7 @@ def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
 
 
 def scale_slope(direction: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3) of unit vectors `direction` (n, 3) by ln scale."""
+    """Return the derivatives (n, 3) of unit vectors (n, 3) with respect to the logarithm of the scale."""
     squared = direction[:, 2:] * direction[:, 2:]
     slope = direction * squared
     slope[:, 2:] -= direction[:, 2:]
@@ -179,11 +179,11 @@ def scale_slope(direction: FloatArray) -> FloatArray:
 
 
 def inflation(squares: FloatArray, parameters: float) -> float:
-    """Return the factor by which the variances must be increased to agree with the residuals.
+    """Return the factor by which variances must be increased to agree with the residuals of a fit.
 
-    `squares` (n,) are |e|^2 / sigma^2, each of two components. Their sum has a chi-square distribution with
-    2n - `parameters` degrees of freedom. The factor is 1 if the sum exceeds its mean by less than three
-    standard deviations.
+    Each of the `squares` (n,) is the chi-square of one star, with two components. The sum of the squares has
+    a chi-square distribution with 2n - `parameters` degrees of freedom. The factor is 1 if the sum exceeds
+    its mean by less than three standard deviations.
     """
     freedom = 2 * len(squares) - parameters
     if freedom <= 0:
@@ -200,15 +200,15 @@ def refine(
     scale: float,
     free_scale: bool,
 ) -> Refinement | None:
-    """Return the attitude and scale that best rotate `reference` into `observed`.
+    """Return the attitude and scale that best transform `reference` directions into `observed` directions.
 
-    Returns None if the stars do not determine the parameters, or the fit diverges.
+    Returns None if the stars do not determine the parameters, or if the fit diverges.
 
     Args:
-        observed: unit vectors (n, 3), camera frame, at scale 1.
-        reference: unit vectors (n, 3), ICRS.
+        observed: observed unit vectors to the stars (n, 3), camera frame, at scale 1.
+        reference: unit vectors to the same stars from the catalogue (n, 3), ICRS.
         sigma: standard deviation of each observed direction (n,), rad, at scale 1.
-        matrix: initial attitude (3, 3).
+        matrix: initial attitude matrix (3, 3), ICRS to camera.
         scale: initial scale, or the fixed scale.
         free_scale: whether the scale is fitted.
     """
@@ -231,8 +231,7 @@ def refine(
             return None
         step = -(covariance @ (residual @ flat))
         longest = float(np.abs(step).max())
-        # Every combination of parameters must be determined beyond rounding. The largest element of a
-        # positive definite matrix is on its diagonal.
+        # The largest element of the matrix times that of its inverse approximates the condition number.
         condition = float(normal.max()) * float(covariance.max()) * _LEAST_INFORMATION
         if not 0.0 < condition < 1.0 or not longest < 1.0:
             return None
@@ -241,13 +240,13 @@ def refine(
             scale *= math.exp(float(step[3]))
         if longest < _SETTLED:
             break
-    # The squares of the residuals after the last step.
+    # The residuals after the last step follow from the linearised equations.
     left = (residual + flat @ step).reshape(-1, 3)
     return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
 
 
 def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return the attitude (3, 3) after a rotation `turn` (3,), rad, about the camera axes (Rodrigues)."""
+    """Return the attitude matrix (3, 3) after a rotation `turn` (3,), rad, about the camera axes."""
     x, y, z = (float(component) for component in turn)
     angle = math.sqrt(x * x + y * y + z * z)
     first = math.sin(angle) / angle if angle > 0.0 else 1.0
@@ -257,19 +256,18 @@ def turned(matrix: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 PRIOR = 0.05
-"""Prior standard deviation of the radial distortion c of an uncalibrated lens. The value of c is the shift of
-a star in the image corner, as a fraction of its distance from the axis."""
+"""Prior standard deviation of an uncalibrated lens's radial distortion, relative to the corner's radius."""
 _MOST = 0.25
 _GROWTH_ROUNDS = 12
 _DISTORTION_STEPS = 6
 _DISTORTION_SETTLED = 1e-6
-# Half width of the gate while the match grows, in standard deviations of a star and relative to the corner's
-# tangent.
+# Half-width of the gate while the match grows: the larger of two limits.
+# One limit is in standard deviations of a star, and the other is relative to the corner's tangent.
 _GATE_SIGMAS = 8.0
 _GATE_SHARE = 0.004
-# Standard deviations of the scatter beyond which a star is excluded from the final fit.
+# Residual above which a star is excluded from the final fit, in standard deviations of the scatter.
 _OUTLIER = 4.0
-# Median of the square root of a chi-square with 2 degrees of freedom.
+# Median of the square root of chi-square with 2 degrees of freedom (the Rayleigh distribution).
 _RAYLEIGH_MEDIAN = 1.1774
 
 
@@ -278,12 +276,13 @@ class DistortedFit:
     """The matched stars and the attitude of a camera with a distorted lens.
 
     Attributes:
-        observed: indices of the matched observed stars (k,).
-        star: indices of the matched guide stars (k,).
-        refined: attitude, scale and their covariance, increased according to the residuals.
-        distortion: the coefficient c of the module docstring.
-        seen: directions of all observed stars, corrected for the distortion (n, 3), camera frame.
-        from_lens: part of the attitude covariance that is due to the uncertainty of c (3, 3), rad^2.
+        observed: indices of the matched observed points (k,).
+        star: indices of the guide stars that they match (k,).
+        refined: attitude and scale, with a covariance that is increased if the residuals are too large.
+        distortion: radial distortion, as the relative displacement of a star in the image corner.
+        seen: unit vectors to all observed points, corrected for the distortion (n, 3), camera frame.
+        from_lens: part of the attitude covariance that is due to the uncertainty of the distortion (3, 3),
+            rad^2.
     """
 
     observed: IntArray
@@ -302,10 +301,17 @@ def fit_with_distortion(
     star: IntArray,
     start: Refinement,
 ) -> DistortedFit | None:
-    """Return the match grown from the stars `observed` and `star` (k,), starting at `start`.
+    """Return a match that is extended to stars for which the distortion of the lens must be fitted.
 
-    `expected` are the indices of the guide stars in and around the field, the brightest first. Returns None
-    if the matched stars do not determine the lens.
+    Returns None if the matched stars do not determine the distortion.
+
+    Args:
+        field: observed points of the frame.
+        sky: index of the guide stars.
+        expected: indices of the guide stars in and around the field, the brightest first.
+        observed: indices of the points that match without distortion (k,).
+        star: indices of the guide stars that these points match (k,).
+        start: attitude and scale of the match without distortion.
     """
     corner = math.hypot(*field.half_width)
     pose = _DistortedPose(start.matrix, start.scale, 0.0)
@@ -339,7 +345,7 @@ def fit_with_distortion(
         if fitted is None:
             return None
     pose, normal, squares = fitted
-    # Residuals that exceed the standard deviations increase the covariance, except for the part of the prior.
+    # Residuals that are too large increase the covariance from the stars, but not the prior covariance.
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
@@ -352,18 +358,22 @@ def fit_with_distortion(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _DistortedPose:
-    """Attitude (3, 3), scale and distortion."""
+    """The attitude matrix (3, 3), scale and radial distortion of a camera."""
 
     matrix: FloatArray
     scale: float
     distortion: float
 
     def true(self, direction: FloatArray, corner: float) -> FloatArray:
-        """Return the directions (n, 3) corrected for scale and distortion, of observed ones (n, 3)."""
+        """Return observed unit vectors (n, 3) corrected for scale and distortion."""
         return stretched(direction, self.scale * self.ratio(direction, corner))
 
     def ratio(self, direction: FloatArray, corner: float) -> FloatArray:
-        """Return the ratios r (n,) of true to observed tangents, the roots of r (1 + c s^2 r^2) = 1."""
+        """Return the ratios r (n,) of true to observed tangents.
+
+        A ratio solves r (1 + c s^2 r^2) = 1, with distortion c and observed tangent s in units of the
+        corner's.
+        """
         squared = self.distortion * _squared_tangent(direction) / corner**2
         ratio = np.ones(len(direction))
         for _ in range(4):
@@ -378,7 +388,10 @@ def _squared_tangent(direction: FloatArray) -> FloatArray:
 def _distorted_fit(
     field: StarField, sky: SkyIndex, observed: IntArray, star: IntArray, pose: _DistortedPose, corner: float
 ) -> tuple[_DistortedPose, FloatArray, FloatArray] | None:
-    """Return the fit to the matched stars, its normal matrix (5, 5) with the prior, and squares (k,)."""
+    """Return attitude, scale and distortion from matched stars, the normal matrix (5, 5) and squares (k,).
+
+    The normal matrix includes the prior of the distortion. The squares are the chi-squares of the stars.
+    """
     direction, reference = field.direction[observed], sky.stars.direction[star]
     weight = 1.0 / (field.sigma[observed] * pose.scale)
     for _ in range(_DISTORTION_STEPS):
@@ -387,7 +400,7 @@ def _distorted_fit(
         predicted = reference @ pose.matrix.T
         residual = weight[:, None] * (seen - predicted)
         slope = np.empty((len(seen), 3, 5))
-        # A rotation d changes A r by -[d x] A r = [A r x] d, and the residual by the negative of it.
+        # A rotation d changes A r by -[d x] A r = [A r x] d, and changes the residual by -[A r x] d.
         slope[:, :, :3] = -cross_matrices(predicted)
         slope[:, :, 3] = scale_slope(seen)
         share = _squared_tangent(direction) * ratio**2 / corner**2

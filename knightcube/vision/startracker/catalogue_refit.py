@@ -1,11 +1,12 @@
-"""Refits the streaks of an identified frame with all stars of the catalogue, including faint ones.
+"""Refit of the streaks of an identified frame with all stars of the catalogue, including faint stars.
 
-In long streaks most stars are below the noise of a pixel, yet their light overlaps the bright streaks and
-shifts them; a close pair is measured as one star. Once a frame is identified, the catalogue gives the
-positions of all stars and, scaled by the light of the measured stars, their brightness. The light of stars
-too faint, or too near to a brighter star, to be fitted is subtracted from the frame, with the uncertainty of
-the catalogue's magnitudes for the camera's colours; the others are fitted from their true places. Objects
-found that are not in the catalogue are fitted but do not affect the motion.
+In a frame of long streaks, most stars are fainter than the noise of a pixel. Their light overlaps the bright
+streaks and displaces the measured positions, and a close pair of stars is measured as one star. After a frame
+is identified, the catalogue gives the positions of all stars. The catalogue also gives their brightness,
+scaled by the measured stars. Stars that are too faint, or too near to a brighter star, to be fitted are
+subtracted from the frame, and the uncertainty of their brightness is added to the noise. The fit of the other
+stars starts at their catalogue positions. Objects that are not in the catalogue are fitted but do not affect
+the motion.
 """
 
 from __future__ import annotations
@@ -43,26 +44,25 @@ from knightcube.vision.streaks.normal_equations import light_of
 from knightcube.vision.streaks.settings import LikelihoodSettings
 from knightcube.vision.streaks.streak_result import MotionResult, StreakStatus
 
-# Distance, relative to the fit's half width, below which a streak overlaps the pixels of a bright streak.
+# Distance below which a streak overlaps the pixels of a bright streak, relative to the half-width of the fit.
 _NEAR = 1.4
-# Distance (px) below which two stars are not fitted separately.
+# Distance (px) below which two stars are too close to be fitted separately.
 _TWIN = 2.0
-# Largest distance (px) of a measured star from its catalogue star, and the least ratio of their light.
+# Largest distance (px) between a measured star and its catalogue star, and minimum ratio of their fluxes.
 _SAME, _ALIKE = 5.0, 0.3
-# Distance (px) from the streak of a catalogue star within which a measured star is a segment of that streak.
+# Distance (px) from a catalogue star's streak within which a measured star is a segment of this streak.
 _BESIDE = 2.5
-# Relative error of the light of a star as the catalogue predicts it.
+# Relative error of a star's flux that is predicted from the catalogue.
 _LIGHT_ERROR = 0.15
-# Number of stars whose light is subtracted at once.
+# Number of stars that are subtracted in one batch.
 _AT_ONCE = 25
-# Number of instants at which a star is tested for being in the frame.
+# Number of instants during the exposure at which a star is tested for being in the frame.
 _INSTANTS = 9
-# Ratio of the pixel limits of the second and the first fit.
-# The second fit includes faint stars.
+# Factor on the maximum number of pixels in the refit, which includes more stars than the first fit.
 _ROOM = 1.7
-# Chi-square of the difference of two fits of one motion, exceeded by chance once in 100,000 cases.
+# Largest chi-square of the difference between the rates of both fits (false rejection of 1 in 100,000).
 _ONE_MOTION = 25.9
-# Increase (px) of the uncertainty of the previous attitude.
+# Increase (px) of the uncertainty of the attitude that is the prior of the refit.
 _PRIOR_PX = 1.0
 
 
@@ -73,12 +73,12 @@ def refit_with_catalogue(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> FrameSolution:
-    """Return `solution` with motion and attitude refitted; unchanged if the refit fails.
+    """Return a solution with motion and attitude refitted, or the same solution if the refit fails.
 
     Args:
-        pixels: the solved frame (rows, columns).
-        solution: solution of a frame of streaks; a solution with a fitted scale is returned unchanged.
-        sky: the guide stars.
+        pixels: counts of the solved frame (rows, columns).
+        solution: solution of a frame of streaks; a solution with a fitted focal length is returned unchanged.
+        sky: index of the guide stars.
         settings: settings with which the frame was solved.
         likelihood: settings of the fit of the streaks.
     """
@@ -104,13 +104,13 @@ def refit_motion(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
-    """Return `motion` refitted with all catalogue stars; None if the fit fails or gives another rate."""
-    # Under a rolling shutter an ambiguous rate lies between two motions: a fit must not start from it.
+    """Return `motion` refitted with all catalogue stars; None if the fit fails or gives a different rate."""
+    # With a rolling shutter, an ambiguous rate lies between two possible rates and is not a valid start.
     between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
-    # The rotation over the exposure from the mean rate and the other terms of the motion.
+    # The rotation during the exposure follows from the mean rate, the acceleration and the higher terms.
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
     shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
     course = CameraMotion.between(motion.rate * exposure, growth, shape)
@@ -131,7 +131,7 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
-    # The stars that were not fitted are known from the catalogue, so no fit of fewer streaks is better.
+    # `hidden` is cleared, so that the fit is not repeated with fewer streaks; the catalogue gives all stars.
     done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, StreakVerdict.CONFIRMED)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
@@ -141,7 +141,7 @@ def refit_motion(
     apart = refit.rate - motion.rate
     if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
         return None
-    # The faint streaks that differ from all refitted ones.
+    # Faint streaks that are not among the refitted streaks are kept.
     worst = np.linalg.norm(motion.faint_endpoints[:, None] - refit.endpoints, axis=-1).max(axis=-1)
     left = (worst > _SAME).all(axis=1)
     return replace(
@@ -159,9 +159,9 @@ class _Known:
     """Catalogue stars in and around a frame.
 
     Attributes:
-        places: positions at mid-exposure (n, 2), px.
-        light: light over the exposure (n,), counts.
-        inside: fraction of the path that lies in the frame (n,).
+        places: positions of the stars at mid-exposure (n, 2), px.
+        light: flux of each star during the exposure (n,), counts.
+        inside: fraction of each star's path that lies in the frame (n,).
     """
 
     places: FloatArray
@@ -172,7 +172,7 @@ class _Known:
     def seen(
         cls, pinhole: Pinhole, course: CameraMotion, places: FloatArray, light: FloatArray, most: int
     ) -> _Known:
-        """Return the stars in the frame, at most `most`, those with the most light in it first."""
+        """Return at most `most` stars in the frame, ordered by decreasing flux within the frame."""
         n = len(places)
         time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
         there = positions(pinhole, course, np.repeat(places, _INSTANTS, axis=0), time)
@@ -182,7 +182,7 @@ class _Known:
         return cls(places[order], light[order], inside[order])
 
     def twins(self) -> BoolArray:
-        """Return which stars (n,) have a brighter star too near to be fitted separately."""
+        """Return which stars (n,) are too close to a brighter star to be fitted separately."""
         order = np.argsort(self.places[:, 0], kind="stable")
         fainter = np.zeros(len(order), dtype=np.bool_)
         for places_on in range(1, len(order)):
@@ -203,7 +203,10 @@ def _known_stars(
     course: CameraMotion,
     most: int,
 ) -> _Known | None:
-    """Return the stars in the frame; None if no fitted star was identified, whose light gives the scale."""
+    """Return the catalogue stars in the frame; None if no fitted star is identified.
+
+    The identified stars give the counts of a star of magnitude zero.
+    """
     matched = solution.matched
     apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
     fitted = apart.argmin(axis=1)
@@ -225,7 +228,7 @@ def _known_stars(
 def _scenes(
     camera: FitProblem, course: CameraMotion, known: _Known, motion: MotionResult
 ) -> tuple[StreakScene, StreakScene]:
-    """Return the stars to fit, of which the brightest are trusted, and the stars to subtract."""
+    """Return the stars to fit, of which the brightest determine the motion, and the stars to subtract."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
@@ -248,9 +251,9 @@ def _scenes(
 
 
 def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known: _Known) -> IntArray:
-    """Return which measured stars are not in the catalogue, neither at their position nor along their streak.
+    """Return the indices of measured stars that are near neither a catalogue star nor its streak.
 
-    The first fit may have split a bright star into two, one behind the other.
+    The streak of a catalogue star is also examined because the first fit may divide it into two stars.
     """
     near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
     polar, azimuth = polar_angles(pinhole, course, motion.stars)
@@ -262,7 +265,7 @@ def _foreign(pinhole: Pinhole, course: CameraMotion, motion: MotionResult, known
 
 
 def _without(camera: FitProblem, hidden: StreakScene) -> ReducedFrame:
-    """Return the frame without the light of `hidden` stars, with their uncertainty added to its noise."""
+    """Return the frame without the light of `hidden` stars, and with their flux uncertainty as noise."""
     frame = camera.frame
     if not len(hidden.light):
         return frame

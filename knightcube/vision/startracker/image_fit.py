@@ -1,20 +1,21 @@
 """The attitude from matched stars whose image positions have individual covariances.
 
-The position of a streaked star is accurate across its path and inaccurate along it. Each residual b - A r is
-taken in the two directions across the star and whitened by the covariance of the position; Gauss-Newton
-minimises the sum of squares, the maximum likelihood estimate for Gaussian errors. The light of another star
-in a streak shifts its position. Stars that disagree by more than chance allows, given the scatter of the
-majority, are found with Huber's weights, which bound the influence of any star, and are excluded.
+The position of a streaked star is accurate across its path and inaccurate along its path. Each residual,
+which is the difference between observed and predicted unit vector, is resolved in two directions normal to
+the star and whitened by the covariance of the position. A Gauss-Newton iteration minimises the sum of
+squares, which is the maximum likelihood estimate for Gaussian errors. A streak that overlaps another star has
+a wrong position. Such outliers are found with Huber's weights, which bound the influence of any star, and are
+excluded.
 
-Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are fitted too, with a prior from
-the calibration or from typical lenses: their remaining uncertainty is part of the covariance of the attitude.
-The same holds for an error of the line time of a rolling shutter, which displaces each star along its motion
-in proportion to its row.
+Tilt, decentring and distortion of an inexact lens (the bend, see `sky_map`) are also fitted, with a prior
+from the calibration or from typical lenses. The covariance of the attitude includes the remaining uncertainty
+of the lens. An error of the line time of a rolling shutter, which displaces each star along its motion in
+proportion to its row, is also fitted.
 
-The positions of streaks that differ from the model have errors of pixels, independent of their brightness. If
-the streaks scatter beyond their noise, a common variance is added to the noise, so that the sum of squares
-equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without it the brightest
-stars, whose noise is smallest, would dominate, and the covariance would be too small.
+The positions of streaks that do not fit the streak model have errors of pixels, whatever their brightness. If
+the residuals of streaks exceed the noise, a common variance is added to the noise, so that the sum of squares
+equals the degrees of freedom (Mandel & Paule 1970, Analytical Chemistry 42(11)). Without this variance, the
+brightest stars would dominate the fit, and the covariance would be too small.
 """
 
 from __future__ import annotations
@@ -37,16 +38,16 @@ from knightcube.vision.startracker.sky_map import BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
-# Step (px) of the numerical derivative of the lens.
+# Step (px) of the numerical derivative of a direction with respect to the image position.
 _STEP_PX = 0.5
-# Chi-square with 2 degrees of freedom that is exceeded by chance once in 1000, and the median.
+# Value of chi-square with 2 degrees of freedom that is exceeded with a probability of 0.1 %, and its median.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
-# Residual (standard deviations) above which the influence of a star is bounded in the search for outliers.
+# Residual (standard deviations) above which Huber's weights bound the influence of a star.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
-# Maximum number of Newton steps for the common variance, and excess of the sum of squares at which they end.
+# Maximum number of Newton steps for the common variance, and the excess chi-square below which they end.
 _SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
 
 
@@ -56,8 +57,8 @@ class Unknowns:
 
     Attributes:
         scale: whether the focal length is fitted.
-        bend: prior information (6,), the reciprocal variances, of the lens errors (`sky_map`); empty (0,) if
-            the lens is exact.
+        bend: reciprocal prior variances (6,) of tilt, decentring and distortion of the lens (`sky_map`);
+            empty (0,) if the lens is exact.
         late: displacement of each star (n, 2), px, due to an error of one standard deviation of the shutter's
             line time; (0, 2) if the line time is exact.
         scatter: whether a common variance may be added to the variances of the positions.
@@ -77,13 +78,13 @@ class ImageFit:
     """The attitude and the quality of its fit.
 
     Attributes:
-        fix: the attitude from the stars that agree; its covariance is increased if they scatter too much.
-        scale: factor of the tangents x/z, y/z; 1 if it was fixed.
-        scale_sigma: relative standard deviation of the scale; 0 if it was fixed.
-        bend: bend of the lens (6,), see `sky_map`; zeros for an exact lens.
+        fix: attitude from the stars that agree; its covariance is increased if their residuals are too large.
+        scale: factor that corrects the observed tangents x/z, y/z; 1 if the focal length was fixed.
+        scale_sigma: relative standard deviation of the scale; 0 if the focal length was fixed.
+        bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros for an exact lens.
         delay: fitted error of the shutter's line time, in standard deviations.
         squares: chi-square of each star (n,), with two degrees of freedom.
-        agree: whether the star was used (n,).
+        agree: which stars were used for the attitude (n,).
     """
 
     fix: AttitudeFix
@@ -103,19 +104,19 @@ def fit_in_image(
     start: FloatArray,
     unknowns: Unknowns = _NONE,
 ) -> ImageFit:
-    """Return the attitude for which stars at `reference` appear at `points`.
+    """Return the attitude for which stars in the directions `reference` appear at the positions `points`.
 
     Args:
-        points: measured positions (n, 2), px.
-        covariance: covariance of each position (n, 2, 2), px^2.
-        reference: directions of the stars (n, 3), unit vectors.
-        camera: the camera with its lens.
-        start: approximate attitude (4,), reference to camera.
-        unknowns: the parameters that are fitted together with the attitude.
+        points: measured positions of the stars (n, 2), px.
+        covariance: covariances of the positions (n, 2, 2), px^2.
+        reference: unit vectors to the stars from the catalogue (n, 3).
+        camera: camera model.
+        start: approximate attitude quaternion (4,) from reference to camera axes.
+        unknowns: parameters that are fitted together with the attitude.
 
     Raises AttitudeError if the stars do not determine the parameters.
     """
-    # The derivatives (n, 3, 2) of direction by position.
+    # The slopes (n, 3, 2) are the derivatives of the directions with respect to the positions.
     moved = [
         camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
         for offset in _STEP_PX * np.eye(2)
@@ -139,7 +140,7 @@ def fit_in_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FittedPose:
-    """Attitude (3, 3), scale, bend (6,), delay, and the covariance of these parameters."""
+    """Fitted attitude matrix (3, 3), scale, bend (6,) and delay, and their covariance."""
 
     matrix: FloatArray
     scale: float
@@ -150,10 +151,16 @@ class _FittedPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Stars observed at `observed` (n, 3), camera frame, whose catalogue directions are `reference` (n, 3).
+    """Observed stars and the parameters to be fitted to them.
 
-    `slopes` (n, 3, 2) are the derivatives of direction by position, and `covariance` (n, 2, 2), px^2, is the
-    covariance of each position.
+    Attributes:
+        observed: observed unit vectors to the stars (n, 3), camera frame.
+        slopes: derivatives of the observed directions with respect to the positions (n, 3, 2), rad/px.
+        covariance: covariances of the positions (n, 2, 2), px^2.
+        reference: unit vectors to the stars from the catalogue (n, 3).
+        unknowns: parameters that are fitted together with the attitude.
+        whitener: transformation (n, 2, 3) of a direction error into two components of unit variance.
+        late: displacement of each direction due to one standard deviation of the line time (n, 3), rad.
     """
 
     observed: FloatArray
@@ -165,8 +172,7 @@ class _Seen:
     late: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        # The whitener (n, 2, 3) transforms a direction error into two components of unit variance. It is a
-        # pseudo-inverse: the third direction, along the line of sight, carries no error.
+        # The whitener is a pseudo-inverse, because a direction has no error along the line of sight.
         spread = self.slopes @ np.linalg.cholesky(self.covariance)
         across = np.swapaxes(spread, -1, -2)
         object.__setattr__(self, "whitener", np.asarray(np.linalg.inv(across @ spread) @ across))
@@ -176,21 +182,21 @@ class _Seen:
 
     @property
     def before(self) -> FloatArray:
-        """The prior information about bend and delay, which are the last parameters."""
+        """The reciprocal prior variances of the bend and of the delay, the last of the parameters."""
         return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
 
     @property
     def camera(self) -> IntArray:
-        """The indices of bend and delay among the parameters, after the rotation and ln scale."""
+        """The indices of the bend and of the delay among the parameters."""
         return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _FittedPose) -> float:
-        """Return the effective number of parameters that the stars determine, without prior information."""
+        """Return the effective number of parameters that the stars determine, not the prior."""
         before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _FittedPose, weight: FloatArray) -> _FittedPose:
-        """Return the pose that minimises the squares, weighted with `weight` (n,)."""
+        """Return the pose that minimises the sum of the stars' chi-squares, weighted with `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
         matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
         held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
@@ -205,7 +211,7 @@ class _Seen:
             try:
                 inverse = np.linalg.inv(normal)
             except np.linalg.LinAlgError as error:
-                raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
+                raise AttitudeError(f"{len(weight)} stars are too close together for an attitude") from error
             step = -inverse @ gradient
             if not np.all(np.abs(step[: 3 + int(self.unknowns.scale)]) < 1.0):
                 raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
@@ -217,12 +223,15 @@ class _Seen:
         return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
 
     def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _FittedPose:
-        """Return a pose with the bend and delay in `held` (0, 1, 6 or 7,)."""
+        """Return a pose; `held` contains the fitted bend and delay, 0, 1, 6 or 7 values."""
         bends = len(self.unknowns.bend)
         return _FittedPose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return d(whitened residuals)/d(turn, ln scale, bend, delay), (2n, 3 to 11)."""
+        """Return the derivatives of the whitened residuals with respect to the parameters, (2n, 3 to 11).
+
+        The parameters are the rotation, ln scale, the bend and the delay, as far as they are fitted.
+        """
         slopes = [-whitener @ cross_matrices(predicted)]
         if self.unknowns.scale:
             slopes.append(whitener @ scale_slope(seen)[:, :, None])
@@ -233,29 +242,30 @@ class _Seen:
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
     def directions(self, pose: _FittedPose) -> FloatArray:
-        """Return the observed unit vectors (n, 3) at mid-exposure, corrected for the lens of a pose."""
+        """Return the observed unit vectors (n, 3) at mid-exposure, corrected for a pose's lens errors."""
         seen = bent(stretched(self.observed, pose.scale), pose.bend)
         return seen - pose.delay * self.late if len(self.late) else seen
 
     def squares(self, pose: _FittedPose) -> FloatArray:
-        """Return each star's squared error over its covariance (n,)."""
+        """Return the chi-square of each star (n,) for a pose, with two degrees of freedom."""
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
 
     def missed(self, pose: _FittedPose) -> FloatArray:
-        """Return the difference (n, 3) between observed and predicted direction of each star."""
+        """Return the difference between observed and predicted unit vector of each star (n, 3)."""
         return self.directions(pose) - self.reference @ pose.matrix.T
 
 
 def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tuple[_FittedPose, BoolArray]:
-    """Return the fit to the stars that agree, and a mask (n,) of these stars.
+    """Return the fit to the stars that agree with each other, and which stars these are (n,).
 
-    An outlier shifts all residuals, so that their spread is meaningful only after the influence of outliers
-    is bounded.
+    An outlier affects the residuals of all stars. Therefore the influence of outliers is bounded before the
+    scatter of the residuals is computed.
     """
     for _ in range(_HUBER_ROUNDS):
         pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
         squares = seen.squares(pose)
-    # A star agrees if it scatters as the majority does. If too few would remain, all stars are used.
+    # A star agrees if its residual is within the scatter of the majority.
+    # If too few stars agree, all stars are used.
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     if np.count_nonzero(agree) < max(_LEAST_AGREEING, len(squares) // 2):
         agree = np.ones(len(squares), dtype=np.bool_)
@@ -263,7 +273,10 @@ def _without_outliers(seen: _Seen, pose: _FittedPose, squares: FloatArray) -> tu
 
 
 def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen, _FittedPose]:
-    """Return stars and fit with a common variance added to the variances of the stars that `agree` (n,)."""
+    """Return stars and fit after a common variance, px^2, is added to the variances of the positions.
+
+    The variance is estimated from the stars that `agree` (n,).
+    """
     weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
     for _ in range(_SCATTER_ROUNDS):
         root = np.linalg.cholesky(seen.covariance[agree])
@@ -271,7 +284,7 @@ def _scattered(seen: _Seen, pose: _FittedPose, agree: BoolArray) -> tuple[_Seen,
         excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
         if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
             break
-        # The derivative of the squares by the variance, at a fixed pose, because the pose minimises them.
+        # The Newton step uses the derivative of chi-square by the variance at a fixed pose.
         variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
         seen = replace(seen, covariance=own + variance * np.eye(2))
         pose = seen.fitted(pose, weight)
@@ -287,19 +300,20 @@ def attitude_by(
     fit: ImageFit,
     late: FloatArray,
 ) -> AttitudeFix:
-    """Return the attitude by a solver of Wahba's problem, from the stars that agree in an image fit.
+    """Return the attitude from a solver of Wahba's problem for the stars that agree in an image fit.
 
-    The image fit excludes the stars that disagree and determines the lens. The solver takes the directions of
-    the other stars, each with one error, the mean over both axes (Michalski 3.4).
+    The image fit excludes outliers and determines the lens errors. The solver uses the directions of the
+    other stars, each with one standard deviation for both axes (Michalski, section 3.4).
 
     Args:
-        solver: the solver.
-        points: measured positions (n, 2), px.
-        covariance: covariance of each position (n, 2, 2), px^2.
-        reference: directions of the stars (n, 3), unit vectors.
-        camera: the camera with which the fit was started.
-        fit: the image fit.
-        late: displacement of each star per standard deviation of the line time (n, 2), px, or (0, 2).
+        solver: solver of Wahba's problem.
+        points: measured positions of the stars (n, 2), px.
+        covariance: covariances of the positions (n, 2, 2), px^2.
+        reference: unit vectors to the stars from the catalogue (n, 3).
+        camera: camera model with which the image fit was started.
+        fit: result of the image fit.
+        late: displacement of each star per standard deviation of the line time (n, 2), px; (0, 2) if the line
+            time is exact.
 
     Raises AttitudeError if the stars do not determine the attitude.
     """
@@ -307,6 +321,6 @@ def attitude_by(
         points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
-    # Off the boresight a pixel subtends a smaller angle: by cos^2 along the radius and by cos across it.
+    # At an angle a from the boresight, a pixel is smaller by cos^2 a along the radius and by cos a across it.
     sigma = pixels * fit.scale / camera.focal_length * seen[:, 2] ** 1.5
     return solver(seen, reference[fit.agree], sigma)

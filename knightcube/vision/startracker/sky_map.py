@@ -1,12 +1,15 @@
 """Conversion between pixels and directions in the sky, for a camera of known attitude.
 
-- Stellar aberration: a moving camera sees stars displaced towards its direction of motion, by up to 20.8"
-  (the exact formula of special relativity; Green, Spherical Astronomy, 1985, 8.3; Explanatory Supplement,
-  7.2.3).
-- Lens errors other than a wrong focal length: an optical axis outside the image centre, and distortion.
-Tangents u are off by (u. a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with tilt a, decentring b
-  and distortion k, l (Brown 1966). The vector (a, b, k, l), (6,), is called the bend of the lens.
-- Pointing: right ascension, declination and roll of an attitude.
+The conversion includes stellar aberration, which displaces stars towards the camera's direction of motion by
+up to 20.8". It is computed by the exact formula of special relativity (Green, Spherical Astronomy, 1985,
+section 8.3; Explanatory Supplement, section 7.2.3).
+
+The conversion also includes lens errors: tilt and decentring, which displace the optical axis from the image
+centre, and distortion. These errors displace a tangent u by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with
+tilt a, decentring b and distortion k, l (Brown 1966). The vector (a, b, k, l) of the six lens errors is
+called the bend of the lens.
+
+`Pointing` gives the right ascension, declination and roll of an attitude.
 """
 
 from __future__ import annotations
@@ -26,9 +29,9 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
     """Return the apparent directions (n, 3) of stars for a moving camera, as unit vectors.
 
     Args:
-        direction: unit vectors (n, 3) of the stars.
-        velocity: velocity of the camera (3,) relative to the barycentre of the solar system, m/s, in the axes
-            of the directions.
+        direction: unit vectors to the stars (n, 3).
+        velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, in the same axes
+            as the directions.
 
     Raises ValueError unless the velocity is finite and below the speed of light.
     """
@@ -43,17 +46,16 @@ def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:
 
 
 BENDS = 6
-# Standard deviations of a typical lens: of the tilt along x and y, relative to the corner's tangent (20 px of
-# 1024), and of the two terms of the distortion in the corner (3 % and 1 %).
-# The decentring is the product of tilt and distortion.
+# Standard deviation of a typical lens's tilt, relative to the corner's tangent (20 px of 1024 px).
+# Standard deviations of a typical lens's two distortion terms at the image corner (3 % and 1 %).
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
-# Minimum standard deviations of the image centre (px) and of the distortion (relative to the radius).
+# Minimum standard deviations of the optical axis (px) and of the distortion (relative to the radius).
 _LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
 
 
 def usual_bend(camera: CameraModel) -> FloatArray:
-    """Return the information (6,), the reciprocal prior variances, about the bend of a typical lens."""
+    """Return the reciprocal prior variances (6,) of the lens errors (bend) of a typical uncalibrated lens."""
     corner = float(np.tan(camera.half_diagonal))
     first, second = _DISTORTION
     off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
@@ -61,9 +63,10 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 
 
 def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
-    """Return the information (6,) about the bend of a lens of known accuracy; (0,) for an exact lens.
+    """Return the reciprocal prior variances (6,) of the lens errors (bend) of a lens of known accuracy.
 
-    An error of the optical axis rotates all stars alike, which counts as mounting error, and tilts the lens.
+    For an exact lens the result is empty (0,). An error of the optical axis tilts the lens. The common
+    rotation of all stars by this error counts as an error of the camera's mounting, not of the lens.
     """
     if lens.centre == lens.distortion == 0.0:
         return np.zeros(0)
@@ -75,7 +78,7 @@ def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
 
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return unit vectors `direction` (n, 3) corrected for the `bend` (6,) of the lens."""
+    """Return unit vectors (n, 3) corrected for the lens errors `bend` (6,)."""
     if not bend.any():
         return direction
     out = direction + bend_slope(direction) @ bend
@@ -83,10 +86,10 @@ def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
 
 
 def bend_slope(seen: FloatArray) -> FloatArray:
-    """Return the derivatives (n, 3, 6) of directions `seen` (n, 3) by tilt, decentring and distortion."""
+    """Return the derivatives (n, 3, 6) of unit vectors `seen` (n, 3) by tilt, decentring and distortion."""
     tangent = seen[:, :2] / seen[:, 2:]
     square = np.sum(tangent**2, axis=1, keepdims=True)
-    # Tilt and distortion stretch a tangent u along itself, by u_x, u_y, |u|^2 and |u|^4.
+    # Tilt and distortion scale a tangent u by relative amounts proportional to u_x, u_y, |u|^2 and |u|^4.
     along = np.concatenate([tangent, square, square**2], axis=1)
     stretch = scale_slope(seen)[:, :, None] * along[:, None, :]
     across = np.eye(3)[:, :2] - seen[:, :, None] * seen[:, None, :2]
@@ -96,12 +99,13 @@ def bend_slope(seen: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """A camera's attitude, rad.
+    """The attitude of a camera as right ascension, declination and roll.
 
     Attributes:
-        right_ascension, declination: of the boresight, ICRS; right ascension in [0, 2 pi).
-        roll: position angle of the image's upward direction (-y), from north towards east, [0, 2 pi).
-            At a celestial pole, north is the direction of the meridian of right ascension zero.
+        right_ascension: right ascension of the boresight, ICRS, rad, in [0, 2 pi).
+        declination: declination of the boresight, ICRS, rad.
+        roll: position angle of the image's upward direction (-y) from north towards east, rad, in [0, 2 pi).
+            At a celestial pole, north is defined by the meridian of right ascension zero.
     """
 
     right_ascension: float
@@ -110,7 +114,7 @@ class Pointing:
 
     @classmethod
     def of(cls, quaternion: FloatArray) -> Pointing:
-        """Return the pointing of an attitude (4,), ICRS to camera."""
+        """Return the pointing of an attitude quaternion (4,) from ICRS to camera axes."""
         _, y, z = attitude_matrix(quaternion)
         declination = np.arctan2(z[2], np.hypot(z[0], z[1]))
         right_ascension = np.arctan2(z[1], z[0])
@@ -120,7 +124,7 @@ class Pointing:
         return cls(float(right_ascension % full), float(declination), float(roll % full))
 
     def quaternion(self) -> FloatArray:
-        """Return the attitude (4,), ICRS to camera."""
+        """Return the attitude quaternion (4,) from ICRS to camera axes."""
         cosine = np.cos(self.declination)
         z = np.array(
             [
@@ -135,13 +139,13 @@ class Pointing:
 
 
 def _north_and_east(right_ascension: float, declination: float) -> tuple[FloatArray, FloatArray]:
-    """Return the unit vectors (3,), (3,) towards north and east at a place of the sky."""
+    """Return the unit vectors (3,), (3,) towards north and east at a position in the sky."""
     sine, cosine = np.sin(right_ascension), np.cos(right_ascension)
     north = np.array([-np.sin(declination) * cosine, -np.sin(declination) * sine, np.cos(declination)])
     return north, np.array([-sine, cosine, 0.0])
 
 
-# Each step reduces the error to a few percent, the slope of the bend.
+# Number of iterations that invert the lens errors; each iteration reduces the error to a few per cent.
 _BEND_STEPS = 8
 
 
@@ -150,11 +154,12 @@ class SkyMap:
     """The conversion between pixels and directions for a camera of known attitude.
 
     Attributes:
-        camera: the camera and its lens.
-        quaternion: attitude (4,), ICRS to camera.
-        bend: remaining lens errors (6,); zeros for an exact lens.
-        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration; None: no
-            correction.
+        camera: camera model.
+        quaternion: attitude quaternion (4,) from ICRS to camera axes.
+        bend: tilt, decentring and distortion that the camera model does not include (6,); zeros if the lens
+            is exact.
+        velocity: velocity of the camera (3,), m/s, by which directions are corrected for aberration; None for
+            no correction.
     """
 
     camera: CameraModel
@@ -163,9 +168,9 @@ class SkyMap:
     velocity: FloatArray | None = None
 
     def directions(self, points: FloatArray) -> FloatArray:
-        """Return the directions (n, 3), ICRS unit vectors, of pixels (n, 2)."""
+        """Return the directions (unit vectors (n, 3), ICRS) of pixels (n, 2)."""
         seen = bent(self.camera.unit_vectors(points), self.bend) @ attitude_matrix(self.quaternion)
-        # The inverse is the aberration for the opposite velocity: accurate to (v/c)^2, 0.002".
+        # The aberration of the opposite velocity is the inverse, accurate to (v/c)^2 or 0.002".
         return seen if self.velocity is None else apparent(seen, -self.velocity)
 
     def pixels(self, directions: FloatArray) -> FloatArray:
@@ -181,11 +186,11 @@ class SkyMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShortTrails:
-    """The motion of stars over an exposure during which the camera rotates by a few pixels.
+    """The motion of stars by a few pixels during an exposure.
 
     Attributes:
-        turn: rotation of the camera over the exposure (3,), rad, camera axes.
-        delay: delay between consecutive rows of a rolling shutter, in exposure times.
+        turn: rotation vector of the camera during the exposure (3,), rad, camera axes.
+        delay: delay between consecutive rows of a rolling shutter, as a fraction of the exposure time.
         delay_sigma: standard deviation of `delay`.
     """
 
@@ -194,10 +199,10 @@ class ShortTrails:
     delay_sigma: float = 0.0
 
     def of(self, camera: CameraModel, direction: FloatArray) -> FloatArray:
-        """Return the displacements (n, 2), px, over the exposure of stars at `direction` (n, 3)."""
+        """Return the displacements (n, 2), px, of stars at `direction` (n, 3) during the exposure."""
         moved = 0.5 * np.cross(direction, self.turn)
         return np.nan_to_num(camera.project(direction + moved) - camera.project(direction - moved))
 
     def late(self, camera: CameraModel, points: FloatArray) -> FloatArray:
-        """Return the displacements (n, 2), px, of stars at `points` (n, 2) per exposure time of delay."""
+        """Return the displacements (n, 2), px, of stars at `points` (n, 2), px, per unit of `delay`."""
         return self.of(camera, camera.unit_vectors(points)) * (points[:, 1:] - camera.centre[1])

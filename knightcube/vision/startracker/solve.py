@@ -1,14 +1,14 @@
-"""The steps from the stars of a frame to its attitude; `knightcube.vision.frame_job` chooses among them.
+"""Attitude of a frame from its stars, in steps that `knightcube.vision.frame_job` selects.
 
-Points are measured by `detection`; for streaks, the positions of their stars at mid-exposure serve as points.
-Identification searches near a prior attitude first, if there is one, then in the whole sky. The result is the
-attitude at mid-exposure.
+If stars are points, `detection` measures their positions. If stars are streaks, their positions at
+mid-exposure are used instead. Identification first searches near a prior attitude, if there is one, and then
+in the whole sky. The result is the attitude at mid-exposure.
 
-At a constant rate the middle of a streak is the position of the star at mid-exposure. An acceleration a
-shifts the mean of a point's light by a T^2 / 24 and the middle of the two ends of a streak by a T^2 / 8. A
-fit that includes the acceleration is shifted only by terms beyond the square of time. White angular
-acceleration of density q adds the variance q T^3 over 320, 48 and 4743 respectively (the integrals of its
-second integral over the same weights).
+During an exposure of length T at a constant rate, the middle of a streak is the position of the star at
+mid-exposure. An angular acceleration a displaces the centroid of a point by a T^2 / 24, and the midpoint
+between the two ends of a streak by a T^2 / 8. A fit that includes the acceleration is displaced only by terms
+of higher order in time. White angular acceleration of density q adds a variance of q T^3 / 320 for points, of
+q T^3 / 48 for the midpoint of the ends, and of q T^3 / 4743 for a fit that includes the acceleration.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from knightcube.vision.streaks.streak_result import FrameMotion, MotionResult, S
 
 
 class SolveStatus(Enum):
-    """The outcome of one frame."""
+    """The outcome of the attitude determination of one frame."""
 
     SOLVED = "solved"
     NO_STARS = "no-stars"
@@ -56,24 +56,25 @@ class FrameSolution:
     """The attitude of one frame at mid-exposure, and the rate if the stars are streaks.
 
     Attributes:
-        status: the attributes from `star` on are valid for SOLVED only.
-        reason: why the frame was not solved, in one sentence; empty if it was.
+        status: outcome of the frame; the attributes from `star` on are valid for SOLVED only.
+        reason: why the frame was not solved, in one sentence; empty if it was solved.
         kind: whether the frame shows points or streaks.
-        camera: the camera, with the focal length fitted to the stars if it was free.
+        camera: camera model; its focal length is the fitted one if the focal length was free.
         points: positions of the detected stars at mid-exposure (n, 2), px, the brightest first.
-        covariance: covariance of the positions (n, 2, 2), px^2.
+        covariance: covariances of the positions (n, 2, 2), px^2.
         late: displacement of the points (n, 2), px, due to an error of one standard deviation of the
             shutter's line time; (0, 2) if the line time is exact.
-        star: indices of the guide stars (n,); -1 for a point without a guide star.
+        star: index of the guide star of each point (n,); -1 for a point without a guide star.
         expected: predicted positions of the guide stars (n, 2), px; NaN for a point without a guide star.
-        fix: attitude, ICRS to camera, and its covariance; the scalar part of the quaternion is not negative.
-        scale_sigma: relative standard deviation of the focal length; 0 if it was given.
-        bend: fitted errors of an inexact lens (6,), see `sky_map`; zeros for an exact lens.
+        fix: attitude from ICRS to camera axes and its covariance; the quaternion's scalar is not negative.
+        scale_sigma: relative standard deviation of the focal length; 0 if the focal length was given.
+        bend: fitted tilt, decentring and distortion of the lens (6,), see `sky_map`; zeros if the lens is
+            exact.
         log10_false_alarm: log10 of the probability that a frame of random points would have been solved.
         tracked: whether the stars were identified near the prior attitude.
-        motion: motion from the streaks, camera frame; None for points.
-        mirrored: whether the image shows the mirrored sky. `fix` is then the attitude of the image with left
-            and right exchanged about the optical axis; `points` and `expected` refer to the original image.
+        motion: motion of the camera from the streaks, camera frame; None for points.
+        mirrored: whether the image shows the mirrored sky. In this case `fix` is the attitude of the image
+            with left and right exchanged about the optical axis, but points are those of the original image.
     """
 
     status: SolveStatus
@@ -95,11 +96,11 @@ class FrameSolution:
 
     @property
     def matched(self) -> IntArray:
-        """The numbers (m,) of the points that are guide stars."""
+        """The indices (m,) of the points that are identified as guide stars."""
         return np.flatnonzero(self.star >= 0)
 
     def wider(self, by: FloatArray) -> FrameSolution:
-        """Return the solution with `by` (3, 3), rad^2, added to the covariance of its attitude, if any."""
+        """Return the solution with `by` (3, 3), rad^2, added to the attitude covariance, if solved."""
         if self.fix is None:
             return self
         return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
@@ -107,23 +108,25 @@ class FrameSolution:
     def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
         """Return the conversion between pixels and directions; None if the frame was not solved.
 
-        `velocity` (3,), m/s, is the velocity with which the frame was solved.
+        `velocity` (3,), m/s, is the camera's velocity with which the frame was solved.
         """
         return None if self.fix is None else SkyMap(self.camera, self.fix.quaternion, self.bend, velocity)
 
 
 NODES = (0.0, 0.25, 0.75, 1.0)
-"""Fractions of the exposure at which the rotation since mid-exposure is evaluated."""
+"""Times at which the rotation since mid-exposure is evaluated, as fractions of the exposure."""
 MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 
 @dataclass(frozen=True, slots=True)
 class Weighting:
-    """The weights with which the attitude of a frame averages the attitudes during its exposure.
+    """Weights with which the measured attitude of a frame averages the attitudes during the exposure.
 
     Attributes:
-        weights: weights of the rotations at `NODES`; the remainder to one is the weight of mid-exposure.
-        noise_share: variance due to white angular acceleration, in units of q T^3.
+        weights: weights of the rotations at the times `NODES`; the weight of mid-exposure is one minus their
+            sum.
+        noise_share: variance due to white angular acceleration, in units of its density times the cube of the
+            exposure time.
     """
 
     weights: tuple[float, float, float, float]
@@ -131,15 +134,15 @@ class Weighting:
 
 
 MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
-"""Weighting of points, which show the mean attitude over the exposure, by Simpson's rule."""
+"""Weighting of points, which show the mean attitude over the exposure, from Simpson's rule."""
 ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
-"""Weighting of streaks that are fitted with a constant rate or measured only at their ends."""
+"""Weighting of streaks that are fitted with a constant rate or only measured at their ends."""
 MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
-"""Weighting of streaks that are fitted with an acceleration, by the middle of the best-fitting parabola."""
+"""Weighting of streaks that are fitted with an acceleration, from the vertex of the best-fitting parabola."""
 
 
 def weighting_of(motion: FrameMotion) -> Weighting:
-    """Return the weighting of a frame with this motion."""
+    """Return the weighting for the motion of a frame."""
     if motion.status not in MOVED:
         return MEAN
     fitted = isinstance(motion, MotionResult) and motion.rate_model == "accelerating"
@@ -149,11 +152,11 @@ def weighting_of(motion: FrameMotion) -> Weighting:
 def middle_covariance(
     weighting: Weighting, turns: FloatArray, angular_acceleration_psd: FloatArray, exposure: float
 ) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, of the measured attitude relative to that at mid-exposure.
+    """Return the covariance (3, 3), rad^2, of the measured attitude relative to the attitude at mid-exposure.
 
     Args:
-        weighting: weighting of the frame.
-        turns: estimated rotations from mid-exposure to each of `NODES` (4, 3), rad.
+        weighting: weighting of the attitudes during the exposure.
+        turns: estimated rotation vectors from mid-exposure to the times `NODES` (4, 3), rad.
         angular_acceleration_psd: density of unmodelled white angular acceleration (3, 3), rad^2/s^3.
         exposure: exposure time, s.
     """
@@ -162,11 +165,11 @@ def middle_covariance(
 
 
 def timing_covariance(motion: MotionResult) -> FloatArray:
-    """Return the covariance (3, 3), rad^2, of the rotation error that all stars of a frame share.
+    """Return the covariance (3, 3), rad^2, of the rotation error that all streaks of a frame share.
 
-    If the rate changes, only the light along a streak determines its position at mid-exposure. An error of
-    the acceleration shifts all stars along their paths by the same time, which does not average out over the
-    stars. The uncertainty of the most accurate star along its path bounds this error.
+    If the rate changes, only the brightness along a streak determines the star's position at mid-exposure. An
+    error of the acceleration displaces all stars along their paths by the same time, an error that does not
+    average out over the stars. The uncertainty of the most accurate star along its path bounds this error.
     """
     if motion.acceleration is None or motion.rate is None:
         return np.zeros((3, 3))
@@ -179,30 +182,29 @@ def timing_covariance(motion: MotionResult) -> FloatArray:
     return np.outer(motion.rate, motion.rate) * float(np.min(along / speed[moving] ** 4))
 
 
-# Position error (px) due to residual distortion of the lens or to the colour of the star.
+# Minimum position error (px) of a star, due to residual distortion of the lens and the colour of the star.
 _LEAST_SIGMA_PX = 0.005
-# Position error (px) due to the colour of the star, for a lens of stated accuracy.
+# Minimum position error (px) of a star due to its colour, for a lens whose accuracy is stated.
 _COLOUR_PX = 0.002
-# Common centroid error, as a fraction of the excess PSF width (campaign `resting`).
+# Common centroid error as a fraction of the excess of the PSF width (from the campaign `resting`).
 _SHAPE_DOUBT = 0.05
-# Position error (px) of an uncalibrated lens in the second attempt of an identification.
-# The first attempt uses only the errors of the positions, within which fewer stars agree by chance.
+# Position error (px) assumed for an uncalibrated lens in the second attempt to identify the stars.
+# The first attempt assumes smaller errors, so that fewer stars agree by chance.
 _UNCALIBRATED_SIGMA_PX = 0.3
-# Attitude error of an uncalibrated lens and of refraction that the fit of the lens does not remove.
-# It is in px across the boresight, and in px at the image edge for the rotation about it.
-# Attitudes of photographs by other solvers differ by this value.
+# Attitude error (px) from an uncalibrated lens and from refraction that the fit of the lens does not remove.
+# The rotation error about the boresight is measured in px at the image edge.
+# Attitudes of the same photograph from different solvers differ by this value.
 _UNCALIBRATED_LENS_PX = 0.25
-# Minimum significance of a streaked star (standard deviations of its light) for identification.
+# Minimum flux of a streak used for identification, in standard deviations of the flux.
 _LEAST_SIGNIFICANCE = 5.0
-# Standard deviation (px) above which a position is unusable, for example if the streak ends outside the
-# frame.
+# Standard deviation (px) above which a position is not used, for instance of a streak that the border cuts.
 _PLACELESS_PX = 5.0
-# Largest chi-square of the difference from the prior attitude, exceeded by chance once in 100,000 cases.
+# Largest chi-square of the difference from the prior attitude (false rejection of one in 100,000 frames).
 _NEAR = 25.9
-# Number of guide stars that tracking searches in the frame, within PRIOR_SIGMAS of the prior.
+# Number of guide stars that tracking searches near their predicted positions.
 _LOOKED_FOR = 30
-# Minimum and maximum search radius (px).
-# Above the maximum, a search of the whole frame is faster.
+# Minimum and maximum search radius (px) around a predicted position.
+# If a larger radius is needed, a search of the whole frame is faster.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 
 
@@ -212,14 +214,15 @@ class SolveSettings:
 
     Attributes:
         detection: settings of the detection of points.
-        likelihood: settings of the estimator of streaks in a picture; in flight the job has its own.
+        likelihood: settings of the streak estimator for images from files; flight uses other settings.
         identification: settings of the default identification method.
-        method: another identification method; None: the default.
-        attitude: a solver of Wahba's problem for the attitude; None: the fit in the image.
-        velocity: velocity of the camera relative to the barycentre (3,), m/s, for aberration; None: no
-            correction.
-        lens: accuracy of a lens of known focal length; None: exact.
-        uncalibrated_lens: whether a lens of uncertain focal length may have a displaced axis and distortion.
+        method: function that replaces the default identification method; None for the default.
+        attitude: solver of Wahba's problem for the attitude; None for the fit of the image positions.
+        velocity: velocity of the camera relative to the solar system barycentre (3,), m/s, for the correction
+            of aberration; None for no correction.
+        lens: accuracy of a lens of known focal length; None if the lens is exact.
+        uncalibrated_lens: whether a lens of uncertain focal length may also have a displaced optical axis and
+            distortion.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -234,7 +237,12 @@ class SolveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudePrior:
-    """A predicted attitude (4,), ICRS to camera, and its standard deviation about each axis, rad."""
+    """A predicted attitude of the camera.
+
+    Attributes:
+        quaternion: attitude quaternion (4,) from ICRS to camera axes.
+        sigma: standard deviation of the attitude about each axis, rad.
+    """
 
     quaternion: FloatArray
     sigma: float
@@ -242,9 +250,12 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """A predicted rate (3,), rad/s, camera axes, and the standard deviation of each component.
+    """A predicted angular velocity of the camera.
 
-    `course` is the rotation of the camera over the exposure, if it is known.
+    Attributes:
+        rate: angular velocity (3,), rad/s, camera axes.
+        sigma: standard deviation of each component of the angular velocity, rad/s.
+        course: rotation of the camera as a function of time during the exposure; None if unknown.
     """
 
     rate: FloatArray
@@ -260,7 +271,7 @@ def solve_points(
     settings: SolveSettings,
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude of a frame of detected points."""
+    """Return the attitude of a frame in which stars are detected as points."""
     solution = solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
@@ -278,7 +289,7 @@ def solve_places(
     prior: AttitudePrior | None = None,
     flux: FloatArray | None = None,
 ) -> FrameSolution:
-    """Return the attitude from positions (n, 2), px, of stars, the brightest first, and their covariances."""
+    """Return the attitude from star positions (n, 2), px, the brightest first, and their covariances."""
     seen = FrameSolution(
         SolveStatus.NO_STARS, "no star stands above the noise", kind, camera, points, covariance
     )
@@ -293,7 +304,7 @@ def solve_motion(
     settings: SolveSettings,
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude at mid-exposure of a frame of streaks, from the motion and its star positions."""
+    """Return the attitude at mid-exposure of a frame of streaks, from the star positions in `motion`."""
     seen = FrameSolution(
         SolveStatus.NO_STARS,
         f"the streaks give no motion: {motion.status.value}",
@@ -327,10 +338,10 @@ def points_near(
     prior: AttitudePrior,
     trails: ShortTrails | None = None,
 ) -> Detections:
-    """Return the stars near the predicted positions of the brightest guide stars.
+    """Return the stars detected near the predicted positions of the brightest guide stars.
 
-    If the prior is too uncertain, no stars are returned. `trails` is the motion of the stars over the
-    exposure, if it is known and at most a few pixels.
+    If the prior is too uncertain, no stars are returned. `trails` describes the motion of the stars during
+    the exposure, if the motion is known and at most a few pixels.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
@@ -352,9 +363,9 @@ def solve_near(
     prior: AttitudePrior,
     trails: ShortTrails | None = None,
 ) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted positions; None if they do not agree.
+    """Return the attitude from stars near their predicted positions; None if the stars do not agree with it.
 
-    `trails` is as in `points_near`.
+    `trails` describes the motion of the stars during the exposure, as for `points_near`.
     """
     found = points_near(pixels, camera, sky, settings, prior, trails)
     if not len(found):
@@ -374,7 +385,7 @@ def solve_near(
 
 
 def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
-    """Return whether an attitude agrees with the prior, near which alone its significance is valid."""
+    """Return whether an attitude agrees with the prior; otherwise its significance is not valid."""
     if solution.fix is None:
         return True
     off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
@@ -385,8 +396,8 @@ def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
     """Return the solution with its covariance increased if the stars are wider than the given PSF.
 
-    If the images of stars have a tail, due to the lens or to stray light, the centroid depends on the weights
-    of the pixels, which causes the same error of all positions.
+    If star images have a tail, due to the lens or to stray light, the centroids depend on the pixel weights,
+    and all positions have the same error.
     """
     width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
     if solution.fix is None or given is None or not len(width):
@@ -403,7 +414,7 @@ def _identify(
     settings: SolveSettings,
     prior: AttitudePrior | None,
 ) -> FrameSolution:
-    """Return `seen` with its stars identified, first near the prior, then in the whole sky."""
+    """Return the solution after identification of the stars, first near the prior, then in the whole sky."""
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
@@ -415,19 +426,19 @@ def _identify(
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
     options = settings.identification
     if seen.kind is FrameKind.STREAKS:
-        # Streaks are not matched with the mirrored sky, because the rate would be wrong.
+        # Streaks are not matched with the mirrored sky, because the rate from a mirrored image is wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
     if found.status is MatchStatus.NO_MATCH and settings.uncalibrated_lens and scale[0] != scale[1]:
         found = identify(star_field(seen, flux, scale, _UNCALIBRATED_SIGMA_PX), sky, options)
     if found.mirrored:
-        # The mirrored positions are fitted, and the original ones reported.
+        # The mirrored positions are fitted, and the original positions are reported.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
     return _with_attitude(seen, found, sky, settings)
 
 
 def _mirrored(seen: FrameSolution) -> FrameSolution:
-    """Return `seen` with left and right of its positions exchanged about the optical axis."""
+    """Return the solution `seen` with its positions mirrored left to right about the optical axis."""
     axis = np.array([2.0 * seen.camera.centre[0], 0.0])
     turned = np.array([-1.0, 1.0])
     return replace(
@@ -442,11 +453,11 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
 def star_field(
     seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
 ) -> StarField:
-    """Return the points of `seen` as directions for identification, with errors of at least `least` px."""
+    """Return the points of a frame as directions, with standard deviations of at least `least` px."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
     pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
-    # Off the boresight a pixel subtends a smaller angle: by cos^2 along the radius and by cos across it.
+    # At an angle a from the boresight, a pixel is smaller by cos^2 a along the radius and by cos a across it.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     magnitude = None if flux is None else -2.5 * np.log10(flux)
@@ -456,7 +467,7 @@ def star_field(
 def _with_attitude(
     seen: FrameSolution, found: StarMatch, sky: SkyIndex, settings: SolveSettings
 ) -> FrameSolution:
-    """Return `seen` with the identified stars and the attitude fitted to their positions in the image."""
+    """Return the solution with the identified stars and the attitude fitted to their image positions."""
     if found.status is not MatchStatus.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
@@ -466,7 +477,7 @@ def _with_attitude(
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    # The prior information about the bend of the lens is empty if no bend is fitted.
+    # `known` is the prior information about the lens errors; it is empty if no lens errors are fitted.
     known = np.zeros(0)
     if free_lens:
         known = usual_bend(camera)
@@ -487,7 +498,7 @@ def _with_attitude(
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
     if free_lens:
-        # The covariance that an uncalibrated lens adds.
+        # An uncalibrated lens adds this covariance to the attitude.
         across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
         floor = np.diag((_UNCALIBRATED_LENS_PX * np.array([across, across, about])) ** 2)
         fix = replace(fix, covariance=fix.covariance + floor)
@@ -510,11 +521,11 @@ def _with_attitude(
 
 
 def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
-    """Return the camera with the fitted focal length, and a pinhole with the fitted distortion."""
+    """Return the camera with the fitted focal length and, if it is a pinhole, with the fitted distortion."""
     camera = camera.rescaled(1.0 / found.scale)
     if found.distortion == 0.0 or not isinstance(camera, Pinhole):
         return camera
-    # `distortion` is relative to the square of the corner's tangent, k1 to the square of the tangent.
+    # The coefficient `distortion` is for tangents relative to the corner's tangent, unlike k1.
     corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
     try:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)
@@ -525,6 +536,6 @@ def _camera_found(camera: CameraModel, found: StarMatch) -> CameraModel:
 def _reason(status: MatchStatus, seen: FrameSolution) -> str:
     count = len(seen.points)
     return {
-        MatchStatus.TOO_FEW_STARS: f"{count} stars are too few to identify",
+        MatchStatus.TOO_FEW_STARS: f"{count} stars are too few for an identification",
         MatchStatus.AMBIGUOUS: f"the {count} brightest points match the sky in more than one place",
     }.get(status, f"the {count} brightest points match no part of the sky beyond chance")

@@ -1,16 +1,17 @@
 """Verification of a candidate attitude against the whole field, and tracking with a prior attitude.
 
-The guide stars predicted in the field are compared with the observed stars; coincident stars refine attitude
-and scale, repeatedly, until the set of matched stars no longer changes. The significance is an upper bound of
-the expected number of searched attitudes at which random stars would match the guide stars equally well or
-better. If it is far below one, it also bounds the probability of a false match. The bound does not depend on
-how a candidate was found. It is raised for every choice that the matching makes among gates, brightness
-limits and tests (Bonferroni).
+The guide stars predicted in the field are compared with the observed stars. Attitude and scale are refined
+from the stars that match, and the comparison is repeated until the set of matched stars no longer changes.
+The significance of a match is an upper bound of the expected number of attitudes, among the searched
+attitudes, at which random stars would match at least as well. If the bound is far below one, it also bounds
+the probability of a false match. The bound does not depend on how a candidate was found. The bound is
+multiplied by the number of alternatives among gates, brightness limits and tests (Bonferroni).
 
-`track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error shifts all
-predicted stars by nearly the same vector. Of all pairs of an observed and a predicted star close enough to be
-the same, the largest set with one shift refines the attitude, and the whole field verifies it as in lost in
-space, with the uncertainty of the prior instead of the whole sky as the searched part.
+`track` identifies the stars of a frame with a prior attitude. A prior attitude with a small error displaces
+all predicted stars by nearly the same vector. Pairs of an observed and a predicted star are formed if their
+distance is within the uncertainty of the prior. The largest set of pairs with a common displacement refines
+the attitude. The attitude is then verified with the whole field as in lost in space, except that only
+attitudes near the prior count as searched.
 """
 
 from __future__ import annotations
@@ -49,11 +50,11 @@ class Chance:
     Attributes:
         observed: number of observed stars.
         spread: variance of a star's direction along one axis, divided by the area of the field.
-        fields: number of such fields in the searched part of the sky.
-        scales: ln of the highest over the lowest scale.
-        choices: number of gates from which the matching chooses.
+        fields: area of the searched part of the sky, divided by the area of the field.
+        scales: natural logarithm of the ratio of the highest to the lowest scale.
+        choices: number of gates among which the matching selects.
         least: minimum number of matched stars.
-        enough: log10 of the bound below which the exact value is not needed.
+        enough: log10 of the significance below which the exact value is not needed.
     """
 
     observed: int
@@ -65,11 +66,15 @@ class Chance:
     enough: float
 
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
-        """Return log10 of the bound for `observed` stars that match the expected stars `ranks` within `gate`.
+        """Return log10 of the bound of the number of chance matches that are as good as a given match.
 
-        Observed and expected stars are numbered in order of brightness. Because the matching also chooses the
-        faintest star that counts, the bound is multiplied by j^2 pi^2/6, where j - 1 is the number of missing
-        brighter expected stars.
+        The matching also selects the faintest star that counts. For this reason, the bound is multiplied by
+        j^2 pi^2/6, where j - 1 is the number of brighter expected stars without a match.
+
+        Args:
+            gate: half-width within which a star matches, in standard deviations.
+            observed: indices of the matched observed stars in order of brightness.
+            ranks: indices of the expected stars that they match, in order of brightness.
         """
         pairs = sorted(zip(ranks, observed, strict=True))
         best = math.inf
@@ -85,13 +90,14 @@ class Chance:
         return best
 
     def _of_places(self, gate: float, matched: int, expected: int) -> float:
-        """Return log10 of the expected number of chance matches of `matched` or more of `expected` stars.
+        """Return log10 of the expected number of chance matches of at least `matched` of `expected` stars.
 
-        The first star may be any star of the sky. The second star lies in a ring around it that the distance
-        of the two defines, with a width given by the range of the scale and the gate. Each other star must
-        lie within the gate of an expected star. The number of choices of the matched stars among the observed
-        stars multiplies the probability. Because the fit moves towards its own stars, the distance of each
-        star is increased by the factor 1/(1 - leverage).
+        The first matched star may be any star of the sky. The second matched star lies in a ring around the
+        first star. The ring's radius is the distance of the two stars, and its width follows from the range
+        of the scale and from the gate. Each other matched star lies within the gate of an expected star. The
+        probability is multiplied by the number of selections of the matched stars from the observed stars.
+        Because the fit moves towards its own stars, the distance of each star is increased by the factor 1/(1
+        - leverage).
         """
         leverage = 2.0 / matched if matched > 2 else 0.5
         chance = min(expected * math.pi * gate * gate * self.spread / (1.0 - leverage) ** 2, 0.5)
@@ -102,13 +108,13 @@ class Chance:
         lost = self.observed - matched
         ways = math.lgamma(self.observed + 1) - math.lgamma(matched + 1) - math.lgamma(lost + 1)
         rest = (matched - 2) * math.log(chance) + lost * math.log1p(-chance)
-        # The terms for more matched stars fall faster than a geometric series (Feller VI.3).
+        # The terms for more matched stars decrease faster than a geometric series (Feller, section VI.3).
         ratio = lost / (matched + 1.0) * chance / (1.0 - chance)
         return (ways + rest - math.log1p(-ratio) + math.log(self.fields * expected * ring)) / math.log(10.0)
 
 
 def order_probability(sequence: Sequence[int]) -> float:
-    """Return the probability that a random order has as few inversions as `sequence` (Kendall's tau)."""
+    """Return the probability that a random order has no more inversions than `sequence` (Kendall's tau)."""
     inversions = sum(a > b for place, a in enumerate(sequence) for b in sequence[place + 1 :])
     counts = _inversion_counts(len(sequence))
     return sum(counts[: inversions + 1]) / math.factorial(len(sequence))
@@ -116,7 +122,7 @@ def order_probability(sequence: Sequence[int]) -> float:
 
 @lru_cache(maxsize=_MOST_ORDERED + 1)
 def _inversion_counts(length: int) -> tuple[int, ...]:
-    """Return how many permutations of `length` items have 0, 1, 2, ... inversions (Mahonian numbers)."""
+    """Return the numbers of permutations of `length` items with 0, 1, 2, ... inversions (Mahonian)."""
     counts = [1]
     for more in range(1, length):
         counts = [sum(counts[max(0, total - more) : total + 1]) for total in range(len(counts) + more)]
@@ -125,17 +131,17 @@ def _inversion_counts(length: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, slots=True)
 class VerificationSettings:
-    """The conditions under which a candidate is accepted.
+    """Settings of the verification of a candidate attitude.
 
     Attributes:
-        log10_false_alarm: log10 of the maximum expected number of chance matches in the searched sky.
-        gates: half widths within which a star matches, in standard deviations; the most significant gate is
-            used. The wide gates are for a lens with distortion, or for standard deviations that are too
-            small.
+        log10_false_alarm: log10 of the largest accepted expected number of chance matches.
+        gates: half-widths within which a star matches, in standard deviations; the gate with the most
+            significant match is used. The wide gates are for a lens with distortion, or for standard
+            deviations that are too small.
         least_matches: minimum number of matched stars.
         rounds: maximum number of rounds of matching and refinement.
-        most: number of the brightest observed stars that decide the acceptance; after it all stars are
-            matched.
+        most: number of observed stars, the brightest first, from which the acceptance is decided. After the
+            acceptance, all stars are matched.
     """
 
     log10_false_alarm: float = -4.5
@@ -147,21 +153,20 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Observed stars (k,), the guide stars (k,) that they match, and the significance."""
+    """Indices of matched observed stars (k,) and of their guide stars (k,), and log10 of significance."""
 
     observed: IntArray
     star: IntArray
     log10_chance: float
 
 
-# Share of matched bright expected stars below which distortion of the lens is fitted.
+# Fraction of bright expected stars that match, below which the distortion of the lens is fitted.
 _FEW_MISSED = 0.8
-# Maximum share of bright expected stars, beyond chance, without a match but with an unmatched star nearby,
-# and the radius of the neighbourhood relative to the corner's tangent.
-# A larger share indicates a wrong fit of the lens, because a foreground hides stars but adds no stars near
-# them.
+# Maximum fraction of bright expected stars that have an unmatched star nearby instead of a match.
+# The radius within which a star is nearby is relative to the corner's tangent.
+# A larger fraction indicates a wrong fit of the lens, because a foreground hides stars but adds none nearby.
 _MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
-# Excess of log10 of the chance probability above which a candidate is rejected without refinement.
+# Excess of log10 of the significance over its limit above which a candidate is rejected without refinement.
 _HOPELESS = 7.0
 
 
@@ -176,12 +181,12 @@ def verify(
     """Return the identification of the whole field, or NO_MATCH if the candidate may be a chance match.
 
     Args:
-        field: the observed stars.
-        sky: the guide stars.
-        matrix: attitude matrix of the candidate (3, 3), ICRS to camera, within some sigmas of the truth.
+        field: observed points of the frame.
+        sky: index of the guide stars.
+        matrix: attitude matrix of the candidate (3, 3), ICRS to camera, accurate enough for stars to match.
         scale: scale of the candidate.
-        searched: fraction of all attitudes from which candidates were taken; 1 if lost in space.
-        settings: conditions of acceptance.
+        searched: fraction of all attitudes that the search for candidates covers; 1 for lost in space.
+        settings: settings of the verification.
     """
     expected = _expected_in(field, sky, matrix, scale)
     deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
@@ -198,7 +203,7 @@ def verify(
         if decided is None:
             return nothing(field)
         matching, refined = decided
-    # The distortion of an uncalibrated lens is fitted if stars are missed or scatter too much.
+    # Distortion of an uncalibrated lens is fitted if bright stars do not match or residuals are too large.
     bright = _bright_matched(expected, matching.star)
     missed = not len(bright) or float(np.mean(bright)) < _FEW_MISSED
     scattered = inflation(refined.squares, len(refined.covariance)) > 1.0
@@ -208,7 +213,7 @@ def verify(
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> StarMatch:
-    """Return the identification with distortion fitted; NO_MATCH if bright stars are displaced."""
+    """Return the identification with the lens distortion fitted; NO_MATCH if bright stars are displaced."""
     expected = _expected_in(field, sky, refined.matrix, refined.scale)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
     if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
@@ -221,7 +226,7 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 def _bright_matched(
     expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
 ) -> npt.NDArray[np.bool_]:
-    """Return which bright expected stars match: those at least as bright as the median matched star."""
+    """Return which expected stars match, of those that are at least as bright as the median matched star."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
@@ -230,7 +235,10 @@ def _bright_matched(
 def _share_displaced(
     field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
 ) -> float:
-    """Return the share of bright expected stars, beyond chance, without a match but with a star nearby."""
+    """Return the fraction of bright expected stars that have an unmatched star nearby instead of a match.
+
+    The fraction that is expected by chance is subtracted.
+    """
     matched = _bright_matched(expected, found.star)
     missed = sky.stars.direction[expected[: len(matched)][~matched]]
     unmatched = np.delete(found.seen, found.observed, axis=0)
@@ -245,7 +253,7 @@ def _share_displaced(
 
 
 def nothing(field: StarField, status: MatchStatus = MatchStatus.NO_MATCH) -> StarMatch:
-    """Return an identification without matched stars."""
+    """Return an identification in which no star is matched."""
     return StarMatch(status, np.full(len(field), -1))
 
 
@@ -255,8 +263,8 @@ def expected_stars(
     """Return the indices of the `count` brightest guide stars in the field, the brightest first."""
     across, down = half_width
     cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
-    # For `count` stars in the field, twice the mean number of the brightest stars is searched.
-    # The density of stars varies between the Milky Way and the galactic poles.
+    # Twice the stars are searched that give `count` stars in an average field.
+    # The factor is needed because the density of stars is lower near the galactic poles.
     brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
     x, y, z = matrix @ sky.stars.direction[near].T
@@ -265,7 +273,7 @@ def expected_stars(
 
 
 def _expected_in(field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float) -> npt.NDArray[np.intp]:
-    """Return the indices of the guide stars that may be in the field, the brightest first."""
+    """Return the indices of the guide stars that are expected in the field, the brightest first."""
     across, down = field.half_width
     return expected_stars(sky, matrix, (across * scale, down * scale), int(1.3 * len(field)) + 8)
 
@@ -278,7 +286,11 @@ def _settle(
     searched: float,
     settings: VerificationSettings,
 ) -> tuple[_Matching, Refinement] | None:
-    """Return the matched stars and the refined `start` once both no longer change; None if they diverge."""
+    """Return the matched stars and the attitude after repeated matching and refinement.
+
+    Matching and refinement are repeated until the matched stars no longer change. Returns None if they
+    diverge.
+    """
     refined, previous = start, None
     for _ in range(settings.rounds):
         matching = _match(field, sky, expected, refined, searched, settings)
@@ -299,7 +311,7 @@ def _settle(
         )
         if found is None:
             return None
-        # The fitted scale must lie in the range of the lens, within five of its sigmas.
+        # The fitted scale must lie within five standard deviations of the range of the lens.
         lowest, highest = field.scale
         slack = math.exp(5.0 * found.scale_sigma)
         if lowest != highest and not lowest / slack <= found.scale <= highest * slack:
@@ -316,7 +328,7 @@ def _match(
     searched: float,
     settings: VerificationSettings,
 ) -> _Matching | None:
-    """Return the observed stars with an expected star within a gate, for the most significant gate."""
+    """Return the observed stars that match an expected star within a gate, for the most significant gate."""
     if len(expected) < settings.least_matches:
         return None
     cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
@@ -339,7 +351,7 @@ def _match(
     matched = settings.least_matches - 1
     for gate in settings.gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A wider gate that matches no further stars is less significant.
+        # A wider gate is less significant unless it matches further stars.
         if len(within) <= matched:
             continue
         matched = len(within)
@@ -363,10 +375,10 @@ def _identified(field: StarField, matching: _Matching, refined: Refinement) -> S
 
 
 PRIOR_SIGMAS = 4.0
-"""Largest assumed error of a prior attitude, in standard deviations."""
+"""Largest error of a prior attitude that the search near it covers, in standard deviations."""
 _BRIGHTEST = 16
-# Maximum number of pairs.
-# The comparison of more pairs is ambiguous and takes longer than a search of the whole sky.
+# Maximum number of pairs of an observed and a predicted star.
+# With more pairs, the comparison is ambiguous and takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -378,10 +390,10 @@ def track(
     sigma: float,
     settings: VerificationSettings = _DEFAULT,
 ) -> StarMatch:
-    """Return the identification of the frame near a prior attitude; NO_MATCH if it points elsewhere.
+    """Return the identification of a frame near a prior attitude; NO_MATCH if the stars contradict the prior.
 
-    `attitude` (4,), ICRS to camera, has the standard deviation `sigma`, rad, about each axis. If `sigma`
-    exceeds some degrees, `identify` is faster and more reliable.
+    The prior is the quaternion `attitude` (4,) from ICRS to camera axes, with the standard deviation `sigma`,
+    rad, about each axis. If `sigma` exceeds some degrees, `identify` is faster and more reliable.
     """
     if len(field) < settings.least_matches:
         return nothing(field, MatchStatus.TOO_FEW_STARS)
@@ -400,7 +412,7 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # The searched fraction is the volume of rotations near the prior over that of all rotations, 8 pi^2.
+    # The searched fraction is the volume of rotations near the prior, relative to that of all, 8 pi^2.
     searched = min((PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify(field, sky, matrix, scale, searched, settings)
 
@@ -408,7 +420,10 @@ def track(
 def _same_shift(
     field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float, sigma: float
 ) -> tuple[IntArray, npt.NDArray[np.intp]]:
-    """Return observed and guide stars (k,), (k,) of the largest set of pairs with one shift."""
+    """Return the indices of observed stars (k,) and guide stars (k,) that have a common displacement.
+
+    They are the largest set of pairs for which one displacement explains the errors of the prior.
+    """
     reach = PRIOR_SIGMAS * sigma
     across, down = (scale * width for width in field.half_width)
     wider = across + reach * (1.0 + across**2), down + reach * (1.0 + down**2)
@@ -416,7 +431,7 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # Errors of roll and scale change the shifts of stars at the image edge.
+    # Errors of roll and scale add different displacements to stars at the image edge.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
@@ -431,7 +446,7 @@ def _same_shift(
     apart = shifts[:, None, :] - shifts
     tolerance = 4.0 * star_sigma + (PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
-    # Pairs that share an observed or a guide star do not support each other.
+    # Two pairs that share an observed star or a guide star do not support each other.
     agree &= (one[:, None] != one) & (two[:, None] != two)
     best = int(agree.sum(axis=1).argmax())
     members = np.append(np.flatnonzero(agree[best]), best)

@@ -4,9 +4,9 @@
     found.points, found.covariance, found.flux        # brightest first
 
 `survey` measures the background and its noise, finds the connected areas above the noise and decides whether
-the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits stars to
-their pixels, `measurement` measures them with the PSF and the noise of their frame, and `detect` searches a
-frame, or the surroundings of predicted positions, for stars.
+the frame shows points or streaks (`knightcube.vision.streaks` measures streaks). `psf_fit` fits the point
+spread function (PSF) to the pixels of stars. `measurement` measures stars with the PSF and the noise of the
+frame. `detect` searches a whole frame, or only areas near predicted positions, for stars.
 """
 
 from knightcube.vision.startracker.detection.detect import (
