@@ -1,14 +1,15 @@
 """Properties of a frame that are needed for frames of points and frames of streaks.
 
 Background. The level and noise of the background are clipped moments of a sub-sample of each block of pixels.
-Streaks, slow gradients of stray light and hot pixels hardly change them. The thesis uses the mean of the
-image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The sum over 3 x 3
-pixels is close to the matched filter of a star that is one pixel wide.
+Streaks, slow gradients of stray light and hot pixels hardly change these moments. The thesis uses the mean of
+the image as threshold, but noise lifts half of all pixels above the mean (errata, chapter 3). The sum over 3
+x 3 pixels is close to the matched filter of a star that is one pixel wide.
 
 Hot pixels are bright pixels with dark neighbours, which no optics can produce. If a star's image has a
 standard deviation of more than 0.5 px, the four neighbours of its brightest pixel have at least 15 % of the
-intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only the certain
-ones. A fit to pixels excludes hot pixels instead, which does little harm if one of them was part of a star.
+intensity of that pixel. Methods that need an image without gaps replace hot pixels, but only if the detection
+is certain. A fit to pixels excludes hot pixels, which does little harm if a pixel of a star is excluded by
+mistake.
 
 A frame without a scene is dead (all pixels are equal) or overexposed. The step between counts is 257 if 8-bit
 counts were stored as 16 bits, and 16 if 12-bit counts were.
@@ -61,9 +62,9 @@ class Background:
 def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Background:
     """Return background level and noise of `pixels` (rows, columns) in blocks of `block` x `block` pixels.
 
-    Every `stride`-th pixel of every `stride`-th row is used. With the defaults, the 256 samples per block
-    give the level to 6 % and the noise to 5 % of the noise. A block that is filled by a bright object gets
-    the median noise of the surrounding 3 x 3 blocks.
+    Every `stride`-th pixel of every `stride`-th row is used. With the defaults, 256 samples per block give
+    the level with an error of 6 % of the noise, and the noise with an error of 5 %. A block that is filled by
+    a bright object gets the median noise of the surrounding 3 x 3 blocks.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators does not need scipy
 
@@ -176,7 +177,7 @@ def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     Regions are 8-connected and numbered in the order of their first pixels. The algorithm connects runs of
     pixels along rows, because there are far fewer runs than pixels. Each run is linked to an earlier run of
     its region, and the links are shortened until all runs of a region share one root (Shiloach and Vishkin
-    1982). The module scipy.sparse would need 12 MiB more.
+    1982). An implementation with scipy.sparse would need 12 MiB more memory.
     """
     # An empty column is added, so that no run continues in the next row.
     pixel, columns = pixel + pixel // columns, columns + 1
@@ -242,8 +243,8 @@ def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> 
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
 """Limits for the neighbours of a hot pixel.
 
-A neighbour must be below a fraction of the hot pixel plus standard deviations of the noise, and below a
-maximum fraction.
+A neighbour of a hot pixel must be below two limits: a fraction of the hot pixel plus standard deviations of
+the noise, and a maximum fraction of the hot pixel.
 """
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Limits for two adjacent hot pixels, in standard deviations.
@@ -311,8 +312,8 @@ _LEAST_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 """Limits for saturation in a frame of points.
 
 The first limit is the minimum number of pixels with the highest count. The second limit is the minimum ratio
-of this number to the number of pixels just below. The third limit is the range of counts that is just below,
-as a fraction of all counts.
+of the pixels with the highest count to the pixels just below this count. The third limit is the width of the
+range just below the highest count, as a fraction of the range of all counts.
 """
 
 
@@ -361,9 +362,9 @@ def saturation_count(pixels: Image) -> float:
 def saturation_of_bright(counts: FloatArray, pixels: Image, given: float | None) -> float:
     """Return the saturation count: `given`, the highest of `counts` (m,) if many share it, or the maximum.
 
-    Use this function for frames of points from any camera. In a dim frame, the highest counts are noise and
-    become rarer with their height. At saturation, more pixels have the highest count than the counts just
-    below.
+    Use this function for frames of points from any camera. In a dim frame, the highest counts are noise, and
+    the higher a count, the fewer pixels have it. In a saturated frame, more pixels have the highest count
+    than the counts just below.
     """
     top = saturation_level(pixels, given)
     highest = counts.max(initial=-np.inf)

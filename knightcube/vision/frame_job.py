@@ -137,8 +137,8 @@ class FrameFound:
 
     Attributes:
         motion: motion of the camera over the exposure.
-        solution: attitude at mid-exposure; None if stars were not identified.
-        objects: points that may be objects other than stars; None if objects were not measured or the
+        solution: attitude at mid-exposure, or None if stars were not identified.
+        objects: points that may be objects other than stars, or None if they were not measured or the
             attitude is unknown.
     """
 
@@ -289,7 +289,7 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         return FrameFound(motion, solution)
     if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
         again = _motion(replace(job, camera=solution.camera))
-        assert isinstance(again, MotionResult)  # The estimator is that of `motion`.
+        assert isinstance(again, MotionResult)  # The same estimator returned `motion`.
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
         # For a single image, the second fit would add half the computing time for a small gain.

@@ -21,7 +21,7 @@ from knightcube.vision.horizon.settings import HorizonKnowledge, LogarithmicResp
 from knightcube.vision.solar_cells import SolarStringModel
 
 SUNLIT_COUNTS = 30.0
-"""Pixel count that the sunlit Earth exceeds, and its stray light does not."""
+"""Pixel count that is exceeded by the sunlit Earth, but not by its stray light."""
 LIT_SIGMA = 0.3
 """Largest standard deviation (rad) of an attitude that is used to predict the Sun direction."""
 EARTHLIGHT_SIGMA = 0.1
@@ -148,7 +148,7 @@ def _false_images(job: HorizonCameraJob) -> dict[int, str] | None:
 
 
 def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the nadir (3,), body axes, predicted by a rough attitude; None if it is too uncertain."""
+    """Return the nadir (3,) in body axes predicted by a rough attitude, or None if too uncertain."""
     rough, position = knowledge.attitude, knowledge.position
     if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
         return None

@@ -51,7 +51,7 @@ _CAUCHY = 2.385
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
 """Median length of a residual of unit variance per axis (Rayleigh distribution)."""
 _DETERMINED = 0.5
-"""Ratio to the prior standard deviation below which a parameter counts as determined."""
+"""Ratio of posterior to prior standard deviation below which a parameter counts as determined."""
 _MAX_EXCESS = 3.0
 """Excess of chi-square, in its standard deviations, above which position errors count as too small."""
 _MIN_SPREAD = 1e-12
@@ -521,9 +521,9 @@ def lens_accuracy(
     """Return the accuracy of a lens by the keys of `camera.accuracy`.
 
     The accuracies of focal length and centre are taken from the fit `found` without the omitted terms. The
-    change of the focal length relative to the fit `whole` with all terms is added to its error. The accuracy
-    of the distortion is the relative displacement of an image corner. This displacement includes the
-    uncertainty with all terms and the difference between the two fits.
+    change of the focal length relative to the fit `whole` with all terms is added to the error of the focal
+    length. The accuracy of the distortion is the relative displacement of an image corner. This displacement
+    includes the uncertainty with all terms and the difference between the two fits.
     """
     lens, sigma = found.lens, found.sigma
     changed = whole.lens.focal_length - lens.focal_length
@@ -596,7 +596,7 @@ class LensCalibration:
     """The outcome of `calibrate_lens`. A `LensCalibration` is true (`if found:`) if a lens was determined.
 
     Attributes:
-        determined: lens, standard deviations, omitted terms and accuracy; None if no image was solved.
+        determined: lens, standard deviations, omitted terms and accuracy, or None if no image was solved.
         images: images in the given order, each with its solution or the reason for excluding it.
     """
 
@@ -609,7 +609,7 @@ class LensCalibration:
 
     @property
     def lens(self) -> Lens | None:
-        """The calibrated lens, for use as `StarTracker(camera=...)`; None if no image was solved."""
+        """The calibrated lens, for use as `StarTracker(camera=...)`, or None if no image was solved."""
         return None if self.determined is None else self.determined.calibration.lens
 
 

@@ -99,7 +99,7 @@ class CoarseSun:
 
     Attributes:
         status: the outcome.
-        direction: unit vector (3,) to the Sun in body axes; None unless the status is FOUND.
+        direction: unit vector (3,) to the Sun in body axes, or None unless the status is FOUND.
         basis: two unit vectors (2, 3) that are normal to the direction and to each other.
         tangent_covariance: covariance (2, 2) of the direction error along `basis`, rad^2.
         reason: reason why no direction was found.
@@ -124,7 +124,8 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
     Args:
         currents: currents (n,) of the strings, A.
         strings: the strings.
-        nadir: unit vector (3,) to nadir in body axes, if known. An error of ten degrees has little effect.
+        nadir: unit vector (3,) to nadir in body axes, if known. An error of the nadir by ten degrees has
+            little effect.
 
     Raises:
         ValueError: if the currents are not n finite numbers.
@@ -319,11 +320,11 @@ class FieldAndStrings:
         return StringFix(attitude, about**2 * along + across**2 * (np.eye(3) - along), axis, about)
 
     def _aligned(self, axis: FloatArray, known: FloatArray) -> FloatArray:
-        """Return the base (4,) after the shortest rotation that aligns the `known` field with `axis`."""
+        """Return the base attitude (4,) after the shortest rotation of the `known` field onto `axis`."""
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # For opposite directions, the base is first rotated by half a turn about any normal of `axis`.
+            # For opposite directions, the base attitude is first rotated by 180 deg about any normal of `axis`.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))

@@ -79,8 +79,8 @@ class StarSolution:
         field_of_view_sigma: standard deviation of the field of view, rad. The deviation is 0 for a calibrated
             camera.
         log10_false_alarm: log10 of an upper limit of the probability that randomly placed points are solved.
-        mirrored: whether the image is a mirror image of the sky. The attitude is then that of the image with
-            left and right exchanged.
+        mirrored: whether the image is a mirror image of the sky. The attitude of a mirror image is that of
+            the image with left and right exchanged.
         rate: angular velocity (3,) of the camera relative to inertial space, in camera axes, rad/s. The rate
             is None unless the stars are streaks and the exposure was given.
         rate_covariance: covariance (3, 3) of `rate`, rad^2/s^2, or None.
@@ -200,7 +200,8 @@ class StarTracker:
                 and for aberration by the Earth's velocity, which is at most 20.5". If `utc` is None, the
                 epoch of the index is used, without aberration.
             attitude: predicted attitude (4,) from ICRS to camera axes. Stars are first searched near their
-                predicted positions, which is faster. If this does not succeed, the whole sky is searched.
+                predicted positions, which is faster. If the search near the predicted positions does not
+                succeed, the whole sky is searched.
             attitude_sigma: standard deviation of the predicted attitude about each axis, rad.
             rate: predicted angular velocity (3,) in camera axes, rad/s. The predicted rate determines the
                 sign of a measured rate.
@@ -233,7 +234,7 @@ class StarTracker:
         return _solution(frame, sky, settings.velocity, exposure is not None)
 
     def _camera_for(self, shape: tuple[int, ...]) -> tuple[CameraModel, tuple[float, float]]:
-        """Return the camera for an image of `shape`, and the range of factors on its field-angle tangents."""
+        """Return the camera for an image of `shape`, and limits of the factor on field-angle tangents."""
         camera = self._camera
         if camera is None:
             return camera_of_field(self._fov_deg, self._fov_error_deg, shape)
@@ -255,7 +256,7 @@ def field_of_view(camera: CameraModel) -> float:
 def camera_of_field(
     fov_deg: float | None, error_deg: float | None, shape: tuple[int, ...]
 ) -> tuple[Pinhole, tuple[float, float]]:
-    """Return a pinhole camera for a field of view, and the range of factors on its field-angle tangents.
+    """Return a pinhole camera for a field of view, and limits of the factor on field-angle tangents.
 
     Args:
         fov_deg: field of view across the columns, deg. If `fov_deg` is None, the range `UNKNOWN_FOV_DEG` is

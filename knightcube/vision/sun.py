@@ -42,8 +42,8 @@ class SunSettings:
 
     Attributes:
         level: threshold of the Sun's image, counts. For a logarithmic camera, the threshold is well above the
-            brightest cloud, so that only the disc remains. For a linear camera, it is slightly below
-            saturation.
+            brightest cloud, so that only the disc remains. For a linear camera, the threshold is slightly
+            below saturation.
         stride: distance between the rows that are read first, px.
         least_radius: radius below which a patch counts as a hot pixel, rad. The Sun itself has a radius of
             0.0047 rad.
@@ -98,7 +98,10 @@ class SunStatus(Enum):
     NO_SUN = "no-sun"
     """No part of the image is bright enough for the Sun."""
     NOT_THE_SUN = "not-the-sun"
-    """A patch is bright enough, but too small, too large or not round. The attribute `reason` says which."""
+    """A patch is bright enough, but too small, too large or not round.
+
+    The attribute `reason` says why the patch is not the Sun.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -483,7 +486,7 @@ def _distances(points: FloatArray, solution: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _consensus(points: FloatArray, gate: float) -> FloatArray | None:
-    """Return the circle (x, y, radius) through three of the points that has most points within `gate`.
+    """Return the circle (x, y, radius) through three points with the most other points within `gate`.
 
     The points of a triple are evenly spaced, by an eighth to a third of the rim.
     """
@@ -569,9 +572,10 @@ class SunOfCameras:
     """The Sun in body axes.
 
     Attributes:
-        direction: unit vector (3,) to the Sun; None if neither a camera nor the solar strings found the Sun.
+        direction: unit vector (3,) to the Sun, or None if neither a camera nor the solar strings found the
+            Sun.
         covariance: covariance (3, 3) of the direction error, zero along the direction, rad^2.
-        camera: index of the camera that found the Sun; None if the solar strings gave the direction.
+        camera: index of the camera that found the Sun, or None if the solar strings gave the direction.
         each: solutions by camera index, in the order in which the cameras were read.
         reason: reason why no camera found the Sun. The reason is empty if a camera found the Sun.
     """

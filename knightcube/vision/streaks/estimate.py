@@ -10,8 +10,9 @@ deterministic.
 With a rolling shutter, a star that moves in the readout direction is exposed longer than a star that moves
 against it. A motion and its time reversal therefore produce streaks of different lengths. A prior rate
 determines the sign of the rotation before the fit. Without a prior rate, both signs of the rotation are
-fitted, and the better fit is selected. If neither sign fits significantly better, the sign remains unknown.
-The reported rate is then the mean of both fits up to sign, and its covariance includes their difference.
+fitted, and the better fit is selected. If neither sign fits significantly better, the sign remains unknown,
+and the rate is the mean of one fit and the reversed other fit. The covariance of this mean includes the
+difference between the two fits.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ _MOST_ANGLES = 2
 _STILL_ROUNDS = 12
 # Minimum number of complete streaks for a guess of the rotation angle from streak lengths alone.
 _WHOLE = 8
-# Maximum fraction of flux in regions that are too long for a guess from streak lengths alone.
+# Maximum fraction of the flux in overlong regions, for a guess of the rotation angle from streak lengths.
 _CONTRADICTED = 0.3
 # Minimum number of stars in a preliminary fit that is accepted without comparison with other fits.
 _MANY = 3
@@ -109,7 +110,7 @@ _IN_PLACE = 0.6
 _EVIDENT = 3000.0
 # Largest median chi-square per degree of freedom of a usable preliminary fit.
 _WORST_FIRST = 12.0
-# Fraction of pixels above the threshold from which the brightest regions count as blends of stars.
+# Fraction of bright pixels above which the brightest regions of a frame count as blends of stars.
 _CROWDED = 0.05
 # Explained chi-square below which a frame of blended stars is scanned completely.
 _BEYOND_CROWD = 100_000.0
@@ -152,7 +153,7 @@ def first_fits(camera: FitProblem, regions: BrightRegions, near: float | None) -
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     if rivals and not yielded:
-        # If the bright regions do not determine the rotation angle, a scan of the whole frame may.
+        # If the bright regions do not determine the rotation angle, the whole frame is scanned.
         axis = max(rivals, key=lambda rival: rival[0])[1].scene.motion.rotation
         angles = _frame_angles(camera, axis)
         for explained, convincing, done in _rescanned(camera, axis, angles):
@@ -302,9 +303,9 @@ _MOST_CHAINED = 0.45
 _TRUE_ENDS = (0.75, 0.6)
 # Largest fraction of streaks with gaps, for an accepted and for a doubtful motion.
 _BROKEN = (0.12, 0.35)
-# Number of streaks with two confirmed ends from which gaps in other streaks are tolerated.
+# Minimum number of streaks with two confirmed ends for which gaps in other streaks are tolerated.
 _CONFIRMING = 3
-# Minimum fraction of the flux of complete streaks that must come from streaks that agree with the motion.
+# Minimum fraction of the flux of complete streaks that comes from streaks consistent with the motion.
 _AGREEING_LIGHT = 0.5
 # Relative change of the rate above which streaks are tested for flux beyond their ends.
 _UNEVEN = 0.4
@@ -324,8 +325,8 @@ def check_streaks(camera: FitProblem, scene: StreakScene, faint: FaintStars) -> 
     """Return whether the trusted streaks of `scene` have confirmed ends and no gaps.
 
     In a crowded frame, one apparent star may be a blend of several stars. A few streaks with gaps therefore
-    make a motion only doubtful, and enough streaks with two confirmed ends outweigh them. A motion is also
-    doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
+    make a motion only doubtful, and enough streaks with two confirmed ends outweigh these gaps. A motion is
+    also doubtful if no streak has both ends in the frame, or if most streaks with both ends in the frame
     contradict the motion. A motion with too many wrong streak ends is rejected.
     """
     stars = np.concatenate([scene.stars, faint.stars])
@@ -435,7 +436,7 @@ def _rolling_result(
         return None
     known = [found for found in both if found.result.rate is not None]
     if len(known) < 2:
-        # The sign of the rotation whose fit did not succeed may be the true one.
+        # If the fit for one sign does not succeed, this sign may still be the true one.
         return replace(both[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
     one, other = known
     distance = np.linalg.norm(one.middles[:, None] - other.middles, axis=2)
@@ -474,7 +475,7 @@ _SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: FitProblem, last: StreakFit) -> MotionResult:
-    """Return `seen` completed by the fitted stars, their streak ends and the covariances."""
+    """Return the result `seen` with the fitted stars, their streak ends and the covariances."""
     settings, joint = camera.settings, last.solution.joint
     significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
     kept = np.flatnonzero(significance > settings.faint_sigmas)
@@ -769,7 +770,7 @@ def _best_motion(
 
 
 def _has_angle(rotation: FloatArray, angles: list[float]) -> bool:
-    """Return whether the angle of `rotation` (3,) equals the first and most likely of `angles` (rad)."""
+    """Return whether the angle of `rotation` (3,) equals the most likely angle in `angles` (rad)."""
     size = float(np.linalg.norm(rotation))
     return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
 

@@ -8,7 +8,7 @@ stars, and a linear system separates the heights of overlapping peaks. For brigh
 along the circle separates overlapping triangles.
 
 If the brightest regions do not determine the rotation angle, all circles are searched. A search of all
-circles is necessary if streaks are faint and fragmented, or if the border truncates all of them. The mean of
+circles is necessary if streaks are faint and fragmented, or if the border truncates all streaks. The mean of
 the pixels in a box along a circle is compared with the mean of the pixels on both sides of the box. The box
 length with the largest sum of squared significances is the length of the streaks.
 """
@@ -51,7 +51,7 @@ class PolarGrid:
         azimuth: (c,) azimuth of each sample on a circle, rad.
         length: number of samples in the length of a streak.
         angle: rotation angle over the exposure, rad.
-        speed: (r,) displacement in the image per azimuth on each circle, px/rad.
+        speed: (r,) image displacement per radian of azimuth on each circle, px/rad.
     """
 
     frame: FloatArray
@@ -114,7 +114,7 @@ def sampled(
     samples are rounded to integer multiples of `unit`, so that sums of them are fast and exact. If the
     circles are complete, the columns include a margin of `room` samples on both sides of the detector.
     """
-    # A direction divided by the sine of its polar angle is a term of the azimuth plus a term of the circle.
+    # A direction divided by the sine of its polar angle is the sum of an azimuth term and a polar term.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
@@ -182,8 +182,8 @@ class RunningSums:
     Attributes:
         light: (r, c) counts.
         count: (r, c) number of samples on the detector in each running sum.
-        span: (r, 2) first and last column of each circle on the detector. The span is infinite if a circle
-            leaves the detector in between.
+        span: (r, 2) first and last column of each circle on the detector. The span is infinite if the samples
+            of a circle on the detector are not contiguous.
         excess: (r,) noise of the running sums on each circle, relative to the noise of independent samples.
     """
 
@@ -249,7 +249,7 @@ def cumulative_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Fl
 
 # Minimum fraction of a streak that must lie on the detector for its detection.
 _LEAST_SEEN = 0.35
-# Number of circles between two stars from which their profiles do not overlap.
+# Number of circles between two stars at which their profiles no longer overlap.
 _FARTHEST = 5
 # Standard deviation (px) of a star's profile across the streak, as assumed by the filter.
 _WIDTH = 1.05
@@ -311,7 +311,7 @@ def sharp_peaks(
     bend += flat.take(place + step, mode="clip")
     np.subtract(np.float32(2.0) * flat[place], bend, out=bend)
     bend *= np.float32(grid.length / (2.0 * step))
-    # The second difference of an isolated star is scaled to its response, and its noise by the same factor.
+    # The second difference is scaled to the response of an isolated star, which also scales its noise.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
     sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
@@ -577,7 +577,7 @@ def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: Polar
     overlap = overlap_of(column[one], column[other], common, grid.length) * profile(
         (row[one] - row[other]) * _ACROSS
     )
-    # The regularisation of nearly coincident stars is compensated for isolated stars on the right-hand side.
+    # For isolated stars, the factor on the right-hand side compensates the regularisation.
     overlap[one == other] *= 1.0 + _RIDGE
     overlap[one == other] += _TINY
     seen = (1.0 + _RIDGE) * held.light[middle, np.rint(column).astype(int) % held.light.shape[1]].astype(

@@ -209,7 +209,7 @@ def _refined_angle(
 _PROPOSERS = 16
 # Smallest sine of the angle between the equations of two regions that propose a rotation axis.
 _PARALLEL = 1e-9
-# Standard error (px) of a region's orientation times its length.
+# Product (px) of the standard error of a region's orientation and the region's length.
 _SIDE_ERROR = 1.2
 # Minimum standard error (rad) of a region's orientation.
 _LEAST_ERROR = 0.012
@@ -217,9 +217,9 @@ _LEAST_ERROR = 0.012
 _LEAST_LENGTH = 3.5
 # Constant part (px) of the standard error of a region's length.
 _LENGTH_ERROR = 1.0
-# Proportional part of the standard error of a region's length.
+# Part of the standard error of a region's length that is proportional to the length.
 _LENGTH_SHARE = 0.015
-# Maximum number of rotation angles from each of the two rankings.
+# Maximum number of rotation angles from each of the two rankings of the votes.
 _MOST_HYPOTHESES = 3
 # Largest distance (px) across the circles between two fragments of one star.
 _SAME_CIRCLE = 2.0
@@ -229,7 +229,7 @@ _LIKELY_LENGTH = 0.2
 _INSTANTS = 65
 # Minimum number of complete regions for an estimate of the angular acceleration.
 _LEAST_GROWING = 3
-# Minimum relative change of the rate that an initial guess includes.
+# Minimum relative change of the rate for which an initial guess includes an angular acceleration.
 _LEAST_GROWTH = 0.4
 
 
@@ -303,7 +303,7 @@ class AxisGuess:
         first: (n,) lowest azimuth of each region, rad.
         last: (n,) highest azimuth of each region, rad.
         width: (n,) arc length of each region from its second moment, rad.
-        speed: (n,) displacement in the image per azimuth at each region, px/rad.
+        speed: (n,) image displacement per radian of azimuth at each region, px/rad.
         cut_first: (n,) whether the border of the frame truncates the end at the lowest azimuth.
         cut_last: (n,) whether the border of the frame truncates the end at the highest azimuth.
     """
@@ -328,7 +328,7 @@ def find_axis(regions: BrightRegions, pinhole: Pinhole) -> AxisGuess | None:
     axis, agree = found
     n, owner, light = len(regions), regions.owner, regions.light
     middle = pinhole.unit_vectors(np.array([pinhole.centre]))[0]
-    # The azimuth zero points to the image centre, or anywhere if the axis is at the image centre.
+    # The azimuth zero points to the image centre, and is arbitrary if the axis is at the image centre.
     first = middle - (middle @ axis) * axis
     if np.linalg.norm(first) < 1e-3:
         first = np.eye(3)[int(np.argmin(np.abs(axis)))]

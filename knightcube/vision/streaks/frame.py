@@ -58,8 +58,8 @@ class ReducedFrame:
 def reduce_frame(pixels: Image, saturation: float | None, gain: float) -> ReducedFrame:
     """Return the frame `pixels` (rows, columns) with its background subtracted and its noise estimated.
 
-    `saturation` is in counts, and `gain` in electrons per count. If `saturation` is None, it is the highest
-    count if many pixels have that count, otherwise the maximum of the integer type.
+    `saturation` is in counts, and `gain` in electrons per count. If `saturation` is None, the highest count
+    is used if many pixels have that count, otherwise the maximum of the integer type.
     """
     top = saturation_count(pixels) if saturation is None else saturation
     pixels, step, offset = in_steps(pixels)
@@ -160,7 +160,7 @@ def find_bright_regions(frame: ReducedFrame, sigmas: float, most: int) -> Bright
 
 # Minimum mean width (px) of a limb or a reflection, twice the width of the brightest stars.
 _BROAD = 25.0
-# Minimum length (px) in the mean width of a region, which is its area divided by its length.
+# Minimum length (px) by which the area of a region is divided to obtain the mean width.
 _LEAST_LENGTH = 40.0
 # Side (px) of a square that fits into a limb or a reflection, but not into a star.
 _SOLID = 31
@@ -172,8 +172,8 @@ def without_glare(frame: ReducedFrame, regions: BrightRegions) -> ReducedFrame |
     """Return `frame` with limbs and reflections excluded, or None if there are none.
 
     A limb or a reflection is a region that contains a square larger than any star. A net of crossing streaks
-    contains no such square. A margin around such a region is also excluded, because the background map does
-    not follow its steep gradient.
+    does not contain such a large square. A margin around limbs and reflections is also excluded, because the
+    background map does not follow steep gradients.
     """
     area = np.bincount(regions.owner, minlength=len(regions))
     broad = area > _BROAD * np.maximum(regions.length, _LEAST_LENGTH)
@@ -251,7 +251,7 @@ _LEAST_WIDTH_REGIONS = 3
 
 
 def measured_psf_sigma(frame: ReducedFrame, regions: BrightRegions) -> float | None:
-    """Return the standard deviation (px) of the point spread without the pixel, or None for few regions.
+    """Return the standard deviation (px) of the point spread before pixel convolution, or None if unknown.
 
     The autocorrelation of a streak of Gaussian width w at a displacement d across the streak is proportional
     to exp(-d^2/(4 w^2)). The product of the autocorrelations along columns and rows has this form for every
@@ -285,7 +285,7 @@ _NARROWEST = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Binning:
-    """Bins of `size` x `size` pixels, from pixel `first` (x, y), as the pixels of the camera `pinhole`."""
+    """Binning by `size` x `size` pixels from pixel `first` (x, y), and the binned camera `pinhole`."""
 
     size: int
     first: tuple[int, int]
@@ -307,7 +307,7 @@ class Binning:
         return cls(1, (0, 0), pinhole)
 
     def frame(self, pixels: Image, top: float) -> tuple[Image, float]:
-        """Return the binned `pixels`, and the value of a bin with a pixel of at least `top` counts."""
+        """Return the binned `pixels`, and the value of bins with a pixel of at least `top` counts."""
         if self.size == 1:
             return pixels, top
         x, y = self.first
@@ -361,9 +361,9 @@ def _centred_count(length: int, size: int) -> int:
 
 # Maximum number of bright regions in a frame.
 _MOST_REGIONS = 48
-# Minimum measured point-spread width (px) that selects binning.
+# Minimum measured point-spread width (px) for which a frame is binned.
 _WIDE = 2.2
-# Minimum ratio of the measured to the configured point-spread width that selects binning.
+# Minimum ratio of measured to configured point-spread width for which a frame is binned.
 _WIDER = 1.5
 
 

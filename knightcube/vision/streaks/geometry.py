@@ -21,7 +21,7 @@ from knightcube.vision.camera.lens import Pinhole
 
 PIXEL_VARIANCE = 1.0 / 12.0
 """Variance (px^2) of a uniform distribution over one pixel."""
-# Number of iterations that invert the lens distortion, which is about 1 % of the radius.
+# Number of iterations for the inversion of the lens distortion, which is about 1 % of the radius.
 _ROUNDS = 6
 _TINY = 1e-12
 
@@ -120,7 +120,7 @@ class CameraMotion:
         return CameraMotion(-self.rate, self.acceleration, odd[:, None] * self.higher_terms)
 
     def scaled_to(self, rotation: FloatArray) -> CameraMotion:
-        """Return this motion with the mean rate changed to give `rotation` (3,), rad, or its negative."""
+        """Return this motion with a mean rate that gives `rotation` (3,), rad, or the opposite rotation."""
         sign = -1.0 if self.rotation @ rotation < 0.0 else 1.0
         return replace(self, rate=self.rate + sign * rotation - self.rotation)
 
@@ -355,7 +355,7 @@ class Shutter:
 
     def delay(self, rows: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
         """Return the exposure delay of `rows` relative to the middle row, in exposures."""
-        # Scalars of the same type as `rows` preserve float32.
+        # Scalars of the same type as `rows` keep float32 arrays from being converted to float64.
         return np.asarray((rows - rows.dtype.type(self.middle)) * rows.dtype.type(self.delay_per_row))
 
 
@@ -367,7 +367,7 @@ _UNEVEN = 0.05
 _INSTANTS = 65
 # Largest uncertainty (px per exposure) of the navigation filter's motion that the fit accepts.
 _MOST_VAGUE = 3.0
-# Error of the mean rate per error of the navigation filter's rate, as a ratio.
+# Ratio of the resulting error of the mean rate to the error of the navigation filter's rate.
 _COURSE_SHARE = 0.15
 
 

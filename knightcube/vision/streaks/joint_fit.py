@@ -2,11 +2,11 @@
 
 The fit iterates until the steps of the shared parameters are small. The fit covers only a few pixels beyond
 the ends of the streaks, so that it can converge to a wrong rotation angle. With a rotation that is too small,
-the model may match only one end of every streak. The function `true_ends` detects flux beyond the other ends.
-With a rotation that is too large, the modelled streaks extend over dark pixels. The function `unbroken`
-detects such gaps. If a modelled end lies more than a few point-spread widths beyond the true end, the pixels
-around it contain no starlight and do not attract the end. The function `stretched` then searches a longer
-distance for the true ends and corrects the streak length.
+the model may match only one end of every streak. The function `true_ends` detects flux beyond the streak ends
+of such a model. With a rotation that is too large, the modelled streaks extend over dark pixels. The function
+`unbroken` detects streaks with dark segments. If a modelled end lies more than a few point-spread widths
+beyond the true end, the pixels around it contain no starlight and do not attract the end. The function
+`stretched` then searches a longer distance for the true ends and corrects the streak length.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from knightcube.vision.streaks.normal_equations import (
 from knightcube.vision.streaks.settings import LikelihoodSettings
 
 # Work (pixels) after which no further motion is fitted.
-# A fit in progress is completed, so that a frame may take twice the work of this limit.
+# A fit in progress is always completed, so that the work on a frame may be twice this limit.
 _MOST_WORK = 1_600_000
 # Fixed overhead of one model evaluation, in equivalent pixels.
 _EVALUATION = 15_000
@@ -148,7 +148,7 @@ class FitProblem:
         sigma: initial standard deviation of the point spread, px.
         growing: whether the angular acceleration is fitted.
         sense: (3,) direction along which the rotation must have a positive component; None for either sense.
-        course: motion from the navigation filter; None if it is unknown or nearly uniform.
+        course: motion from the navigation filter, or None if it is unknown or nearly uniform.
         work: work spent on this frame so far.
     """
 
@@ -559,7 +559,7 @@ _SUBTRACTION_ERROR = 0.35
 # Maximum number of pixels in all fit windows, which limits memory and time.
 # A pixel in several windows counts once for each window.
 _MOST_PIXELS = 60_000
-# Fraction of `_MOST_PIXELS` for the brightest streaks if all their neighbours are fitted.
+# Fraction of the pixel limit for the brightest streaks in a fit with all their neighbours.
 _BRIGHTEST_SHARE = 0.5
 # Minimum number of streaks in a fit of the brightest streaks with all their neighbours.
 _LEAST_BRIGHTEST = 10

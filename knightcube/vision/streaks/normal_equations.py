@@ -62,8 +62,8 @@ class BlockPixels:
     """Frame data on b blocks of pixels. Arrays have the shape (b, ...) unless stated otherwise.
 
     Attributes:
-        slot: index of each pixel among all fitted pixels. Stars that share a pixel share its slot. A pixel
-            outside the frame has the number of fitted pixels as its slot.
+        slot: index of each pixel among all fitted pixels. Stars that share a pixel share its slot. The slot
+            of a pixel outside the frame is the number of fitted pixels.
         inside: mask of the pixels that are fitted.
         signal: counts of each pixel above the background.
         floor: noise variance of each pixel without a star, counts^2.
@@ -629,8 +629,8 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> EliminatedEquations | 
 def solve(evaluation: Evaluation, scene: StreakScene, free: BoolArray, rounds: int) -> Solution | None:
     """Return the step towards maximum likelihood, or None if the shared parameters are undetermined.
 
-    At most `rounds` conjugate-gradient iterations account for shared pixels. With 0 iterations, sharing is
-    neglected.
+    At most `rounds` conjugate-gradient iterations account for shared pixels. If `rounds` is 0, the coupling
+    by shared pixels is neglected.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:

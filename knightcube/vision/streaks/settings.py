@@ -19,10 +19,11 @@ class LikelihoodSettings:
 
     Attributes:
         gain: gain of the camera, electrons per count.
-        saturation: count from which a pixel is saturated. If `saturation` is None, it is the highest count of
-            the frame if several pixels have that count, otherwise the maximum of the integer type.
+        saturation: count from which a pixel is saturated. If `saturation` is None, the highest count of the
+            frame is used if several pixels have that count, otherwise the maximum of the integer type.
         saturated_fraction: fraction of saturated pixels from which a frame is rejected.
-        psf_sigma: initial standard deviation of the point spread, px. From 2 px on, the frame is binned.
+        psf_sigma: initial standard deviation of the point spread, px. If `psf_sigma` is 2 px or more, the
+            frame is binned.
         rate_model: `constant` for a constant rate, `accelerating` for a linearly changing rate, or `auto` to
             let a score test decide.
         line_time: delay between the exposures of successive rows, s. The line time is positive for a rolling

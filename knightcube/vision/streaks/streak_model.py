@@ -4,7 +4,7 @@ A long streak is fitted on strips of parallel lines of pixels across its path. T
 if the path runs mainly along rows, otherwise rows of pixels. Ten lines form a block, over which the
 derivatives with respect to the motion are linear. Long paths are divided into parts in time, and also where
 their major axis changes between rows and columns. Each pixel is assigned to the nearest part of a path. The
-selection of pixels stays fixed during the fit, and only their distances from the path are updated.
+selected pixels stay fixed during the fit, and only their distances from the path are updated.
 
 Near a pixel, the path is an arc with the speed v and the coordinates s along the arc and n across the arc. A
 star of unit flux gives each pixel the counts
@@ -482,7 +482,7 @@ def _draw(
     out[:, 5] += u
     across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    # This image is the first moment along the path of the counts between start and end of the exposure.
+    # This basis image is the first moment of the counts along the path, between the streak ends.
     along *= out[:, 1]
     across *= np.float32(width**2)
     across *= out[:, 3] - out[:, 4]

@@ -109,7 +109,7 @@ class MotionResult(FrameMotion):
     """The maximum-likelihood motion over one exposure, and the stars of the frame.
 
     The attribute `rate` is the mean rate over the exposure. The stars in the mask `used` determine the
-    motion. The attributes `length` and `residual`, here the expected error, refer to the used stars.
+    motion. The attributes `length` and `residual` (the expected error) refer to the used stars.
 
     Attributes:
         stars: (n, 2) positions of the stars at mid-exposure, px.
@@ -118,8 +118,8 @@ class MotionResult(FrameMotion):
         directions: (n, 3, 3) unit vectors at the start, middle and end of each streak, in camera axes.
         flux: (n,) counts of each star over the exposure.
         significance: (n,) flux of each star over its standard deviation.
-        faint_endpoints: (m, 2, 2) ends of streaks that were detected but not fitted, accurate to about 1 px,
-            px.
+        faint_endpoints: (m, 2, 2) ends (px, accurate to about 1 px) of streaks that were detected but not
+            fitted.
         faint_flux: (m,) counts.
         faint_significance: (m,) flux of each faint star over its standard deviation.
         psf_sigma: fitted standard deviation of the point spread, px.

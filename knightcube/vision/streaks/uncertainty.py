@@ -42,7 +42,7 @@ from knightcube.vision.streaks.streak_result import MotionResult
 
 # Residual (standard deviations) above which a pixel contains flux of another star.
 _FOREIGN_SIGMAS = 5.0
-# Increase of this residual limit, as a fraction of the brightest modelled pixel of the line.
+# Increase of the residual limit for foreign flux, as a fraction of the brightest modelled pixel of a line.
 _FOREIGN_SHARE = 0.6
 # Minimum sensitivity of a pixel to a displacement, relative to the most sensitive pixel of its block.
 _LEAST_SENSITIVITY = 0.02
@@ -186,10 +186,10 @@ def correct(
         information: (n, k, k) information of each star after elimination of the star's own parameters.
         score: (n, k) gradient of each star's log-likelihood.
         apparent: (n, k, m) apparent change of the shared parameters by each of m calibration errors of one
-            standard deviation. Errors of specified size come first.
+            standard deviation. Calibration errors of specified size come first.
         spread: variance of the scatter of the stars, relative to their noise.
         described: number of calibration errors whose size is specified.
-        counted: (m,) errors already corrected in the fit. The result is relative to these errors.
+        counted: (m,) errors already corrected in the fit. The result is relative to the errors in `counted`.
     """
     m = apparent.shape[2]
     known = information / spread
@@ -230,8 +230,8 @@ def apparent_rates(camera: FitProblem, scene: StreakScene, exposure: float) -> F
     """Return apparent rate changes (n, 3, m) of each star by calibration errors of one standard deviation.
 
     The apparent rate changes are in rad per exposure. Exactly known calibration parameters are omitted, and
-    the line time of the shutter is last. A streak determines the position of its path across the path, and
-    its ends determine its length.
+    the line time of the shutter is last. A streak determines the position of its path perpendicular to the
+    path, and its ends determine the length.
     """
     errors = _error_sizes(camera)
     n = len(scene.stars)
@@ -502,7 +502,7 @@ def _reversal_chi2(one: _PathLight, shares: FloatArray, lengths: FloatArray, wid
 
 # Maximum number of conjugate-gradient iterations for the covariance.
 _CONJUGATE = 12
-# Number of stars too small for a consistency test, and the factor on the variance for such a fit.
+# Number of stars up to which no consistency test is possible, and the variance factor for such a fit.
 _UNCHECKED = (2, 4.0)
 # Relative difference between fitted and configured point-spread variance that counts as zero.
 _SAME_SPREAD = 0.05
@@ -686,8 +686,8 @@ def _end_uncertainty(left: StreakResiduals, scene: StreakScene, sigma: float, mi
     """Return the uncertainty (px) of streak ends from a point-spread width that differs from `sigma` (px).
 
     If the residuals at the ends are not significant, the point spread has the modelled shape and the same
-    width along and across the streaks. Residuals indicate another shape, or a vibration too fast to be
-    resolved, which shifts the apparent ends.
+    width along and across the streaks. Significant residuals indicate another shape, or a vibration too fast
+    to be resolved, which shifts the apparent ends.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
