@@ -324,7 +324,7 @@ class FieldAndStrings:
         base = np.array([0.0, 0.0, 0.0, 1.0]) if self._base is None else self._base
         shown = attitude_matrix(base) @ known
         if float(shown @ axis) < -0.99:
-            # For opposite directions, the base attitude is first rotated by 180 deg about any normal of `axis`.
+            # For opposite directions, the base attitude is first rotated by 180 deg about a normal of `axis`.
             base = multiply(np.array([*tangent_basis(axis)[0], 0.0]), base)
             shown = attitude_matrix(base) @ known
         shortest = normalise(np.array([*np.cross(axis, shown), 1.0 + float(shown @ axis)]))
