@@ -249,8 +249,8 @@ the noise, and a maximum fraction of the hot pixel.
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 """Limits for two adjacent hot pixels, in standard deviations.
 
-The first limit is the minimum brightness of both pixels. The second limit is the noise margin of the third
-brightest pixel.
+The first limit is the minimum brightness of both pixels. The second limit is the number of standard
+deviations by which noise may raise the third brightest pixel.
 """
 _REPAIR_SIGMAS, _HOT_SIGMAS = 10.0, 8.0
 """Minimum brightness (standard deviations) of a hot pixel that is replaced, and of one that is excluded."""

@@ -2,8 +2,8 @@
 
 The fit is a weighted least-squares fit in pixels to all frames at once, with an unknown attitude for each
 frame. Wrong matches first get small Cauchy weights, which are scaled by the spread of the residuals. Matches
-with residuals above five standard deviations are then rejected. The attitudes are eliminated frame by frame
-with the Schur complement, as three small rotations each. The remaining system is 5 x 5 for any number of
+with residuals above five standard deviations are then rejected. The three attitude parameters of each frame
+are eliminated frame by frame with the Schur complement. The remaining system is 5 x 5 for any number of
 frames.
 
 The data may not determine all parameters. In a narrow field, a shift of the optical axis looks like a

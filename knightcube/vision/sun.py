@@ -4,10 +4,10 @@
 
 Every few rows of the image are read, and bright patches on these rows are candidates. The rim of a candidate
 is traced along spokes, and a circle on the sphere is fitted to the rim points. The centre of the circle is
-the centre of the Sun, even if the disc is saturated, has glare, or is truncated by the edge of the image. The
-circle is first the consensus of triples of rim points, and is then refined by geometric least squares
-(Gauss-Newton). Tukey's biweight of each point's distance from the circle (Huber 1981, Robust Statistics,
-chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
+the centre of the Sun, even if the disc is saturated, has glare, or is truncated by the edge of the image. An
+initial circle is found by consensus among triples of rim points, and is then refined by geometric least
+squares (Gauss-Newton). Tukey's biweight of each point's distance from the circle (Huber 1981, Robust
+Statistics, chapter 7) excludes a cloud beside the disc or a hot pixel on the rim.
 
 The function `sun_of_cameras` reads the cameras in an order that depends on the coarse Sun direction from the
 solar strings (Meller et al., chapter 2). If no camera finds the Sun, the coarse direction is returned with
@@ -417,7 +417,7 @@ _MOST_CORRELATED = 0.9
 _TUKEY = 4.685
 """Cut-off of Tukey's biweight in standard deviations, 95 % efficient for Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Fraction of the best consensus from which a smaller circle is preferred.
+"""Fraction of the largest consensus that a smaller circle must reach to be preferred.
 
 Stray light enlarges discs, so that a smaller circle is more likely the Sun.
 """

@@ -402,7 +402,7 @@ class _Candidate:
 
     @property
     def possible(self) -> bool:
-        """Whether the streak check did not reject the motion."""
+        """Whether the motion passed the streak check, at least as doubtful."""
         return self.verdict is not StreakVerdict.REJECTED
 
 

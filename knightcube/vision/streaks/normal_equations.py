@@ -150,7 +150,7 @@ class FitWindows:
 def window_areas(pinhole: Pinhole, scene: StreakScene, reach: float) -> FloatArray:
     """Return the approximate number of pixels (n,) within `reach` point-spread widths of each star's path.
 
-    All lines of all strips are as long as the line that a path crosses most obliquely.
+    The strips of all stars are assumed to be as wide, in pixels, as the strip of the most oblique path.
     """
     n, room = len(scene.stars), reach * scene.width
     if n == 0:

@@ -20,7 +20,8 @@ the path by c(t), the counts change by
     dm = c_n n/w^2 m + c_s(t1) e1 - c_s(t0) e0 - (dc_s/ds) m,
 
 where e0 and e1 are the counts per px of path at the two ends. All derivatives are combinations of seven basis
-images, with coefficients for each block. The first moment of m accounts for the change of c_n along a block.
+images, with coefficients for each block. The first moment of the image m along the path accounts for
+derivatives that change along a block.
 
 A spot is a short streak or the slow part of a longer streak. The model of a spot is a sum of Gaussians at
 instants of the exposure (Gauss-Legendre quadrature), each integrated over every pixel. The quadrature is also
@@ -65,7 +66,7 @@ _DIAGONAL = 1.03
 _INSTANTS = 7
 # Lower limit (px per exposure) of speeds by which the code divides.
 _SLOWEST = 1e-3
-# Minimum cosine between a path and the normal of a line beyond the end of the path's part.
+# Lower limit of the cosine between path and line normal, for lines beyond the end of a curved path.
 _MOST_BENT = 0.5
 # Width (px) of the seam between two parts of a straight path.
 _SEAM = 0.003
@@ -166,7 +167,7 @@ def _parts(
         1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_ROTATION)
     )
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # The assignment keeps the end time exact for the comparison below.
+    edges[:, -1] = times[:, 1]  # The comparison below needs the exact end time.
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -422,7 +423,7 @@ IMAGES = 7
 _AT_ONCE = 256
 # Distance from a streak end, in point-spread widths, beyond which the intensity is zero or full.
 _ENDS = 5.5
-# Largest distance along the path, in point-spread widths, of a pixel from the crossing of its line.
+# Largest distance (point-spread widths) along a path from a pixel to the crossing of the pixel's line.
 _OBLIQUE = 7.0
 # Time step of numerical derivatives, in exposures.
 _STEP = 1e-4

@@ -399,8 +399,8 @@ _MOST_IMPROVEMENT = 100.0
 class _PathLight:
     """Sums over the pixels of a streak that give chi-square for any intensity along its path.
 
-    In the sums below, d are the pixel values, w their weights, and g is the point-spread profile across the
-    path.
+    In the sums, d are the pixel values, w the weights of the pixels, and g is the point-spread profile across
+    the path.
 
     Attributes:
         places: (k,) distances along the path from the point of rest, px.
@@ -520,7 +520,7 @@ _END_COMMON = 25.0
 _MOST_LENSES = 3
 # Largest calibration error (standard deviations) at which the lens correction is converged.
 _SMALL_ERROR = 0.2
-# Relative uncertainty of the rotation from the lens above which the lens correction is always tried.
+# Relative uncertainty of the rotation due to lens errors above which a lens correction is always tried.
 _WORTHWHILE = 0.002
 # Ratio of the covariance to the noise covariance above which model errors are the cause (three sigma).
 _BEYOND_NOISE = 9.0
