@@ -1,15 +1,15 @@
 """The guardian: a small process that sets the coils to zero when the control loop's heartbeats stop.
 
-The guardian has its own connection to the I2C bus. It sets the coils to zero from its start until the first
-heartbeat, and 0.3 s after the last heartbeat. While heartbeats are missing, zero is written again every 0.1
-s, to override a late write of the flight process or the effect of a brown-out. When heartbeats return, the
-guardian stops writing. The guardian ignores SIGTERM and SIGINT, and ends only when the flight process says
-goodbye or dies. Neither this module nor its imports use numpy, so that the guardian starts within a few
-hundredths of a second and needs little memory.
+The guardian has its own connection to the I2C bus. The guardian sets the coils to zero from its start until
+the first heartbeat, and 0.3 s after the last heartbeat. While heartbeats are missing, zero is written again
+every 0.1 s, to override a late write of the flight process or the effect of a brown-out. When heartbeats
+return, the guardian stops writing. The guardian ignores SIGTERM and SIGINT, and ends only when the flight
+process says goodbye or dies. Neither this module nor its imports use numpy, so that the guardian starts
+within a few hundredths of a second and needs little memory.
 
-`GuardianLine` runs in the flight process. It starts the guardian before the coils can be energised, sends the
-heartbeats, and replaces a guardian that dies or stops reading. Sending a heartbeat never blocks: a heartbeat
-is one byte, which is dropped if it cannot be written at once.
+`GuardianLine` runs in the flight process. `GuardianLine` starts the guardian before the coils can be
+energised, sends the heartbeats, and replaces a guardian that dies or stops reading. Sending a heartbeat never
+blocks: a heartbeat is one byte, which is dropped if it cannot be written at once.
 
 The flight process starts the guardian by the following command:
 
@@ -106,7 +106,7 @@ class Watch:
 
 
 PRIORITY = 60
-"""SCHED_FIFO priority of the guardian, above the priority of a control loop that may run endlessly."""
+"""SCHED_FIFO priority of the guardian, higher than the priority of the control loop."""
 
 
 class ByteWriter(Protocol):
@@ -301,7 +301,7 @@ class GuardianLine:
         return news
 
     def close(self) -> None:
-        """End the guardian, which sets the coils to zero once more. A second call has no effect."""
+        """End the guardian, which sets the coils to zero once more. A further call has no effect."""
         try:
             self._line.send(BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
             self._process.wait(_END_TIMEOUT_S)
@@ -344,7 +344,7 @@ class GuardianLine:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 # Signals to the process group of the flight must not reach the guardian.
-                # Unlike a session, a stopped group is continued by the kernel when the flight dies.
+                # The kernel continues a stopped process in a separate group when its parent dies.
                 process_group=0,
             )
         except OSError as error:

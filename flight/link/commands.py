@@ -283,7 +283,7 @@ def shown(text: str) -> str:
 
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the pointing target in the fields of a POINT packet, in which a roll of NaN means a free roll.
+    """Return the pointing target in the fields of a POINT packet. A roll of NaN means a free roll angle.
 
     Raises CommandError for fields that do not define a target.
     """
@@ -496,7 +496,7 @@ class Channel(Protocol):
         """Send an answer to a sender that has an address. Never blocks, never raises."""
 
     def close(self) -> None:
-        """Close the channel. A second call has no effect."""
+        """Close the channel. Calling this method again has no effect."""
 
 
 class DatagramChannel:
@@ -514,7 +514,7 @@ class DatagramChannel:
         Args:
             name: name of the channel.
             bound: bound datagram socket, which the channel closes.
-            path: file of a UNIX socket, removed when the channel closes; None for a UDP socket.
+            path: file of a UNIX socket, removed when the channel closes, or None for a UDP socket.
             peers: networks of the accepted senders, None to accept all senders.
         """
         self.name = name

@@ -1,4 +1,4 @@
-"""The table of events, with the severity of each and the reaction to it."""
+"""Table of all events, with the severity of each event and the reaction to each event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transfer frames of telecommands (CCSDS 232.0-B-4) and telemetry (132.0-B-3), and streams of frames.
+"""Transfer frames for telecommands (CCSDS 232.0-B-4) and telemetry (CCSDS 132.0-B-3), and frame streams.
 
 A telecommand frame has a header of 5 bytes, one space packet and a CRC of 2 bytes. All telecommand frames are
 of type BD (bypass, data), which the frame layer neither acknowledges nor retransmits, and have no segment
@@ -9,7 +9,7 @@ with an idle packet. Telecommand and telemetry frames carry the security header 
 (`flight.link.security`).
 
 In a byte stream (serial line, TCP) each frame follows the attached sync marker 1ACFFC1D (CCSDS 131.0-B), in
-both directions. This software does not create CLTUs. A radio that transmits CLTUs must create them.
+both directions. CLTUs are not created by this software. A radio that transmits CLTUs must create the CLTUs.
 """
 
 from __future__ import annotations

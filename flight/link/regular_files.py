@@ -53,7 +53,7 @@ def make_lasting(folder: Path) -> None:
 
 
 def overwrite(path: Path, data: bytes) -> bool:
-    """Overwrite a file in place and sync it to disk. Return whether this succeeded."""
+    """Overwrite a file in place and sync it to disk. Return whether the file was written."""
     try:
         new = not path.exists()
         # Without O_NONBLOCK, opening a FIFO at this path would block.

@@ -285,7 +285,7 @@ class Gate:
         """Accept frames of the given SPIs and restore lost copies of their associations.
 
         If `store_every` is above 1, the counter is stored only once per `store_every` counts. The ground uses
-        this for telemetry.
+        a value above 1 for telemetry.
         """
         self._vault = vault
         self._parse = parse

@@ -50,7 +50,7 @@ _MEANING = {
     errno.EBADF: "the bus has been closed",
     errno.EUSERS: "another flight drives the coils on this bus",
 }
-# After these errors the bus still works, so that the file descriptor is kept.
+# Errors after which the bus still works, so that the device file stays open.
 _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
 
 
@@ -127,7 +127,7 @@ class LinuxI2cBus:
         self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
 
     def close(self) -> None:
-        """Close the bus. A second call has no effect."""
+        """Close the bus. Calling this method again has no effect."""
         self._closed = True
         # The bus is closed even without the lock, because a hung transaction must not delay the exit.
         locked = self._lock.acquire(timeout=self._patience)

@@ -1,7 +1,7 @@
 """Linux serial port through pyserial, with a thread that receives data and records their arrival times.
 
-The same thread reopens a lost port. An adapter that was unplugged and plugged in again gets the same device
-name by a udev rule.
+The receiving thread also reopens a lost port. An adapter that was unplugged and plugged in again gets the
+same device name by a udev rule.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class PySerialPort:
             raise NotResponding(self._device, f"does not take {baud_rate} baud ({error})") from error
 
     def close(self) -> None:
-        """Stop the thread and close the port. A second call has no effect."""
+        """Stop the thread and close the port. Calling this method again has no effect."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -133,7 +133,10 @@ class PySerialPort:
                 self._keep(self._clock.now_ns(), data)
 
     def _open_again(self) -> None:
-        """Try to reopen the port until this succeeds or `close` is called. Runs in the receiving thread."""
+        """Try to reopen the port until this succeeds or `close` is called.
+
+        It runs in the receiving thread.
+        """
         self._serial.close()
         while not self._closing.wait(_REOPEN_S):
             try:

@@ -46,14 +46,14 @@ class ByteBus:
         fcntl.ioctl(self._descriptor, I2C_SMBUS, call)
 
     def close(self) -> None:
-        """Close the adapter. A second call has no effect."""
+        """Close the adapter. Calling this method again has no effect."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
 
 
 def open_bus(where: str) -> ByteBus:
-    """Open the I2C adapter with the device file `where`. The guardian calls this function."""
+    """Open the I2C adapter with the device file `where`. The guardian opens the bus by this function."""
     return ByteBus(where)
 
 

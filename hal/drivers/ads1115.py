@@ -20,7 +20,7 @@ from hal.interfaces.wires import Clock, I2cBus
 
 CONVERSION, CONFIG = 0x00, 0x01
 START = 0x8000
-"""Bit of the Config register. Writing 1 starts a conversion; reading 1 means that no conversion runs."""
+"""Bit of the Config register that starts a conversion if written, and reads 1 if no conversion runs."""
 _SINGLE_ENDED, _MUX_BIT = 0b100, 12
 _RANGE_2_048 = 0b010 << 9
 _SINGLE_SHOT = 1 << 8
@@ -99,7 +99,7 @@ class AdsSolarStrings:
             return self._error
 
     def close(self) -> None:
-        """Stop reading. A second call has no effect."""
+        """Stop reading. Calling this method again has no effect."""
         self._ticker.stop()
 
     def _serve(self) -> None:

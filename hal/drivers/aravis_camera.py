@@ -1,11 +1,11 @@
 """Driver of GenICam cameras (USB3 Vision, GigE Vision) through Aravis, with software-triggered exposures.
 
 Aravis (https://aravisproject.github.io/aravis) is a system library that Python calls by GObject
-introspection. The library is imported only when such a camera is opened.
+introspection. The library is imported only when a GenICam camera is opened.
 
 The exposure is assumed to begin half-way between sending the trigger and receiving its acknowledgement. On
-USB this is accurate to about one millisecond. The camera's own clock is not used, because its offset from the
-host clock is unknown.
+USB the start time is accurate to about one millisecond. The camera's own clock is not used, because its
+offset from the host clock is unknown.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class AravisCamera:
         return None
 
     def close(self) -> None:
-        """Stop and close the camera. Has no effect if the camera is not open."""
+        """Stop and close the camera. The call has no effect if the camera is not open."""
         camera, self._camera, self._stream, self._start_ns = self._camera, None, None, None
         if camera is not None:
             with contextlib.suppress(_glib_error()):  # a lost camera has already stopped

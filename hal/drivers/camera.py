@@ -1,8 +1,8 @@
 """Camera service that operates a slow camera in parallel to the control loop.
 
 Triggering, reading, configuring and reopening a camera can each take milliseconds to seconds. An unanswered
-USB control transfer takes five seconds. A periodic job executes all these operations. The methods `trigger`
-and `poll`, which the control loop calls, only exchange requests and frames with the job.
+USB control transfer takes five seconds. A periodic job executes all slow camera operations. The methods
+`trigger` and `poll`, which the control loop calls, only exchange requests and frames with the job.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class CameraDevice(Protocol):
         """
 
     def close(self) -> None:
-        """Close the camera. Has no effect if the camera is not open."""
+        """Close the camera. The call has no effect if the camera is not open."""
 
 
 class ServedCamera:
@@ -132,7 +132,7 @@ class ServedCamera:
             return frame
 
     def close(self) -> None:
-        """Close the camera. A second call has no effect."""
+        """Close the camera. Calling this method again has no effect."""
         with self._lock:
             if self._closed:
                 return

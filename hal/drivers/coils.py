@@ -2,13 +2,15 @@
 
 Each coil is driven by an H-bridge with two inputs A and B (Sease 2013, Table 5.2, eq. 5.33). A signed count n
 from -4096 to 4096 gives the direction and the duty. For n > 0, input A is high for n/4096 of the PWM period
-and input B is low. For n < 0, the inputs are exchanged. For n = 0, both inputs are low. The time constant L/R
-of a coil (0.1 ms) is far shorter than the PWM period (20 ms), so that the mean current is n/4096 V/R.
+and input B is low. For n < 0, the roles of the inputs A and B are exchanged. For n = 0, both inputs are low.
+The time constant L/R of a coil (0.1 ms) is far shorter than the PWM period (20 ms), so that the mean current
+is n/4096 V/R.
 
-The method `command` stores the newest currents in a mailbox and wakes a periodic job. Only this job and a
-request for zero use the bus. The job writes the newest command and replaces a stale command by zero. While
-zero is requested, the job writes zero in each period. Twice a second the job reads configuration and outputs
-back, and after a brown-out it configures the chip again. After any failure the job tries to write zero.
+The method `command` stores the newest currents in a mailbox and wakes a periodic job. Only the periodic job
+and requests for zero current use the bus. The job writes the newest command and replaces a stale command by
+zero. While zero is requested, the job writes zero in each period. Twice a second the job reads configuration
+and outputs back, and after a brown-out it configures the chip again. After any failure the job tries to write
+zero.
 
 Zero current is written as low level at both inputs of all bridges, because only this message works without a
 configured chip. If a bridge leg is stuck high, low inputs would drive current through the coil, so such a
@@ -112,7 +114,7 @@ class CoilSettings:
             ("tries", self.tries, 1, 5, ""),
             ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
         ):
-            # This form of the condition also rejects NaN.
+            # The condition is written so that it also rejects NaN.
             if not low <= value <= high:
                 raise OutOfRange(DEVICE, quantity, value, low, high, unit)
         used = [channel for coil in self.coils for channel in coil.channels]
@@ -318,7 +320,7 @@ class CoilOutputs:
         return self._clock.now_ns() >= self._check_ns
 
     def is_intact(self) -> bool:
-        """Return whether the chip still has its configuration and outputs. Retries; raises NotResponding."""
+        """Return, with retries, whether the chip has its configuration and outputs. Raises NotResponding."""
         held, kept = self._retried(self._read_back)
         if kept:
             self._postpone_check()
@@ -377,7 +379,7 @@ class CoilOutputs:
         raise AssertionError("tries is at least 1")
 
     def _read_back(self) -> tuple[bool, bool]:
-        """Return whether the chip has its configuration, and whether it has configuration and outputs."""
+        """Return whether the chip has kept its configuration, and whether it has also kept its outputs."""
         held = self._pca.is_configured()
         # Zero is not read back, because zero is written again in each period.
         driven = any(self.written) or any(self.braked)
@@ -398,7 +400,7 @@ class CoilOutputs:
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _record(self, counts: Counts, braked: Axes) -> None:
-        """Record acknowledged counts and brakes. A repeated write of the same values keeps the first time."""
+        """Record acknowledged counts and brakes. Writing the same values again keeps the recorded time."""
         with self._lock:
             if self.written_ns < 0 or (counts, braked) != (self.written, self.braked):
                 self.written, self.braked = counts, braked
@@ -411,7 +413,7 @@ _AXES = "xyz"
 
 
 class PwmTorqueCoils:
-    """Driver of the torque coils. Thread-safe; zero can be requested at any time."""
+    """Driver of the torque coils. All methods are thread-safe."""
 
     def __init__(self, pca: Pca9685, clock: Clock, settings: CoilSettings) -> None:
         self._clock = clock
@@ -524,7 +526,10 @@ class PwmTorqueCoils:
             )
 
     def close(self) -> None:
-        """Stop the job and set the coils to zero. A second call has no effect. The shared bus stays open."""
+        """Stop the job and set the coils to zero, while the shared bus stays open.
+
+        Calling this method again has no effect.
+        """
         with self._mailbox.lock:
             was_running, self._running = self._running, False
             ticker, self._ticker = self._ticker, None
@@ -551,7 +556,7 @@ class PwmTorqueCoils:
         return self._outputs.zero(self._mailbox.braked)
 
     def _serve(self) -> None:
-        """Write the newest request to the chip. This is the periodic job of the driver."""
+        """Write the newest request to the chip. The clock calls this method periodically."""
         with self._wire:
             # The job can be re-entered while it waits, by a signal handler or by simulated time.
             if self._serving or not self._running:

@@ -1,10 +1,10 @@
 """Driver of the INA219 current monitor (TI SBOS448G), which measures the coils' total current and voltage.
 
 The current is computed as shunt voltage divided by shunt resistance. The Calibration register of the chip is
-not used, because a brown-out clears the register. Each conversion averages 128 samples within 68 ms. This is
-not a multiple of the PWM period of 20 ms, so that a single conversion has an error of up to 18 %, and the
-mean of five conversions an error of up to 7 % (both computed in a test). A current outside the measuring
-range is reported as the limit of the range and marked as clipped.
+not used, because a brown-out clears the register. Each conversion averages 128 samples within 68 ms. Because
+68 ms is not a multiple of the PWM period of 20 ms, a single conversion has an error of up to 18 %, and the
+mean of five conversions has an error of up to 7 %. A test computes these errors. A current outside the
+measuring range is reported as the limit of the range and marked as clipped.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ BUS_STEP_V = 4e-3
 CONVERSION_READY = 0b10
 OVERFLOW = 0b01
 
-_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # by the value of the PG bits
+_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # full-scale shunt voltages by the value of the PG bits
 _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
 """Number of consecutive reads with a set ready flag after which the flag is considered stuck."""
 _REACH_NS = 300_000_000
-"""Largest age (ns) of the start of a conversion when it is read.
+"""Largest age (ns) of the start of a conversion at the time of reading.
 
-A conversion of both voltages takes up to 150 ms (136 ms + 10 %), and the result is at most as old when it is
-read.
+A conversion of both voltages takes up to 150 ms (136 ms + 10 %), and its result is read within another 150
+ms.
 """
 
 
@@ -56,7 +56,7 @@ def config_for(range_bits: int) -> int:
 
 
 class Ina219:
-    """Current monitor, read and, at the start and after a brown-out, configured by a periodic job."""
+    """Current monitor that a periodic job reads, and configures at the start and after a brown-out."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class Ina219:
             return self._error
 
     def close(self) -> None:
-        """Stop reading. A second call has no effect."""
+        """Stop reading. Calling this method again has no effect."""
         self._ticker.stop()
 
     def _serve(self) -> None:
@@ -162,7 +162,7 @@ class Ina219:
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]
         current, clipped = signed * SHUNT_STEP_V / self._ohm, abs(signed) >= round(full_scale / SHUNT_STEP_V)
-        if bus & OVERFLOW and not clipped:  # other software has set Calibration
+        if bus & OVERFLOW and not clipped:  # overflow flag, set only if other software has set Calibration
             bound = full_scale / self._ohm
             raise OutOfRange(self.name, "overflow: coil current", current, -bound, bound, "A")
         return (bus >> 3) * BUS_STEP_V, current, clipped

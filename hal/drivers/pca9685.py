@@ -21,7 +21,7 @@ PRE_SCALE = 0xFE
 
 RESTART = 0x80
 AUTO_INCREMENT = 0x20
-EXTERNAL_CLOCK = 0x40  # bit that only a reset clears
+EXTERNAL_CLOCK = 0x40  # external clock bit, which only a reset clears
 SLEEP = 0x10
 TOTEM_POLE = 0x04
 FULL = 0x10  # bit 4 of an ON_H or OFF_H register: on or off for the whole period
@@ -70,7 +70,7 @@ def prescale_for(frequency_hz: float) -> int:
     Raises OutOfRange outside the frequency range of the chip, 24 Hz to 1526 Hz.
     """
     low, high = OSCILLATOR_HZ / (COUNTS * 256), OSCILLATOR_HZ / (COUNTS * 4)
-    # This form of the condition also rejects NaN.
+    # The condition is written so that it also rejects NaN.
     if not low <= frequency_hz <= high:
         raise OutOfRange("pca9685", "PWM frequency", frequency_hz, low, high, "Hz")
     return round(OSCILLATOR_HZ / (COUNTS * frequency_hz)) - 1

@@ -265,7 +265,7 @@ class UbloxReceiver:
     def _set_up(self) -> None:
         """Configure the receiver to send only NAV-PVT.
 
-        Repeated every three seconds until a message arrives.
+        The request is repeated every three seconds.
         """
         now_ns = self._clock.now_ns()
         never = self._parser.frames == 0 and self._requested_ns < 0

@@ -1,13 +1,14 @@
 """Driver of free-running monochrome cameras (Video for Linux 2) with manual exposure.
 
-A free-running camera has no trigger. It exposes frames continuously, and the kernel stamps each frame with
-the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. All other
+A free-running camera has no trigger. The camera exposes frames continuously, and the kernel stamps each frame
+with the monotonic time. A trigger selects the first frame whose exposure begins after the trigger. All other
 frames are returned to the kernel without reading their pixels.
 
 A flag of the kernel driver states whether the time stamp refers to the start of exposure (SOE) or to the end
 of the frame. The kernel driver uvcvideo always sets the flag SOE. Unless the module parameter `hwtimestamps`
 is set, however, uvcvideo stamps the arrival of the first packet of a frame (uvc_video_decode_start), which is
-after the end of the exposure. The setting `Stamp` corrects this.
+after the end of the exposure. The setting `Stamp` can override the meaning of the time stamps that the kernel
+driver states.
 
 `VideoDevice` executes the system calls. A failed call raises OSError with the kernel's errno. The device is
 opened in non-blocking mode, so that no call waits for a frame. The structures and request numbers are those
@@ -102,13 +103,13 @@ class _FormatUnion(ctypes.Union):
 
 
 class Format(ctypes.Structure):
-    """struct v4l2_format."""
+    """Structure v4l2_format of the kernel."""
 
     _fields_ = (("type", ctypes.c_uint32), ("fmt", _FormatUnion))
 
 
 class RequestBuffers(ctypes.Structure):
-    """struct v4l2_requestbuffers."""
+    """Structure v4l2_requestbuffers of the kernel."""
 
     _fields_ = (
         *_words("count type memory capabilities"),
@@ -118,7 +119,7 @@ class RequestBuffers(ctypes.Structure):
 
 
 class TimeValue(ctypes.Structure):
-    """struct timeval."""
+    """Structure timeval of the kernel."""
 
     _fields_ = (("seconds", ctypes.c_long), ("microseconds", ctypes.c_long))
 
@@ -139,7 +140,7 @@ class _BufferUnion(ctypes.Union):
 
 
 class Buffer(ctypes.Structure):
-    """struct v4l2_buffer."""
+    """Structure v4l2_buffer of the kernel."""
 
     _fields_ = (
         *_words("index type bytesused flags field"),
@@ -153,7 +154,7 @@ class Buffer(ctypes.Structure):
 
 
 class Fraction(ctypes.Structure):
-    """struct v4l2_fract."""
+    """Structure v4l2_fract of the kernel."""
 
     _fields_ = (("numerator", ctypes.c_uint32), ("denominator", ctypes.c_uint32))
 
@@ -170,13 +171,13 @@ class StreamParameters(ctypes.Structure):
 
 
 class ControlValue(ctypes.Structure):
-    """struct v4l2_control."""
+    """Structure v4l2_control of the kernel."""
 
     _fields_ = (("id", ctypes.c_uint32), ("value", ctypes.c_int32))
 
 
 class QueryControl(ctypes.Structure):
-    """struct v4l2_queryctrl."""
+    """Structure v4l2_queryctrl of the kernel."""
 
     _fields_ = (
         *_words("id type"),
@@ -363,7 +364,7 @@ class VideoDevice:
     def dequeue(self) -> Filled | None:
         """Return the oldest filled buffer, None if there is none.
 
-        The caller must pass the buffer to `queue`.
+        The caller must requeue it by `queue`.
         """
         buffer = _numbered(0)
         try:
@@ -387,7 +388,7 @@ class VideoDevice:
         return view.astype(kind.newbyteorder("="), order="C")
 
     def close(self) -> None:
-        """Stop streaming and close the device. A second call has no effect."""
+        """Stop streaming and close the device. Calling this method again has no effect."""
         if self._descriptor < 0:
             return
         if self._streaming:
@@ -699,7 +700,7 @@ class V4l2Camera:
         return None
 
     def close(self) -> None:
-        """Stop streaming and close the camera. Has no effect if the camera is not open."""
+        """Stop streaming and close the camera. The call has no effect if the camera is not open."""
         device, self._device = self._device, None
         if device is not None:
             device.close()

@@ -21,7 +21,7 @@ class NotResponding(DeviceError):
 
 @contextmanager
 def answering(device: str) -> Iterator[None]:
-    """Convert an OSError of the bus, raised in the context, into NotResponding of the device."""
+    """Return a context manager that converts an OSError of the bus into NotResponding of the device."""
     try:
         yield
     except OSError as error:

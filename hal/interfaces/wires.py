@@ -40,13 +40,13 @@ class Ticker(Protocol):
         """Run the job as soon as possible, without waiting for the next period."""
 
     def stop(self) -> None:
-        """Stop the job and return when no run is in progress. A second call has no effect."""
+        """Stop the job and return when no run is in progress. Calling this method again has no effect."""
 
 
 class Clock(Protocol):
     """Clock of the flight, with monotonic time in integer nanoseconds.
 
-    All code takes the time from a clock.
+    All modules get the time from a clock.
     """
 
     def now_ns(self) -> int:
@@ -88,7 +88,7 @@ class SerialPort(Protocol):
         """Change the baud rate of the port."""
 
     def close(self) -> None:
-        """Close the port. A second call has no effect."""
+        """Close the port. Calling this method again has no effect."""
 
 
 class I2cBus(Protocol):
@@ -114,7 +114,7 @@ class I2cBus(Protocol):
         """Write at most 32 bytes to consecutive registers of a device."""
 
     def close(self) -> None:
-        """Close the bus. A second call has no effect."""
+        """Close the bus. Calling this method again has no effect."""
 
 
 @dataclass(frozen=True, slots=True)

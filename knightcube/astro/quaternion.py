@@ -1,10 +1,10 @@
 """Quaternion algebra for unit quaternions, scalar last, with the convention v_body = A(q) v_reference.
 
-This is the convention of Sease 2013 and Wertz 1978. Quaternions are multiplied in the order of the attitude
-matrices: A(multiply(p, q)) = A(p) A(q). The attitude matrix is equation 4.8 of Sease 2013 with a correction,
-because the printed lower triangle repeats the upper triangle. The kinematic equation is equation 2.12 of
-Sease 2013 with a corrected sign of the upper left block, which is minus the cross-product matrix. No other
-module contains these formulas.
+The quaternion convention is that of Sease 2013 and Wertz 1978. Quaternions are multiplied in the order of the
+attitude matrices: A(multiply(p, q)) = A(p) A(q). The attitude matrix is equation 4.8 of Sease 2013 with a
+correction, because the printed lower triangle repeats the upper triangle. The kinematic equation is equation
+2.12 of Sease 2013 with a corrected sign of the upper left block, which is minus the cross-product matrix. The
+formulas of quaternion algebra are contained in this module only.
 
 `NED_TO_TESTBED` and `attitude_map` convert between the reference frames of the mission. The y axis of the
 testbed frame T points down along the thread, and the magnetic field points along -z. Magnetic north is the

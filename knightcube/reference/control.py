@@ -14,10 +14,10 @@ error s = e' + l e and the reference acceleration a_r = theta_m'' + l e', the cu
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
 The parameters p are inertia, stiffness, damping and constant torque, each divided by the torque constant. The
-controller converges for any values of these parameters. The reference angle theta_m follows the target
-through a critically damped second-order model, so that the body can follow a step of the target. The
-parameters p are adapted only while the coil is not saturated and |s| exceeds the noise level. They are
-bounded, because noise alone would make them drift.
+adaptive controller converges for any values of the parameters p. The reference angle theta_m follows the
+target through a critically damped second-order model, so that the body can follow a step of the target. The
+parameters p are adapted only while the coil is not saturated and |s| exceeds the noise level. The parameters
+p are also bounded, because noise alone would make the parameters drift.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class AdaptiveSettings:
     Attributes:
         bandwidth: factor l in the composite error s = e' + l e, rad/s; also the gain on s, 1/s.
         adaptation: adaptation gain relative to the square of each parameter's range, s/rad^2.
-        reference_bandwidth: bandwidth of the reference model, rad/s; None to follow the commanded motion
+        reference_bandwidth: bandwidth of the reference model, rad/s, or None to follow the commanded motion
             directly.
         dead_zone: minimum |s| for adaptation of the parameters, rad/s.
     """

@@ -1,7 +1,8 @@
 """Nadir by the methods of Meller et al., chapter 3, for comparison with `knightcube.vision.horizon`.
 
 Edge detection (Meller et al., section 3.1): A scan line is divided by the average of its high intensities and
-rounded to 0 or 1. Short fluctuations are filtered out. The first change from 0 to 1 is the edge.
+rounded to 0 or 1. Short fluctuations along the scan line are filtered out. The first change from 0 to 1 is
+the edge of the horizon.
 
 Circle fit (Meller et al., section 3.2.1): The centre and radius of the horizon circle are computed by a
 pseudo-inverse. The method assumes that the image has no distortion and that the horizon is a circle on the
@@ -9,8 +10,8 @@ flat detector, which is valid near the optical axis only. The paper does not sta
 is scanned; this implementation scans from the darkest border. The paper does not state how to compute nadir
 from the circle of one camera either. Here the point of the circle closest to the optical axis is assumed to
 lie on the limb. Nadir lies in the direction from this point to the centre of the circle, at the angular
-radius of the Earth from the point. Lens distortion is removed first. The method does not distinguish between
-limb and terminator.
+radius of the Earth from the point. The lens distortion is removed before the circle fit. The circle fit does
+not distinguish between limb and terminator.
 
 Graphic Method (Meller et al., section 3.2.2 and Fig. 10): The limb is a circle in the horizon plane, whose
 distance below the satellite follows from the altitude. The plane through the centre column of a camera image
@@ -18,8 +19,8 @@ contains the body's z axis and intersects the horizon plane in a line. The lines
 point Z on the body's z axis. The vector from Z to the centre of the circle gives the angle between the z axis
 and nadir. The paper does not state the ratio of pixels to kilometres. This implementation uses the distance
 of the circle's centre below the optical axis (px), divided by the distance of the horizon plane below the
-satellite (km). For level cameras this ratio is exact to first order in the tilt, and for tilts about an
-optical axis it is exact.
+satellite (km). This scale is exact for tilts about an optical axis, and exact to first order for other tilts
+of level cameras.
 
 Vector Method (Meller et al., section 3.2.2, equation 6): If a point on the horizon moves from Q to P, the
 shortest rotation from Q to P rotates the old nadir to the new nadir. A rotation of the body about P is not
@@ -56,7 +57,7 @@ def high_average(lines: Image) -> FloatArray:
 def binarised(lines: Image, high: FloatArray) -> BoolArray:
     """Return scan lines (n, m) divided by their high averages (n,) and rounded to 0 or 1.
 
-    This is step 1 in section 3.1 of Meller et al.
+    The operation is step 1 in section 3.1 of Meller et al.
     """
     return np.asarray(lines >= 0.5 * np.asarray(high)[:, None])
 
@@ -91,9 +92,9 @@ class HorizonCircle:
 def fit_circle(points: FloatArray) -> HorizonCircle:
     """Return the least-squares circle through points (n, 2), by equations (2) to (5) of Meller et al.
 
-    Each row of the linear system contains a point and the next point, cyclically. For three points the circle
-    is exact. For more points the radius is the RMS distance of the points from the centre. Raises
-    NoCircleError for fewer than three points and for collinear points.
+    Each row of the linear system contains a point and the next point, cyclically. Three points lie exactly on
+    the circle. For more points the radius of the circle is the RMS distance of the points from the centre.
+    Raises NoCircleError for fewer than three points and for collinear points.
     """
     points = np.asarray(points, dtype=float)
     if len(points) < 3:

@@ -6,39 +6,43 @@ guide stars are counted. The candidates with the highest counts are verified wit
 `knightcube.vision.startracker.verification`, which rejects false candidates. If the image scale is uncertain,
 the field is searched at several scales (`ScaledField`).
 
-- Angle matching (Michalski, section 3.2.1; Gottlieb in Wertz 1978, section 7.7): The triangles of the
-brightest
-  observed stars are processed in order of brightness. Two pairs of guide stars with the angles of two sides
-  are joined if they share a star. The joined pairs are a candidate if the third angle matches as well.
-- Triangles by area and polar moment (Michalski, sections 3.2.2 and 3.2.3; Cole & Crassidis 2004, 2006): The
-area of
-  an observed triangle and its propagated standard deviation define a range of areas in the table of guide
-  star triangles. The triangles in this range whose polar moment and side lengths match are candidates. If
-  several triangles match, the sources pivot to a neighbouring triangle, while this implementation tests all
-  of them.
-- Pyramid (Michalski, section 3.2.4; Mortari, Samaan, Bruccoleri & Junkins, Navigation 51, 2004): The
-triangles are
-  ordered so that no observed star occurs in many consecutive triangles, which limits the effect of a false
-  star. A matched triangle becomes a pyramid if the angles between a fourth observed star and all three
-  corners match as well. Only pyramids are candidates, because the fourth star makes chance matches rare.
-- Rate matching (Michalski, section 3.2.5; Samaan, Mortari & Junkins, Recursive mode star identification
-algorithms,
-  IEEE TAES 41, 2005): Two frames, or the ends of streaks, give the velocity of each observed point. A fixed
-  star moves as v' = -w x v, with a body rate w that is common to all stars. Satellites, hot pixels and planes
-  move differently and are excluded. A previous attitude, propagated by the body rate, predicts the position
-  of each star. Without a previous attitude, the pyramid method identifies the remaining points.
-- Geometric voting (Michalski, section 3.2.6; Kolomenkin, Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008):
-For
-  each pair of observed stars, each guide star with a partner at the pair's angle gets one vote for each of
-  the two observed stars. The number of partners is ignored, because otherwise crowded regions of the sky
-  would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments with the most votes
+The methods are:
+
+- Angle matching: The triangles of the brightest observed stars are processed in order of brightness
+  (Michalski, section 3.2.1, and Gottlieb in Wertz 1978, section 7.7). Two pairs of guide stars with the
+  angles of two sides are joined if they share a star. The joined pairs are a candidate if the third angle
+  matches as well.
+
+- Triangles by area and polar moment: The area of an observed triangle and its propagated standard deviation
+  define a range of areas in the table of guide star triangles (Michalski, sections 3.2.2 and 3.2.3, and Cole
+  & Crassidis 2004 and 2006). The triangles in this range whose polar moment and side lengths match are
+  candidates. If several triangles match, the sources pivot to a neighbouring triangle, while this
+  implementation tests all of them.
+
+- Pyramid: The triangles are ordered so that no observed star occurs in many consecutive triangles, which
+  limits the effect of a false star (Michalski, section 3.2.4, and Mortari, Samaan, Bruccoleri & Junkins,
+  Navigation 51, 2004). A matched triangle becomes a pyramid if the angles between a fourth observed star and
+  all three corners match as well. Only pyramids are candidates, because the fourth star makes chance matches
+  rare.
+
+- Rate matching: Two frames, or the ends of streaks, give the velocity of each observed point (Michalski,
+  section 3.2.5, and Samaan, Mortari & Junkins, Recursive mode star identification algorithms, IEEE TAES 41,
+  2005). A fixed star moves as v' = -w x v, with a body rate w that is common to all stars. Satellites, hot
+  pixels and planes move differently and are excluded. A previous attitude, propagated by the body rate,
+  predicts the position of each star. Without a previous attitude, the pyramid method identifies the remaining
+  points.
+
+- Geometric voting: For each pair of observed stars, each guide star with a partner at the pair's angle gets
+  one vote for each of the two observed stars (Michalski, section 3.2.6, and Kolomenkin, Pollak, Shimshoni &
+  Lindenbaum, IEEE TAES 44, 2008). The number of partners is ignored, because otherwise crowded regions of the
+  sky would win the vote if the noise exceeds 0.3 px. In a second vote, the assignments with the most votes
   support each other if the angles between their stars agree. The largest group of consistent assignments is
   the candidate.
-- Grid (Michalski, section 3.2.7; Padgett & Kreutz-Delgado, IEEE TAES 33, 1997): The grid pattern of each
-observed star
-  is compared with the patterns of all guide stars by counting the cells that both patterns occupy. The
-  neighbour that aligns a pattern may be a false star or missing in the catalogue, so that several neighbours
-  are tried.
+
+- Grid: The grid pattern of each observed star is compared with the patterns of all guide stars by counting
+  the cells that both patterns occupy (Michalski, section 3.2.7, and Padgett & Kreutz-Delgado, IEEE TAES 33,
+  1997). The neighbour that aligns a pattern may be a false star or missing in the catalogue, so that several
+  neighbours are tried.
 
 The dictionary `METHODS` contains all methods by name.
 """
@@ -121,7 +125,7 @@ DEFAULT = ClassicalSettings()
 class FieldUnknown(FlightError):
     """Raised if the image scale is too uncertain for the classical methods.
 
-    The default method can solve such a field.
+    The default method can solve a field of uncertain scale.
     """
 
 
@@ -624,7 +628,8 @@ def identify_by_rate(
         field: observed stars.
         sky: guide stars and tables of their patterns.
         settings: settings of the method.
-        motion: motion of the observed points; None treats all points as stars and the attitude as constant.
+        motion: motion of the observed points, or None to treat all points as stars and the attitude as
+            constant.
         previous: previous attitude, None if unknown.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)

@@ -1,10 +1,10 @@
 """Tables for the classical methods of star identification: pairs, triangles and grid patterns of guide stars.
 
 Pair table (Michalski, sections 3.3.1 and 3.3.4, eq. 49-61): A pair consists of two star indices and the angle
-between the stars. The angle is stored as float32, with a rounding error of at most 0.003" below 0.5 rad.
-Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
+between the stars. The angle of a pair is stored as float32, with a rounding error of at most 0.003" below 0.5
+rad. Pairs are sorted by angle and searched with a k-vector, which finds the keys of a range without a binary
 search (Mortari & Neta, K-vector range searching techniques, 2000). A straight line approximates the sorted
-keys. The k-vector stores the number of keys below each of the evenly spaced values of the line. The inverse
+keys. The k-vector contains the number of keys below each of the evenly spaced values of the line. The inverse
 of the line gives the cell of a value, so that two look-ups delimit a range. Ranges are half-open (low <= key
 < high). Unlike equation 61 of Michalski, which returns some additional keys, this implementation compares the
 keys in the two boundary cells and is exact. Equation 54 of Michalski is corrected to 2 delta-epsilon, as in
@@ -12,15 +12,15 @@ the original paper, so that the line ends above the largest key. The fixed margi
 Michalski is replaced by a margin relative to the size of the keys.
 
 Triangle tables: Triangles of the brighter guide stars are described by area and polar moment. Planar
-triangles (Michalski, eq. 35-48; Cole & Crassidis, Fast star-pattern recognition using planar triangles, J.
-Guidance 29, 2006) have chords as sides. Equation 47a of Michalski is corrected to the sides a, b and c. The
-covariance of a direction b is sigma^2 (1 - b b^T) (Michalski, eq. 25). Spherical triangles (Michalski, eq.
-32-34; Cole & Crassidis, Fast star pattern recognition using spherical triangles, AIAA 2004) have great-circle
-arcs as sides. Instead of the recursive subdivision of the source, Gaussian quadrature computes the polar
-moment as the integral of theta^2 over the triangle, where theta is the angle from the mean direction of the
-corners. Each table contains all triangles whose sides fit into one frame, sorted by area with a k-vector. The
-corners of a triangle are ordered by the length of the opposite side, so that matching triangles also have
-matching corners.
+triangles have chords as sides (Michalski, eq. 35-48, and Cole & Crassidis, Fast star-pattern recognition
+using planar triangles, Journal of Guidance, Control, and Dynamics 29, 2006). Equation 47a of Michalski is
+corrected to the sides a, b and c. The covariance of a direction b is sigma^2 (1 - b b^T) (Michalski, eq. 25).
+Spherical triangles have great-circle arcs as sides (Michalski, eq. 32-34, and Cole & Crassidis, Fast star
+pattern recognition using spherical triangles, AIAA 2004). Instead of the recursive subdivision of the source,
+Gaussian quadrature computes the polar moment as the integral of theta^2 over the triangle, where theta is the
+angle from the mean direction of the corners. Each table contains all triangles whose sides fit into one
+frame, sorted by area with a k-vector. The corners of a triangle are ordered by the length of the opposite
+side, so that matching triangles also have matching corners.
 
 Grid table (Padgett & Kreutz-Delgado 1997): The grid pattern of a star is the set of cells occupied by its
 neighbours. The star is the origin of a tangent plane, and the nearest neighbour outside a buffer radius

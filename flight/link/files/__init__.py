@@ -1,1 +1,1 @@
-"""Files over the link: CFDP class 2 (CCSDS 727.0-B-5), both ends, resumed over gaps, kills and restarts."""
+"""File transfers over the link by CFDP class 2 (CCSDS 727.0-B-5), resumed after link gaps and restarts."""

@@ -1,12 +1,13 @@
 """File transfers by CFDP class 2 (CCSDS 727.0-B-5): sender, receiver, and the entity that manages them.
 
-Once a second, the receiver syncs the received data to disk and then stores the record of received ranges.
-After a kill, at most one second of data is requested again. Each EOF is acknowledged, including repeated
-EOFs.
+Once a second, the receiver syncs the received data to disk and then stores the record of received ranges. If
+the process is killed, at most one second of data is requested again. Each EOF is acknowledged, including
+repeated EOFs.
 
-An entity is one end of all file transfers. The caller asks the entity for the next unit whenever a unit can
-be sent. Replies are sent first, followed by units of the open transfers in round-robin order. An entity never
-blocks and gets the time from its caller. State that survives a restart of the process is kept in the store.
+A CFDP entity handles all file transfers at one end of the link. The caller asks the entity for the next unit
+whenever a unit can be sent. Replies are sent first, followed by units of the open transfers in round-robin
+order. An entity never blocks and gets the time from its caller. State that survives a restart of the process
+is kept in the store.
 """
 
 from __future__ import annotations
@@ -493,7 +494,7 @@ class Receiver:
 
     def _place(self) -> None:
         try:
-            self.keep()  # store first, so that a restarted process can move the file
+            self.keep()  # store the record first, so that a restart can move the file
             self.close()
             self._store.place(self.record)
         except FileError as error:

@@ -245,7 +245,7 @@ def _remove(path: Path) -> None:
 
 MOST_ENTRIES = 32
 HIGHEST = 2**63 - 1
-"""Largest number in a stored schedule. As a UTC in ns, this number is in the year 2262."""
+"""Largest number in a stored schedule. If it is a UTC in ns, the time is in the year 2262."""
 _LONGEST_FILE = 1 << 16
 
 _Count = Annotated[int, Meta(ge=0, le=HIGHEST)]
@@ -329,7 +329,7 @@ class Timetable:
         self._store(left, self._now.last)
 
     def forget(self, number: int) -> None:
-        """Remove an entry from memory only. This is used if the disk cannot be written."""
+        """Remove an entry from memory only, for use if the disk cannot be written."""
         left = tuple(entry for entry in self._now.entries if entry.number != number)
         self._now = msgspec.structs.replace(self._now, entries=left)
 
@@ -398,7 +398,7 @@ class Scheduling:
 
         Args:
             directive: directive that adds, deletes or lists scheduled commands.
-            done: report of the directive's completion.
+            done: report to be sent when the directive is completed.
             utc_ns: current UTC, ns since 1970.
         """
         try:

@@ -74,7 +74,7 @@ class LogFollower:
         self._attach(at_end=True)
 
     def folder(self, number: int) -> Path | None:
-        """Return the folder of a run by its number, 0 for the newest run; None if there is no such run."""
+        """Return the folder of a run by its number, or of the newest run for 0, or None if there is none."""
         if number == 0:
             return self._run
         return next((run for run in _runs(self.place) if int(run.name.partition("-")[2]) == number), None)

@@ -126,7 +126,7 @@ class Filing:
 
         Args:
             directive: directive about files.
-            done: report of the directive's completion.
+            done: report to be sent when the directive is completed.
             utc_ns: current UTC, ns since 1970.
             now_ns: current time of the monotonic clock, ns.
         """

@@ -86,7 +86,7 @@ class Line(Protocol):
         """Send frames to all listeners. Never raises."""
 
     def close(self) -> None:
-        """Close the line. A second call has no effect."""
+        """Close the line. Calling this method again has no effect."""
 
 
 class UdpLine:
@@ -494,7 +494,7 @@ class Station:
         self._report(*reports)
 
     def _executed(self, directive: Directive, done: Report) -> list[Report]:
-        """Execute a directive and return the reports due now. The report `done` states its completion."""
+        """Execute a directive and return the reports due now. The report `done` is sent at its completion."""
         match directive:
             case Play():
                 return self._playback.begin(directive, done)

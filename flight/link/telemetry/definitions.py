@@ -77,7 +77,7 @@ def flag(name: str, meaning: str) -> Field:
 class Packet:
     """Definition of a packet: name, application process identifier (APID), rate and fields.
 
-    The text `hazard` states the harm that a telecommand can cause. It is empty for a harmless packet.
+    The text `hazard` states the harm that a telecommand can cause. The text is empty for a harmless packet.
     """
 
     name: str

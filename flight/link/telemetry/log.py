@@ -332,7 +332,7 @@ class FlightLog:
     ) -> None:
         """Begin a new log.
 
-        If `sync_period_ns` is None, fsync is called only at the end of each segment file. This suits a
+        If `sync_period_ns` is None, fsync is called only at the end of each segment file, for example in a
         lock-step simulation, which runs faster than real time. If `patient` is true, a failing disk raises no
         error, and writing is retried. Raises UsageError if the folder contains a log of the same name and
         `overwrite` is false, if the sizes are invalid, or if the folder cannot be written.
@@ -348,7 +348,7 @@ class FlightLog:
         self._queue: deque[bytes] = deque()
         self._refused = 0  # packets lost because the queue was full or the log closed
         self._unwritten = 0  # packets lost after they were queued
-        self._refused_ns = 0  # time of the last such loss
+        self._refused_ns = 0  # time at which `write` last lost a packet
         self._failure = ""  # reason why packets cannot be written now
         self._past_failure = ""
         self._retry_ns = 0
@@ -415,7 +415,7 @@ class FlightLog:
     def close(self) -> None:
         """Write the queue, sync and close the log.
 
-        The call waits at most five seconds for a hung disk. A second call has no effect.
+        The call waits at most five seconds for a hung disk. Calling this method again has no effect.
         """
         if self._closed:
             return
@@ -525,8 +525,7 @@ class Log(Protocol):
 class Recorder:
     """Recorder that packs values into packets, converts clock time to mission time and writes to the logs.
 
-    A record that cannot be packed is lost and counted. It raises no error in the task that called the
-    recorder.
+    A record that cannot be packed is lost and counted. The calling task gets no error.
 
     Attributes:
         epoch_ns: clock time (ns) of mission time zero.
@@ -575,7 +574,7 @@ class Recorder:
             self._performance.write(packed)
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event to the flight log. This method is the sink of `flight.loop.facts.EventLog`."""
+        """Write an event to the flight log. `flight.loop.facts.EventLog` calls this method."""
         packed = self.record(
             EVENT,
             time_ns,

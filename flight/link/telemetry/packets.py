@@ -255,7 +255,7 @@ BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAYO
 _START = re.compile(
     b"|".join(re.escape(i) + b"|" + re.escape(i[:1]) + rb"\Z" for i in BY_IDENTIFIER), re.DOTALL
 )
-_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # sequence flags within their byte
+_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # sequence flags in the third byte of the header
 
 
 def walk(data: bytes) -> Iterator[tuple[Layout, int, int]]:

@@ -44,10 +44,10 @@ IMU_RATE_HZ = 800
 ASCII_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 STANDARD_GRAVITY = 9.80665
 
-# These fields are TimeStartup, Quaternion, AngularRate and Accel of group 1, and Mag of group 3.
+# A packet contains TimeStartup, Quaternion, AngularRate and Accel (group 1) and Mag (group 3).
 OUTPUT_SET = {0: 0x0131, 2: 0x0100}
 _QMR_LENGTH = 137  # length (bytes) of a VNQMR line with a CRC16
-_LINE_LOAD_LIMIT = 0.8  # fraction of the line capacity for output; the rest is for answers
+_LINE_LOAD_LIMIT = 0.8  # largest fraction of the line capacity used by measurements
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +108,7 @@ def check(settings: Vn100Settings, baud_rate: int) -> None:
         raise Refused(DEVICE, f"unit_port = {settings.unit_port}: the unit has serial ports 1 and 2")
 
 
-# The driver retries a command after these transient errors. All other error codes are refusals.
+# Error codes after which a command is sent again; all other error codes are refusals.
 PASSING_ERRORS = frozenset({-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF})
 
 
@@ -491,8 +491,8 @@ class ReadingConverter:
     def _check_step(self, step_ns: int) -> None:
         """Detect a unit that sends samples at a wrong rate, because its rate divisor register was corrupted.
 
-        Lost packets cause time steps that are multiples of the sample period. A corrupted divisor causes
-        other time steps.
+        Lost packets cause time steps that are multiples of the sample period. A corrupted rate divisor causes
+        time steps that are not multiples of the sample period.
         """
         part_ns = step_ns % self._period_ns
         off = min(part_ns, self._period_ns - part_ns) > 500_000_000 // IMU_RATE_HZ
@@ -597,7 +597,7 @@ class Vn100:
         return readings
 
     def link(self) -> ImuLink:
-        """Return the counters of the serial line. Packets and ASCII lines are counted together."""
+        """Return the counters of the serial line. The count `packets` includes ASCII lines."""
         parser = self._parser
         return ImuLink(
             parser.bytes_received,

@@ -11,7 +11,8 @@ bytes, and four digits are a CRC-16/XMODEM. The unit also accepts `XX`, which me
 polynomial 0x07 in section 4.2 of the manual is wrong.
 
 `StreamParser` finds valid packets after or inside corrupted data, because the search continues one byte after
-an invalid candidate. Its computing time and memory are limited by the length of the longest possible packet.
+an invalid candidate. The computing time and memory of `StreamParser` are limited by the length of the longest
+possible packet.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ _INS = (
     ("reserved_11", "68s"), ("reserved_12", "64s"),
 )  # fmt: skip
 
-# The keys are the bits of the groups in the group byte.
+# Tables of the fields of each group, by the bit of the group in the group byte.
 FIELDS: Mapping[int, tuple[tuple[str, str], ...]] = {0: _COMMON, 1: _TIME, 2: _IMU, 4: _ATTITUDE, 5: _INS}
 GROUP_NAMES: Mapping[int, str] = {0: "common", 1: "time", 2: "imu", 4: "attitude", 5: "ins"}
 
@@ -333,8 +334,8 @@ class StreamParser:
 
         Args:
             byte_ns: transmission time of one byte on the serial line, ns.
-            longest: maximum length of a packet, bytes; a small value avoids that noise which looks like the
-                start of a long packet delays the next valid packet.
+            longest: maximum length of a packet, bytes; with a small value, noise that resembles the start of
+                a packet delays the next valid packet less.
         """
         self.byte_ns = byte_ns
         self.bytes_received = 0

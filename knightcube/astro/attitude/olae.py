@@ -10,10 +10,10 @@ The function `solve` computes attitudes with any rotation angle. A sequential ro
 attitude, limits the angle to 120 deg and |g| to 1.74. An error e of b enters the equation as (1 + [g x]) e,
 which is larger than e by a factor of up to sqrt(1 + g^2) and anisotropic, so that the weights 1/sigma^2 are
 not optimal. The difference from the solution of Wahba's problem is of the order of the noise. The returned
-covariance takes this into account.
+covariance is that of the OLAE attitude.
 
-Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, J. Guidance, Control, and Dynamics
-30 (2007).
+Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, Journal of Guidance, Control, and
+Dynamics 30 (2007).
 """
 
 from __future__ import annotations

@@ -3,43 +3,49 @@
 Most solvers (`PROFILE_METHODS`) compute the optimal quaternion from the attitude profile matrix B (3, 3),
 with weights that sum to one. The function `knightcube.astro.attitude.wahba.refine` then corrects the rounding
 errors of B. The default solver is Davenport's q-method, because it has no singularity and no iteration that
-can fail. It is also fast, because LAPACK decomposes a 4 x 4 matrix faster than Python evaluates the
+can fail. The q-method is also fast, because LAPACK decomposes a 4 x 4 matrix faster than Python evaluates the
 closed-form solutions. If the formula of a solver is singular, the reference frame is first rotated by 180 deg
 about one of its axes (sequential rotation).
 
 The function `weighted_fit` solves the least-squares problem with a full covariance matrix per direction.
 
-- Davenport's q-method (Michalski, section 3.4.2, eq. 69-75): The quaternion is the eigenvector of the largest
-  eigenvalue of the matrix K.
-- Singular value decomposition of B (Michalski, eq. 80-84, corrected: the determinants occur only once, in the
-middle):
-  See Markley, Attitude determination using vector observations and the singular value decomposition, J.
-  Astronautical Sciences 36 (1988).
-- QUEST (Michalski, section 3.4.4, eq. 78 and 79): See Shuster and Oh, Three-axis attitude determination from
-vector
-  observations, J. Guidance and Control 4 (1981). The loss of accuracy of Newton's method (Cheng and Shuster,
-  J. Guidance, Control, and Dynamics 37, 2014) is avoided by the Rayleigh quotient.
-- ESOQ2 (Sease, chapter 3, text at eq. 3.23): See Mortari, ESOQ-2 single-point algorithm, Advances in the
-Astronautical
-  Sciences 95 (1997), and Markley and Mortari, Quaternion attitude estimation using vector observations, J.
-  Astronautical Sciences 48 (2000).
-- FOAM (Michalski, section 3.4.6): See Markley, Attitude determination using vector observations: a fast
-optimal matrix
-  algorithm, J. Astronautical Sciences 41 (1993).
-- Predictive filter (Michalski, section 3.4.1, which gives no formula): In each step the filter chooses the
-body rate
-  that minimises the weighted residuals of the directions predicted to first order. For measurements of one
-  time, the steps converge to the solution of Wahba's problem. The filter uses residuals instead of B, which
-  avoids rounding errors. See Crassidis and Markley, J. Guidance, Control, and Dynamics 20 (1997), and Park
-  and Crassidis, Navigation 53 (2006).
-- TRIAD (Michalski, section 3.4.5): The attitude follows from the pair of directions whose covariance has the
-smallest
-  trace, and the first direction of the pair is assumed to be exact. The covariance is that of Shuster and Oh.
-  The result does not minimise the loss.
-- OLAE: See `knightcube.astro.attitude.olae`.
+The solvers are:
+
+- Davenport's q-method: The quaternion is the eigenvector of the largest eigenvalue of the matrix K
+  (Michalski, section 3.4.2, eq. 69-75).
+
+- SVD: The attitude follows from the singular value decomposition of B (Michalski, eq. 80-84, corrected: the
+  determinants occur only once, in the middle). The reference is Markley, Attitude determination using vector
+  observations and the singular value decomposition, Journal of the Astronautical Sciences 36 (1988).
+
+- QUEST: The quaternion follows from the Gibbs vector (Michalski, section 3.4.4, eq. 78 and 79). The reference
+  is Shuster and Oh, Three-axis attitude determination from vector observations, Journal of Guidance and
+  Control 4 (1981). The Rayleigh quotient avoids the loss of accuracy of Newton's method that Cheng and
+  Shuster describe (Journal of Guidance, Control, and Dynamics 37, 2014).
+
+- ESOQ2: The rotation axis follows from cross products (Sease, chapter 3, text at eq. 3.23). The references
+  are Mortari, ESOQ-2 single-point algorithm, Advances in the Astronautical Sciences 95 (1997), and Markley
+  and Mortari, Quaternion attitude estimation using vector observations, Journal of the Astronautical Sciences
+  48 (2000).
+
+- FOAM: The attitude matrix follows from a closed formula (Michalski, section 3.4.6). The reference is
+  Markley, Attitude determination using vector observations: a fast optimal matrix algorithm, Journal of the
+  Astronautical Sciences 41 (1993).
+
+- Predictive filter: In each step the filter chooses the body rate that minimises the weighted residuals of
+  the directions predicted to first order (Michalski, section 3.4.1, without a formula). For measurements of
+  one time, the steps converge to the solution of Wahba's problem. The predictive filter uses residuals
+  instead of B, which avoids rounding errors. The references are Crassidis and Markley, Journal of Guidance,
+  Control, and Dynamics 20 (1997), and Park and Crassidis, Navigation 53 (2006).
+
+- TRIAD: The attitude follows from the pair of directions whose covariance has the smallest trace, and the
+  first direction of the pair is assumed to be exact (Michalski, section 3.4.5). The covariance of the TRIAD
+  attitude is that of Shuster and Oh. The TRIAD attitude does not minimise the loss.
+
+- OLAE: The attitude follows from linear least squares, see `knightcube.astro.attitude.olae`.
 
 The optimal estimate is statistically efficient. The covariance of the difference between the TRIAD or OLAE
-attitude and the optimal attitude is therefore the difference of their covariances.
+attitude and the optimal attitude is therefore the difference between the covariances of the two attitudes.
 """
 
 from __future__ import annotations
@@ -76,7 +82,7 @@ _MAXIMUM_STEPS = 100
 _MINIMUM_SLOPE = 1e-13
 """Minimum product of the differences between the largest eigenvalue of K and the other three eigenvalues.
 
-In a narrow field of view, two of the three differences are of the order of one.
+In a narrow field of view, two of the three eigenvalue differences are of the order of one.
 """
 
 
@@ -191,9 +197,9 @@ def quest(profile: FloatArray) -> FloatArray:
     The matrix is M = l + t - S, with the largest eigenvalue l of K, the trace t of B and S = B + B^T. The
     adjugate of M is used instead of its inverse, so that a rotation by 180 deg causes no division by zero. A
     small determinant of M still causes a loss of accuracy. The reference frame is therefore rotated by 180
-    deg such that the determinant is largest and the remaining rotation smallest. The determinant is
-    proportional to the square of the scalar part. The trace of B would be a cheaper criterion, but it does
-    not depend on the roll angle in a narrow field of view.
+    deg such that the determinant is largest and the remaining rotation smallest. The determinant of M is
+    proportional to the square of the quaternion's scalar part. The trace of B would be a cheaper criterion,
+    but it does not depend on the roll angle in a narrow field of view.
     """
 
     def gibbs_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:

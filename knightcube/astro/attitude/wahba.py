@@ -1,9 +1,9 @@
 """Wahba's problem: the attitude A that best rotates reference directions r into observed directions b.
 
-The loss is half the sum of |b - A r|^2 / sigma^2 (Sease, eq. 3.22 and 3.23; Michalski, eq. 77, corrected).
-Each sigma is the standard deviation of an observed direction per axis, rad. Twice the minimum loss of n
-directions has a chi-square distribution with 2n - 3 degrees of freedom. Equal standard deviations give the
-uniform weights 1/N of Sease 2013.
+The loss is half the sum of |b - A r|^2 / sigma^2 (Sease, eq. 3.22 and 3.23, and Michalski, eq. 77,
+corrected). Each sigma is the standard deviation of an observed direction per axis, rad. Twice the minimum
+loss of n directions has a chi-square distribution with 2n - 3 degrees of freedom. Equal standard deviations
+give the uniform weights 1/N of Sease 2013.
 
 Solvers based on the profile matrix B lose accuracy by rounding. Two directions with a separation of d rad
 change B only by terms of the order d^2, so that the error of the quaternion is the rounding error divided by
@@ -31,13 +31,16 @@ from knightcube.errors import FlightError
 _MINIMUM_SPREAD = 1e-12
 """Determinant of the information matrix below which the directions do not determine an attitude.
 
-This value corresponds to directions that are collinear within about 1e-6 rad.
+The threshold corresponds to directions that are collinear within about 1e-6 rad.
 """
 _UNIT_TOLERANCE = 1e-6
 _EYE = np.eye(3)
 _MAXIMUM_STEPS = 100
 _CONVERGED = 1e-11
-"""Length (rad) of the last Newton step. Each step is at most a tenth of the previous step."""
+"""Length (rad) of a Newton step below which the iteration ends.
+
+The remaining error is smaller, because each step is at most a tenth of the previous step.
+"""
 _ROUNDING = 3e-15
 """Several times the rounding error of the residuals, which limits the smallest meaningful Newton step."""
 _CLOSE_FIT = 1e-2
@@ -109,7 +112,7 @@ def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) ->
         )
     if n < 2:
         raise _on_one_line(n, "observed")
-    # The comparison is also false for NaN.
+    # The comparison is written so that NaN is rejected as well.
     if not (np.minimum.reduce(sigma) > 0.0 and np.vdot(sigma, sigma) < np.inf):
         raise AttitudeError(f"sigma {sigma}: each must be finite and positive, in rad")
     weight = 1.0 / (sigma * sigma)
@@ -166,8 +169,8 @@ def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
     """Return the matrix diagonal (3,) and the quaternion (4,) of a 180 deg rotation about a coordinate axis.
 
     The index `component` is 0, 1 or 2 for the axes x, y and z, and 3 for the identity. The rotation moves
-    this component of a quaternion into the scalar part. If it is the largest component, the remaining
-    rotation is at most 120 deg.
+    this component of a quaternion into the scalar part. If the moved component is the largest component, the
+    remaining rotation is at most 120 deg.
     """
     return _SIGNS[component], _HALF_ROTATIONS[component]
 
@@ -175,8 +178,8 @@ def half_rotation(component: int) -> tuple[FloatArray, FloatArray]:
 def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
     """Return the indices of the two directions that determine the TRIAD attitude most accurately.
 
-    The first direction is the one that TRIAD assumes to be exact. Raises AttitudeError if all directions are
-    collinear in one of the frames.
+    TRIAD assumes that the first direction is exact. Raises AttitudeError if all directions are collinear in
+    one of the frames.
     """
     sines = np.minimum(_squared_sines(seen.observed), _squared_sines(seen.reference))
     squared = sigma**2
@@ -235,7 +238,7 @@ def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
         quaternion: (4,) initial attitude.
     """
     weight = seen.weight[:, None]
-    # This value is of the order of 1/spread^2, where spread (rad) is the angular extent of the directions.
+    # This is of the order of 1/spread^2, where spread (rad) is the angular extent of the directions.
     narrowness = seen.total * float(seen.covariance.trace())
     smallest = max(_CONVERGED**2, _ROUNDING**2 * narrowness)
     for _ in range(_MAXIMUM_STEPS):
@@ -285,7 +288,7 @@ def _check_unit_length(both: FloatArray) -> None:
     """Raise AttitudeError unless both halves (3,) of each row of an array (n, 6) are unit vectors."""
     vectors = both.reshape(-1, 2, 3)
     excess = np.einsum("nij,nij->ni", vectors, vectors) - 1.0
-    # The sum is small if all vectors have unit length. The comparison is also false for NaN.
+    # The sum is small only if all vectors have unit length and no component is NaN.
     if np.vdot(excess, excess) <= (2.0 * _UNIT_TOLERANCE) ** 2:
         return
     right = np.abs(excess) <= 2.0 * _UNIT_TOLERANCE

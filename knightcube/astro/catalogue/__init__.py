@@ -1,8 +1,8 @@
 """Star catalogue: Hipparcos stars to V 8.5 with ICRS positions at J1991.25, proper motions, magnitudes.
 
-The table `hipparcos.npz` is built by `knightcube.astro.catalogue.build`. It contains integers, so that its
-content does not depend on the machine. Right ascension and declination are stored in milliarcseconds (rounded
-by at most 0.71 mas), proper motions in 0.01 mas per year, and magnitudes in 0.01 mag.
+The table `hipparcos.npz` is built by `knightcube.astro.catalogue.build`. The table contains integers, so that
+its content does not depend on the machine. Right ascension and declination are stored in milliarcseconds
+(rounded by at most 0.71 mas), proper motions in 0.01 mas per year, and magnitudes in 0.01 mag.
 
 Directions are in the Hipparcos frame, without parallax (at most 0.75") and aberration (20"). An unresolved
 close pair of stars is one entry with the combined magnitude, as in Hipparcos.

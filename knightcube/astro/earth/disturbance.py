@@ -5,8 +5,9 @@ estimated in flight. The atmosphere rotates with the Earth, and its density in t
 the density at night (Montenbruck & Gill 2000, section 3.5.2: cos^4 of half the angle from an apex 30 deg
 behind the Sun). Each torque is the cross product c x d. The vector c (N m) is a constant of the body: force
 times the lever arm of the centre of pressure. The vector d is the direction of the pressure in body axes,
-times its relative strength and the exposed area. The areas are those of a homogeneous box with the moments of
-inertia of the body. A constant torque in body axes represents all other torques.
+times its relative strength and the exposed area. The exposed areas are those of a homogeneous box with the
+moments of inertia of the body. All other disturbance torques are represented by a constant torque in body
+axes.
 """
 
 from __future__ import annotations
@@ -67,8 +68,8 @@ class Pressures:
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     """Return the pressures along an orbit.
 
-    The strength of the air pressure is about one at an altitude of 500 km. The strength of the light is one
-    in full sunlight.
+    The relative strength of the air pressure is about one at an altitude of 500 km, and that of the sunlight
+    is one in full sunlight.
 
     Args:
         ephemeris: predicted orbit.

@@ -1,6 +1,6 @@
 """Predictions of position, velocity, geomagnetic field and Sun along an orbit.
 
-The function `predict` computes an `Ephemeris` outside the control loop, which takes 0.3 ms per time step.
+The function `predict` computes an `Ephemeris`, which takes 0.3 ms per time step, outside the control loop.
 Positions are interpolated by cubic Hermite polynomials, and the field and the Sun linearly. With steps of 10
 s, the interpolation errors are 1 mm and 3 nT.
 
@@ -142,7 +142,10 @@ _REFERENCE_RADIUS = 6_371_200.0
 _CORRECTION_TIME = 400.0
 """Time constant (s) with which the correction of the dipole to the current field decays."""
 NODE_STEP = 60.0
-"""Time between two nodes, s. The field rotates by 8 deg, and linear interpolation is 0.2 % too weak."""
+"""Time between two nodes, s.
+
+Within this time the field rotates by 8 deg, and its linear interpolation is at most 0.2 % too weak.
+"""
 NODES_PER_CALL = 5
 """Maximum number of nodes that one call adds."""
 LARGEST_JUMP = 50e3

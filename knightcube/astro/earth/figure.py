@@ -7,7 +7,7 @@ import numpy as np
 from knightcube.astro.arrays import FloatArray
 
 GRAVITATIONAL_PARAMETER = 3.986004418e14
-"""Gravitational parameter of the Earth, m^3/s^2 (EGM2008; IERS Conventions 2010, Table 1.1)."""
+"""Gravitational parameter of the Earth, m^3/s^2 (EGM2008, in IERS Conventions 2010, Table 1.1)."""
 EARTH_RADIUS = 6_378_136.6
 """Equatorial radius of the Earth, m (IERS Conventions 2010, Table 1.1)."""
 J2 = 1.0826359e-3

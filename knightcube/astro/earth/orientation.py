@@ -1,9 +1,9 @@
 """Orientation of the Earth: rotations between celestial (ICRS) and terrestrial (ITRS) axes, and time scales.
 
 The precession-nutation model is IAU 2006/2000B, computed by ERFA, with an error of one milliarcsecond. UT1 is
-assumed to equal UTC unless the difference is given. The difference is at most 0.9 s, or 13" of Earth
-rotation. Polar motion (0.3") is neglected. Julian dates are UTC, and TT is 69.184 s ahead of UTC since 2017.
-A Julian date as a double-precision number has a resolution of 40 us, or 0.3 m along a low orbit.
+assumed to equal UTC unless the difference is given. The difference between UT1 and UTC is at most 0.9 s, or
+13" of Earth rotation. Polar motion (0.3") is neglected. Julian dates are UTC, and TT is 69.184 s ahead of UTC
+since 2017. A Julian date as a double-precision number has a resolution of 40 us, or 0.3 m along a low orbit.
 """
 
 from __future__ import annotations

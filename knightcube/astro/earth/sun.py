@@ -60,8 +60,8 @@ def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
 def earth_velocity(julian_date: float) -> FloatArray:
     """Return the Earth's barycentric velocity (3,) in ICRS axes, m/s, at a Julian date TT.
 
-    This velocity causes the annual aberration. The orbital velocity of a satellite in a low orbit (7.6 km/s)
-    causes an additional aberration of 5".
+    The Earth's velocity causes the annual aberration. The orbital velocity of a satellite in a low orbit (7.6
+    km/s) causes an additional aberration of 5".
     """
     return earth_from_sun(julian_date)[1]
 

@@ -92,7 +92,7 @@ def interpixel_response(image: FloatArray, neighbours: int) -> FloatArray:
     """Return the interpixel cornerness: the minimum squared intensity change over all directions.
 
     The minimum is computed for each pair of neighbouring diameters (Sease, eq. 3.11-3.13, corrected). For
-    four neighbours this equals eq. 3.11 with the smaller of B1 and B2 as B.
+    four neighbours, the minimum equals Sease, eq. 3.11, with the smaller of B1 and B2 as B.
     """
     ring = _changes(image, neighbours)
     # The neighbour of the last diameter is the first diameter with exchanged ends.

@@ -3,10 +3,11 @@
 The order of the two ends of a streak is initially unknown. All stars rotate about a common axis a, so that
 a.(v2 - v1) = 0 for the end directions v1 and v2 of each streak. The axis, except for its sign, is the
 direction that is most nearly perpendicular to all chords v2 - v1. The sign of a.(v1 x v2) then determines the
-order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike the projected centre of rotation, this formulation
-has no singularity. OLAE computes the rotation, and a median-based scale of the residuals rejects outliers.
-The "Combined Indicator" of Sease uses the standard deviation instead, which outliers increase. A single frame
-cannot distinguish omega from -omega, so that a prior rate must decide.
+order of the ends (Sease, eq. 3.17-3.19, corrected). Unlike a computation with the projected centre of
+rotation, the computation with vectors has no singularity. OLAE computes the rotation, and a median-based
+scale of the residuals rejects outliers. The "Combined Indicator" of Sease uses the standard deviation
+instead, which outliers increase. A single frame cannot distinguish omega from -omega, so that a prior rate
+must decide.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from knightcube.vision.objects.streak_ends import (
 )
 from knightcube.vision.streaks.streak_result import StreakStatus, admit, in_time, validate
 
-# Pairs of this number of the strongest streaks are used to propose rotation axes.
+# Number of the strongest streaks, whose pairs are used to propose rotation axes.
 _MOST_PROPOSERS = 24
 _PARALLEL = 1e-12
-# A rotation is accepted if at least this fraction of the measured streaks agrees with it.
+# Minimum fraction of the measured streaks that must agree with the rotation.
 _LEAST_AGREEMENT = 0.5
-# The robust scale of the residuals, relative to the expected errors, is at least this value.
+# Lower limit of the robust scale of the residuals, relative to the expected errors.
 _LEAST_SCALE = 0.3
 _MOST_ROUNDS = 10
 
@@ -57,11 +58,10 @@ def estimate_rate(
         pinhole: model of the camera.
         exposure: exposure time, s.
         settings: settings of the estimation.
-        prior_rate: (3,) prior body rate in camera axes, rad/s, which determines only the sense of rotation;
-            None if unknown.
+        prior_rate: (3,) prior body rate in camera axes, rad/s, which determines only the sense of rotation,
+            or None if unknown.
         prior_sigma: standard deviation of each component of the prior rate, rad/s.
-        previous_checksum: checksum of the previous frame, by which a frozen camera is detected; None if there
-            is none.
+        previous_checksum: checksum of the previous frame, by which a frozen camera is detected, or None.
 
     Raises FlightError for an invalid frame, exposure or prior. The status of the result states why a frame
     has no rate.
@@ -129,9 +129,9 @@ def rotation_axis(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the rotation axis (3,) with which most streaks agree, and flags (n,) of the agreeing streaks.
 
-    The sign of the axis is arbitrary. Each pair of streaks defines an axis. The axis with the best agreement
-    is refined by least squares over the streaks that agree. Up to about half of the streaks may be outliers.
-    The result is deterministic.
+    The sign of the axis is arbitrary. Each pair of streaks defines an axis. The axis with which most streaks
+    agree is refined by least squares over the streaks that agree. Up to about half of the streaks may be
+    outliers. The result is deterministic.
 
     Args:
         first: (n, 3) unit vectors to one end of each streak, strongest streak first.
@@ -304,8 +304,8 @@ def _covariance(
 
     The variances along and across the streaks are estimated separately from the residuals. Each variance is
     multiplied by nu/(nu - 2), with nu degrees of freedom, to allow for its uncertainty (Student's t
-    distribution). The bias of the detector does not affect the residuals. Its uncertainty
-    `endpoint_bias_sigma` is therefore added.
+    distribution). The bias of the detector does not affect the residuals, so that the uncertainty
+    `endpoint_bias_sigma` of the bias is added.
     """
     weights = 1.0 / errors**2
     cross = cross_matrices(solution.sums)

@@ -53,13 +53,14 @@ class StreakSettings(EndpointSettings):
 
 _OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
     # The endpoint biases for point spreads of 0.7 and 1.5 px are -0.14 and 0.40 px with Harris's detector.
-    # They are 0.34 and 0.71 px with the minimum eigenvalue.
-    # They are 1.23 and 1.68 px with Trajkovic-4, and 0.93 and 1.24 px with Trajkovic-8.
+    # With the minimum eigenvalue, the endpoint biases for 0.7 and 1.5 px are 0.34 and 0.71 px.
+    # The endpoint biases for 0.7 and 1.5 px are 1.23 and 1.68 px with Trajkovic-4.
+    # The endpoint biases for 0.7 and 1.5 px are 0.93 and 1.24 px with Trajkovic-8.
     "harris": {},
     # The minimum eigenvalue grows with brightness squared, Harris's response with its fourth power.
     "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},
     # With four neighbours, all pixels of a diagonal streak are detected as corners.
-    # Smoothing and a high threshold suppress these detections, but also half of the streak ends.
+    # Smoothing and a high threshold suppress false corners, but also half of the streak ends.
     "trajkovic-4": {
         "smoothing_sigma": 1.0,
         "peak_relative": 0.4,

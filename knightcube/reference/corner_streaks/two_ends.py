@@ -37,7 +37,7 @@ from knightcube.vision.startracker.solve import (
     solve_places,
 )
 
-# This is the minimum error (px) of an endpoint; smaller residuals are a chance agreement of few streaks.
+# Minimum assumed error (px) of an endpoint, because small residuals of few streaks can be due to chance.
 _LEAST_SIGMA_PX = 0.02
 
 
