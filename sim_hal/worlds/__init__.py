@@ -1,1 +1,1 @@
-"""The physical world that the devices measure and act on."""
+"""Simulated physical worlds, which the emulated devices measure and act on."""

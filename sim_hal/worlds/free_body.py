@@ -1,20 +1,23 @@
-"""A free body in low Earth orbit: the craft of one seed, moved by its coils and by all disturbances.
+"""A free body in low Earth orbit, rotated by its coils and by the disturbance torques.
 
-The flight software assumes nominal values; the true values of the craft differ from them as a built satellite
-differs from its drawing. Loads are the coils, the residual dipole, gravity gradient, air and sunlight.
+The flight software assumes nominal properties of the craft. The true properties differ from them by random
+errors drawn from one seed, as a built satellite differs from its drawing. The torques on the body come from
+the coils, the residual dipole, the gravity gradient, air drag and sunlight.
 
-- Air: F = -1/2 rho C_D A (n . v) v on faces that meet the flow (Wertz 1978, 17.61, with C_D 2.2).
-- Sunlight: F = -P A cos(theta) ((1 - e) s + 2 e cos(theta) n) (Montenbruck & Gill 2000, 3.73).
-- Shading of one face by another is not modelled; for a box this is exact.
+- The air exerts F = -1/2 rho C_D A (n . v) v on the faces that meet the flow (Wertz 1978, eq. 17.61, with C_D
+  = 2.2).
+- Sunlight exerts F = -P A cos(theta) ((1 - e) s + 2 e cos(theta) n) on the lit faces (Montenbruck & Gill
+  2000, eq. 3.73).
+- Shading of one face by another is not modelled, because a box has none.
 
-The rotation follows Euler's equations in principal axes, by classical Runge-Kutta. The torques that turn with
-the body within a step are evaluated in every stage: a dipole in the field, and the gravity gradient (Wertz
-1978, 17.28). At |w| dt = 0.01 the error of a step is 1e-13 rad. The code uses plain floats, because for three
-components numpy takes ten times as long.
+Euler's equations are integrated in principal axes by the classical Runge-Kutta method. Every stage evaluates
+the torques that depend on the attitude, which are those of the dipole in the field and of the gravity
+gradient (Wertz 1978, eq. 17.28). With |w| dt = 0.01 the error of one step is 1e-13 rad. The code uses plain
+floats, because for three components numpy takes ten times as long.
 
-The rotation is integrated when the state is read or when the currents change; the result depends on the times
-of reading by less than a microradian. Torques of air and sunlight and the residual dipole are held in body
-axes for 0.1 s.
+The rotation is integrated when the state is read and when the currents change. The times at which the state
+is read change the result by less than a microradian. The torques of air and sunlight and the residual dipole
+are constant in body axes for 0.1 s at a time.
 """
 
 from __future__ import annotations
@@ -39,21 +42,21 @@ from sim_hal.worlds.orbit import Environment, air_flow, elements, julian_date
 from sim_hal.worlds.world import BodyMotion, Floats, OrbitEnvironment, OrbitTruth, WorldInputs, WorldTruth
 
 State = tuple[float, float, float, float, float, float, float]
-"""Quaternion of the principal axes, scalar last, and rate about them (rad/s)."""
+"""Attitude quaternion of the principal axes (scalar last), followed by the rate about these axes (rad/s)."""
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
 TURN_PER_STEP = 0.01
-"""Largest rotation in one step (rad)."""
+"""Largest rotation (rad) of the body in one integration step."""
 
 
 class Loads(NamedTuple):
     """The loads on the body during a step.
 
     Attributes:
-        dipole: (3,) A m^2, principal axes.
-        pull: (3,) the position times sqrt(3 mu / r^5), rad/s, inertial axes.
-        torque: (3,) N m, principal axes.
+        dipole: magnetic dipole (3,) of the body, A m^2, principal axes.
+        pull: position (3,) times sqrt(3 mu / r^5), rad/s, inertial axes, for the gravity gradient.
+        torque: torque (3,) of air and sunlight, N m, principal axes.
     """
 
     dipole: Floats
@@ -62,7 +65,7 @@ class Loads(NamedTuple):
 
 
 class Rotation:
-    """Steps the rotation of a body with moments of inertia `inertia` (3,) kg m^2."""
+    """Integrator of the rotation of a body with principal moments of inertia `inertia` (3,), kg m^2."""
 
     def __init__(self, inertia: Floats) -> None:
         a, b, c = inertia
@@ -71,7 +74,10 @@ class Rotation:
         self._of_torques = (1.0 / a, 1.0 / b, 1.0 / c)
 
     def step(self, state: State, dt: float, begin: Floats, end: Floats, loads: Loads) -> State:
-        """Return the state after `dt` s; the field changes from `begin` to `end` (3,) T, inertial axes."""
+        """Return the state after `dt` s.
+
+        The magnetic field changes from `begin` to `end` (3,), T, inertial axes.
+        """
         middle = 0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1]), 0.5 * (begin[2] + end[2])
         half = 0.5 * dt
         first = self._slope(state, begin, loads)
@@ -94,7 +100,7 @@ class Rotation:
         return q1 * unit, q2 * unit, q3 * unit, q4 * unit, w1, w2, w3
 
     def _slope(self, state: State, field: Floats, loads: Loads) -> State:
-        """Return the derivative of the state in `field` (3,) T, inertial axes."""
+        """Return the time derivative of the state in a magnetic field (3,), T, inertial axes."""
         q1, q2, q3, q4, w1, w2, w3 = state
         (mx, my, mz), pull, (tx, ty, tz) = loads
         a11, a12, a13, a21, a22, a23, a31, a32, a33 = matrix(q1, q2, q3, q4)
@@ -104,7 +110,7 @@ class Rotation:
         gx, gy, gz = a11 * x + a12 * y + a13 * z, a21 * x + a22 * y + a23 * z, a31 * x + a32 * y + a33 * z
         i1, i2, i3 = self._of_torques
         k1, k2, k3 = self._of_rates
-        # r x (J r) has the same products and differences of inertia as w x (J w).
+        # The gravity-gradient term r x (J r) has the same factors as the gyroscopic term w x (J w).
         return (
             0.5 * (w3 * q2 - w2 * q3 + w1 * q4),
             0.5 * (w1 * q3 - w3 * q1 + w2 * q4),
@@ -132,7 +138,7 @@ def _moved(state: State, slope: State, dt: float) -> State:
 
 
 def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
-    """Return the attitude matrix of a quaternion, row by row (`knightcube.astro.quaternion`, as floats)."""
+    """Return the attitude matrix of a quaternion as nine floats, row by row."""
     r11, r22, r33, r44 = q1 * q1, q2 * q2, q3 * q3, q4 * q4
     r12, r13, r14, r23, r24, r34 = q1 * q2, q1 * q3, q1 * q4, q2 * q3, q2 * q4, q3 * q4
     return (
@@ -149,39 +155,41 @@ def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
 
 
 def turned(turn: Matrix, vector: Floats) -> Floats:
-    """Return the product of a matrix and a vector."""
+    """Return the product of a 3 x 3 matrix and a vector."""
     a, b, c, d, e, f, g, h, i = turn
     x, y, z = vector
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
 
 
 def steps_within(span: float, rate: float, longest: float) -> int:
-    """Return the number of steps for `span` s at `rate` rad/s; no step is longer than `longest` s."""
+    """Return the number of steps of at most `longest` s for `span` s at a rotation rate of `rate` rad/s."""
     return max(1, math.ceil(span / longest - 1e-9), math.ceil(span * rate / TURN_PER_STEP))
 
 
 CRAFTS = {
-    # Sease 2013 Table 5.1 with its exponent corrected; 80 turns of 0.0081 m^2.
+    # The inertia is from Sease 2013, Table 5.1 (exponent corrected); a coil has 80 turns of 0.0081 m^2.
     "knightcube": CraftSection(
         inertia=(1.10e-3, 1.05e-3, 0.99e-3), size=(0.1, 0.1, 0.1), dipole_per_ampere=0.648
     ),
-    # Assumed: 4 kg; 0.2 A m^2 at 58.8 mA, 5 W/(A m^2)^2 with coils of 57.8 ohm.
+    # This craft is assumed to have 4 kg and coils of 57.8 ohm with 0.2 A m^2 at 58.8 mA, or 5 W/(A m^2)^2.
     "cubesat_3u": CraftSection(inertia=(0.0066, 0.0333, 0.0333), size=(0.3, 0.1, 0.1), dipole_per_ampere=3.4),
 }
 
 PRESSURE_ARM = 0.02
-"""Distance (m) from centre of mass to centre of pressure: the limit of the CubeSat standard."""
+"""Largest distance (m) from the centre of mass to the centre of pressure that the CubeSat standard allows."""
 CONSTANT_DIPOLE, SUNLIT_DIPOLE, WALKING_DIPOLE = 1e-3, 3e-4, 5e-5
-"""Worst case (A m^2) of each part of the residual dipole; for the random walk its standard deviation."""
+"""Largest constant and sunlit residual dipole, and standard deviation of its random walk (A m^2)."""
 _REFLECTED = (0.1, 0.6)
-"""Bounds of the fraction of sunlight that a face reflects specularly."""
+"""Lower and upper bound of the fraction of sunlight that a face reflects specularly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Face:
-    """A flat face: outward `normal`, and `arm` (m) from the centre of mass to its centre, body axes.
+    """A flat face of the craft.
 
-    `area` is in m^2. `mirrored` is the fraction of sunlight reflected specularly; the rest is absorbed.
+    `normal` is the outward normal and `arm` (m) the vector from the centre of mass to the centre of the face,
+    both in body axes. `area` is in m^2. `mirrored` is the fraction of sunlight that is reflected specularly;
+    the remaining light is absorbed.
     """
 
     normal: tuple[float, float, float]
@@ -195,13 +203,14 @@ class TrueCraft:
     """The true properties of a craft.
 
     Attributes:
-        inertia: (3,) kg m^2, of the principal axes.
-        to_principal: (4,) body axes into principal axes.
-        faces: of the box.
-        coil_dipole: (3, 3) m^2, currents to dipole in body axes.
-        constant_dipole: (3,) A m^2, body axes.
-        sunlit_dipole: (3,) A m^2, body axes, at one astronomical unit.
-        walking_dipole: A m^2, standard deviation of each axis.
+        inertia: principal moments of inertia (3,), kg m^2.
+        to_principal: quaternion (4,) from body axes to principal axes.
+        faces: faces of the craft's box.
+        coil_dipole: matrix (3, 3), m^2, that maps coil currents to the dipole in body axes.
+        constant_dipole: constant part (3,) of the residual dipole, A m^2, body axes.
+        sunlit_dipole: part (3,) of the residual dipole that sunlight at one astronomical unit causes, A m^2,
+            body axes.
+        walking_dipole: standard deviation of the residual dipole's random walk on each axis, A m^2.
     """
 
     inertia: tuple[float, float, float]
@@ -214,9 +223,10 @@ class TrueCraft:
 
 
 def build(section: CraftSection, disturbances: Disturbances, generator: np.random.Generator) -> TrueCraft:
-    """Return the craft of one seed.
+    """Return the craft with random errors from one seed.
 
-    The number of draws does not depend on the multiples, so a seed's directions are the same at 0.1 and 1.
+    The number of random draws does not depend on the disturbance multiples, so the random directions of a
+    seed are the same for every multiple.
     """
     widest = math.radians(disturbances.principal_turn_deg)
     turn = generator.uniform(widest / 3.0, widest) * _direction(generator)
@@ -231,7 +241,7 @@ def build(section: CraftSection, disturbances: Disturbances, generator: np.rando
         inertia=section.inertia,
         to_principal=quaternion.from_rotation_vector(turn),
         faces=box(section.size, arm, mirrored),
-        # Each column is the axis of a coil, tilted and then scaled.
+        # Each column is the tilted axis of a coil times the coil's dipole per ampere.
         coil_dipole=section.dipole_per_ampere * scale * tilt / np.linalg.norm(tilt, axis=0),
         constant_dipole=worst * CONSTANT_DIPOLE * constant,
         sunlit_dipole=worst * SUNLIT_DIPOLE * sunlit,
@@ -240,7 +250,10 @@ def build(section: CraftSection, disturbances: Disturbances, generator: np.rando
 
 
 def box(size: tuple[float, float, float], arm: FloatArray, mirrored: FloatArray) -> tuple[Face, ...]:
-    """Return the six faces of a box of `size` m; `arm` (3,) m leads from the centre of mass to its centre."""
+    """Return the six faces of a box of `size` m.
+
+    `arm` (3,), m, is the vector from the centre of mass to the centre of the box.
+    """
     faces = []
     for index in range(6):
         axis, sign = index // 2, 1.0 - 2.0 * (index % 2)
@@ -267,10 +280,10 @@ ZERO: Floats = (0.0, 0.0, 0.0)
 
 
 def air_torque(faces: Sequence[Face], flow: Floats, density: float) -> Floats:
-    """Return the torque (3,) N m, body axes; `flow` is the velocity through the air, m/s, body axes."""
+    """Return the drag torque (3,), N m, at the velocity `flow` through the air, m/s, both in body axes."""
     vx, vy, vz = flow
     half = 0.5 * DRAG_COEFFICIENT * density
-    # All forces have the direction of the flow, so their arms add up before one cross product.
+    # All drag forces have the direction of the flow, so the arms are summed before one cross product.
     x = y = z = 0.0
     for face in faces:
         nx, ny, nz = face.normal
@@ -285,7 +298,10 @@ def air_torque(faces: Sequence[Face], flow: Floats, density: float) -> Floats:
 
 
 def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
-    """Return the torque (3,) N m, body axes; `sun` (3,) is a direction, `light` is relative to 1 au."""
+    """Return the torque (3,) of sunlight, N m, body axes.
+
+    `sun` (3,) is the direction to the Sun in body axes. `light` is the sunlight relative to that at 1 au.
+    """
     if light <= 0.0:
         return ZERO
     sx, sy, sz = sun
@@ -305,7 +321,7 @@ def sunlight_torque(faces: Sequence[Face], sun: Floats, light: float) -> Floats:
 
 
 class LoadModel:
-    """The loads of one craft; `multiples` scale the worst cases of its disturbances."""
+    """Model of the dipoles and torques of one craft; `multiples` scale its worst-case disturbances."""
 
     def __init__(self, craft: TrueCraft, multiples: Disturbances) -> None:
         self._faces = craft.faces
@@ -324,20 +340,23 @@ class LoadModel:
         return turned(self._coils, currents)
 
     def residual_dipole(self, around: OrbitEnvironment) -> Floats:
-        """Return the residual dipole (3,) A m^2."""
+        """Return the residual dipole (3,), A m^2, body axes."""
         light, walking = around.light, self._walking
         (a, b, c), (d, e, f), (x, y, z) = self._constant, self._sunlit, around.walk
         return a + light * d + walking * x, b + light * e + walking * y, c + light * f + walking * z
 
     def pull(self, position: Floats) -> Floats:
-        """Return `Loads.pull` (3,), rad/s, at a position (3,) m."""
+        """Return the gravity-gradient vector `Loads.pull` (3,), rad/s, at a position (3,), m."""
         x, y, z = position
         squared = x * x + y * y + z * z
         scale = self._gradient / (squared * math.sqrt(math.sqrt(squared)))
         return scale * x, scale * y, scale * z
 
     def pressures(self, around: OrbitEnvironment, to_body: Matrix) -> tuple[Floats, Floats]:
-        """Return the torques (3,) N m of air and sunlight; `to_body` turns ICRS into body axes."""
+        """Return the torques (3,) of air and sunlight, N m, body axes.
+
+        The matrix `to_body` rotates ICRS into body axes.
+        """
         flow = turned(to_body, air_flow(around))
         drag = air_torque(self._faces, flow, self._drag * around.density)
         light = self._sunlight * around.light
@@ -348,18 +367,18 @@ _STREAM = 0xF4EE
 
 
 def generators(seed: int) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
-    """Return the generators of the craft's errors, of the release, and of air, storms and walks."""
+    """Return the random generators for the craft's errors, for the release, and for the environment."""
     errors, tip_off, weather = (np.random.default_rng([seed, _STREAM, stream]) for stream in range(3))
     return errors, tip_off, weather
 
 
 LONGEST_STEP = 0.1
-"""Longest step (s), during which air, sunlight and residual dipole are held at their mid-step values."""
+"""Longest integration step (s), during which air, sunlight and residual dipole keep their mid-step values."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoilSupply:
-    """Resistance (3,) of the coils, ohm, and their supply voltage."""
+    """Resistance (3,), ohm, and supply voltage (V) of the coils."""
 
     resistance: tuple[float, float, float]
     voltage: float
@@ -380,7 +399,7 @@ class FreeBody:
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,
     ) -> None:
-        """Hold the body still until it is released; `utc` labels `start_ns`."""
+        """Hold the body still until it is released; `utc` is the UTC at `start_ns`."""
         errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
         self.craft = built_craft(section, errors)
@@ -403,7 +422,7 @@ class FreeBody:
         self._read: tuple[State, BodyMotion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
-        # The state is that of `_done_ns`; from then to `time_ns` the currents `_acting` flow.
+        # The state is valid at `_done_ns`, and from then to `time_ns` the coil currents are `_acting`.
         self._done_ns = self.time_ns = start_ns
         self._pull, self._field = self._gravity_and_field(0.0)
         self.energy = 0.0
@@ -414,7 +433,7 @@ class FreeBody:
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance to `time_ns` under the present currents."""
+        """Advance the world to `time_ns` under the present coil currents."""
         if time_ns <= self.time_ns:
             return
         x, y, z = self._currents().tolist()
@@ -424,7 +443,7 @@ class FreeBody:
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion; in free fall the specific force is zero."""
+        """Advance to `time_ns` and return the motion, whose specific force is zero in free fall."""
         self.advance_to(time_ns)
         self._integrate()
         state, motion = self._read
@@ -436,24 +455,25 @@ class FreeBody:
                 field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
                 specific_force_body=np.zeros(3),
             )
-            self._read = self._state, motion  # truth recorder and inertial unit read at the same times
+            # The truth recorder and the inertial unit read the motion at the same times.
+            self._read = self._state, motion
         return motion
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return the environment of the craft at the present state."""
+        """Return the environment of the craft at the present time."""
         return self.environment.at(self._seconds(self.time_ns))
 
     def utc_ns(self) -> int:
-        """Return UTC of the present state, ns since 1970."""
+        """Return the present UTC, ns since 1970."""
         return self._utc_start_ns + self.time_ns
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the present state."""
+        """Return the present coil currents and the energies so far."""
         self._integrate()
         return WorldTruth(np.array(self._acting), self.energy, self.supply_energy)
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the whole present state."""
+        """Return the present state of body, orbit and environment."""
         self._integrate()
         around, state, acting = self.surroundings(), self._state, self._acting
         return OrbitTruth(
@@ -473,7 +493,7 @@ class FreeBody:
         )
 
     def _torques(self, around: OrbitEnvironment, state: State, acting: Floats) -> dict[str, FloatArray]:
-        """Return the torques (3,) N m, body axes, by `CAUSES`."""
+        """Return the torque (3,), N m, body axes, of each cause in `CAUSES`."""
         turn = matrix(*state[:4])
         attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
         to_body = matrix(*attitude.tolist())
@@ -491,7 +511,7 @@ class FreeBody:
         }
 
     def _integrate(self) -> None:
-        """Bring the state to `time_ns`."""
+        """Integrate the state up to `time_ns`."""
         if self._held:
             if self.time_ns < self._release_ns:
                 self._done_ns = self.time_ns
@@ -529,7 +549,10 @@ class FreeBody:
         self._pull, self._field = pull, field
 
     def _renew(self, time: float, middle: float) -> None:
-        """Evaluate the loads that are held in body axes at `middle` s, at the attitude predicted for then."""
+        """Evaluate the torques of air and sunlight and the residual dipole for the time `middle` s.
+
+        The attitude is extrapolated to that time.
+        """
         around = self.environment.at(middle)
         ahead = (middle - time) * np.array(turned(self._to_body, self._state[4:]))
         turn = quaternion.multiply(quaternion.from_rotation_vector(ahead), self._attitude())
@@ -549,7 +572,7 @@ class FreeBody:
 
 
 def released(tip_off: TipOff, generator: np.random.Generator) -> tuple[FloatArray, Floats]:
-    """Return the attitude (4,) of the release, ICRS into body, and its rate (3,) rad/s, body axes."""
+    """Return the attitude (4,), ICRS into body, and the rate (3,), rad/s, body axes, at release."""
     attitude = quaternion.normalise(generator.standard_normal(4))
     axis = generator.standard_normal(3)
     if tip_off.attitude is not None:
@@ -567,13 +590,16 @@ def built_craft(section: FreeBodySection, errors: np.random.Generator) -> TrueCr
 
 
 def coil_supply(inputs: WorldInputs) -> CoilSupply:
-    """Return the true supply of the coils of a configuration."""
+    """Return the true resistance and supply voltage of the coils of a configuration."""
     coils, truth = inputs.config.coils, inputs.section.truth
     return CoilSupply(truth.resistance or coils.resistance, truth.supply_voltage or coils.supply_voltage)
 
 
 def make(inputs: WorldInputs) -> FreeBody:
-    """Return the free body of a configuration. Raises ConfigError without its section."""
+    """Return the free body of a configuration.
+
+    Raises ConfigError if the section `simulation.free_body` is missing.
+    """
     section, currents = inputs.section, inputs.currents
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: the world free_body needs it")

@@ -1,13 +1,15 @@
 """The Earth's true magnetic field: the International Geomagnetic Reference Field, 14th generation (IGRF-14).
 
-Spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49, eq. 1; coefficients of 2024,
-doi 10.5281/zenodo.14012302), linear in time between epochs. The flight software uses another model
-(`knightcube.astro.earth.geomagnetism`), so that it has a realistic model error. The field of the ring current
-is added by `ring_current`; currents in the ionosphere are not modelled.
+The field is an expansion in spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49,
+eq. 1), whose coefficients (2024, doi 10.5281/zenodo.14012302) are interpolated linearly between epochs. The
+flight software uses another model (`knightcube.astro.earth.geomagnetism`), so that the simulation includes a
+realistic model error. `ring_current` gives the field of the ring current. Currents in the ionosphere are not
+modelled.
 
-The table `igrf.npz` holds whole hundredths of a nanotesla. `tests/support/build_igrf.py` makes it from the
-file that the package ppigrf ships. The package itself is not used: its fields agree within 0.06 nT, but it is
-slower (81 ms against 3 ms for one position) and needs pandas.
+The table `igrf.npz` holds the coefficients as integers in units of 0.01 nT. `tests/support/build_igrf.py`
+makes the table from the file that the package ppigrf ships. The package ppigrf itself is not used, because it
+needs pandas and takes 81 ms for one position instead of 3 ms. Its fields agree with this module within 0.06
+nT.
 """
 
 from __future__ import annotations
@@ -25,18 +27,21 @@ from knightcube.astro.earth.orientation import celestial_to_terrestrial, julian_
 TABLE = Path(__file__).with_name("igrf.npz")
 DEGREE = 13
 REFERENCE_RADIUS = 6_371_200.0
-"""Reference radius (m) of the expansion."""
+"""Reference radius (m) of the spherical-harmonic expansion."""
 UNIT = 1e-11
-"""Unit (T) of the whole numbers in the table."""
+"""Unit (T) of the integer coefficients in the table `igrf.npz`."""
 DEVICE = "geomagnetic field"
 _NEAR_POLE = 0.5 * np.pi - 1e-8
-"""Largest latitude (rad), 7 cm from the pole, where the direction east is undefined."""
+"""Largest latitude (rad) that is used, 7 cm from the pole, because the direction east is undefined at the
+pole."""
 
 
 def field(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArray:
-    """Return the field (..., 3) T, ICRS axes, at Julian dates UTC (...) and positions (..., 3) m, ICRS.
+    """Return the magnetic field (..., 3), T, ICRS axes.
 
-    Raises OutOfRange for a date outside the epochs of the table.
+    The field is evaluated at Julian dates UTC (...) and positions (..., 3), m, ICRS.
+
+        Raises OutOfRange for a date outside the epochs of the table.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     there = np.einsum("...ij,...j->...i", to_ground, position)
@@ -44,7 +49,7 @@ def field(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArray:
 
 
 def field_on_ground(julian_date: npt.ArrayLike, position: FloatArray) -> FloatArray:
-    """Return the field (..., 3) T, ITRS axes, at Julian dates (...) and positions (..., 3) m, ITRS."""
+    """Return the field (..., 3), T, at Julian dates (...) UTC and positions (..., 3), m, all in ITRS axes."""
     position = np.asarray(position, dtype=float)
     shape = np.broadcast_shapes(np.shape(julian_date), position.shape[:-1])
     place = np.broadcast_to(position, (*shape, 3)).reshape(-1, 3)
@@ -59,12 +64,12 @@ def field_on_ground(julian_date: npt.ArrayLike, position: FloatArray) -> FloatAr
 
 
 def ring_current(julian_date: npt.ArrayLike, disturbance: float) -> FloatArray:
-    """Return the uniform field (..., 3) T, ICRS axes, of a ring current, opposite to the dipole field.
+    """Return the uniform field (..., 3), T, ICRS axes, that a ring current adds.
 
-    `disturbance` (T) is the negative Dst index: 20 nT on a quiet day, 100 nT in a storm.
+    `disturbance` (T) is the negative Dst index, about 20 nT on a quiet day and 100 nT in a storm.
     """
     dipole = _coefficients(np.atleast_1d(julian_epoch(julian_date)).reshape(-1))[0, :3]
-    # The dipole (g10, g11, h11) and the field inside the ring current both point south.
+    # The dipole moment (g10, g11, h11) and the field inside the ring current both point south.
     axis = np.array([dipole[1], dipole[2], dipole[0]]) / np.linalg.norm(dipole)
     to_ground = celestial_to_terrestrial(julian_date)
     return np.asarray(np.einsum("...ji,j->...i", to_ground, disturbance * axis))
@@ -72,13 +77,13 @@ def ring_current(julian_date: npt.ArrayLike, disturbance: float) -> FloatArray:
 
 @cache
 def _table() -> tuple[FloatArray, FloatArray]:
-    """Return the epochs (e,) in years and the coefficients (e, 195) in T, ordered g10, g11, h11, g20, ..."""
+    """Return the epochs (e,), years, and the coefficients (e, 195), T, ordered g10, g11, h11, g20, ..."""
     with np.load(TABLE, allow_pickle=False) as stored:
         return stored["epoch"].astype(float), UNIT * stored["coefficient"].astype(float)
 
 
 def _coefficients(year: FloatArray) -> FloatArray:
-    """Return the coefficients (n, 195) T at years (n,), linear between epochs."""
+    """Return the coefficients (n, 195), T, interpolated linearly to years (n,)."""
     epochs, values = _table()
     if year.size and not (epochs[0] <= np.min(year) and np.max(year) <= epochs[-1]):
         worst = float(np.min(year) if np.min(year) < epochs[0] else np.max(year))
@@ -91,7 +96,10 @@ def _coefficients(year: FloatArray) -> FloatArray:
 def _expansion(
     coefficients: FloatArray, radius: FloatArray, colatitude: FloatArray, longitude: FloatArray
 ) -> FloatArray:
-    """Return the field (n, 3) T, geocentric north, east and down: the negative gradient of the potential."""
+    """Return the field (n, 3), T, along geocentric north, east and down.
+
+    The field is the negative gradient of the potential.
+    """
     legendre, slope = _legendre(np.cos(colatitude), np.sin(colatitude))
     sine = np.sin(colatitude)
     ratio = REFERENCE_RADIUS / radius
@@ -113,9 +121,9 @@ def _expansion(
 
 
 def _legendre(cosine: FloatArray, sine: FloatArray) -> tuple[list[list[FloatArray]], list[list[FloatArray]]]:
-    """Return Schmidt's functions P[n][m] and their derivatives by the colatitude, each (points,).
+    """Return the Schmidt functions P[n][m] and their derivatives by the colatitude, each of shape (points,).
 
-    The recursions are those of Langel (The main field, in Geomagnetism, ed. Jacobs, 1987, eq. 27, table 2).
+    The recursions are from Langel, "The main field", in Geomagnetism (Jacobs, 1987), eq. 27 and table 2.
     """
     p = [[np.ones_like(cosine)]]
     d = [[np.zeros_like(cosine)]]

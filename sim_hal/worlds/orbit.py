@@ -1,23 +1,23 @@
 """The orbit of the craft and its environment: position, Sun, magnetic field, sunlight and air density.
 
-Orbits have Keplerian elements and follow the Earth's central gravity and oblateness J2 (Sease 2.13, 2.14),
-without drag or other bodies. Positions are in m, ICRS. The pole of ICRS is used as the Earth's pole, from
-which it differs by 0.15 deg in 2026.
+Orbits start from Keplerian elements and follow the Earth's central gravity and oblateness J2 (Sease, eqs.
+2.13 and 2.14), without drag or other bodies. Positions are in m, ICRS. The ICRS pole is used as the Earth's
+pole, although the two differ by 0.15 deg in 2026.
 
-The Sun follows the Astronomical Almanac's low-precision series. The flight software uses ERFA's epv00
-instead: with one shared series the flight would be tested against itself. This series costs 1.5 us a date,
-against 230 us for epv00. Its error of 42" (until 2030) moves the entry into the Earth's shadow by 0.2 s.
+The Sun's position follows the low-precision series of the Astronomical Almanac. The flight software uses
+ERFA's epv00 instead, so that simulation and flight software do not share one error. The Almanac's series
+takes 1.5 us for a date, and epv00 takes 230 us. The series errs by up to 42" until 2030, which moves the
+entry into the Earth's shadow by 0.2 s.
 
-The environment is evaluated at knots and interpolated by cubic splines. Knots are 10 s apart, in which
-position and field change by a thousandth of a revolution; interpolation is then accurate to 2 mm and 1e-4 nT,
-far below the errors of the models. Sunlight changes within seconds in the penumbra, so it has a knot each
-second, with linear interpolation. Knots are computed 1,000 s at a time, and random draws follow the order of
-the knots, never the order of the times that are requested.
+The environment is evaluated at knots, 10 s apart, and interpolated by cubic splines. The interpolation errors
+of 2 mm and 1e-4 nT are far below the errors of the models. Sunlight changes within seconds in the penumbra,
+so it has a knot every second and is interpolated linearly. The knots of 1,000 s are computed at once. Random
+numbers are drawn in the order of the knots, so they do not depend on the times that are requested.
 
 The air density is an exponential profile (Vallado, Fundamentals of Astrodynamics, 4th ed. 2013, Table 8-4)
-with a day bulge. The bulge has its apex 30 deg behind the Sun in right ascension and falls off as cos^4 of
-half the angle from it (Montenbruck & Gill 2000, 3.5.2, Harris-Priester). By day the air is four times as
-dense as by night, as near 500 km at a mean solar activity.
+with a day bulge. The apex of the day bulge is 30 deg east of the Sun in right ascension, and the density
+falls off as cos^4 of half the angle from the apex (Montenbruck & Gill 2000, section 3.5.2, Harris-Priester).
+The day-side air is four times as dense as the night-side air, as near 500 km at mean solar activity.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from sim_hal.worlds.world import Floats, OrbitEnvironment
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12
-"""Relative, of the integration: centimetres after ten low orbits."""
+"""Relative tolerance of the orbit integration, which gives errors of centimetres after ten low orbits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KeplerianElements:
-    """The osculating ellipse at one time; angles in rad, the semi-major axis in m."""
+    """Keplerian elements of the osculating orbit, with angles in rad and the semi-major axis in m."""
 
     semi_major_axis: float
     eccentricity: float = 0.0
@@ -68,7 +68,7 @@ class KeplerianElements:
             raise OutOfRange(DEVICE, "eccentricity", self.eccentricity, 0.0, 1.0, "")
 
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Return position (3,) m and velocity (3,) m/s (Vallado, Algorithm 10)."""
+        """Return the position (3,), m, and the velocity (3,), m/s, by Algorithm 10 of Vallado."""
         node, inclination = self.ascending_node, self.inclination
         towards_node = np.array([math.cos(node), math.sin(node), 0.0])
         across = np.array(
@@ -91,7 +91,7 @@ class KeplerianElements:
 
     @property
     def period(self) -> float:
-        """Orbital period (s) without J2."""
+        """Orbital period (s) of the two-body orbit, without J2."""
         return 2.0 * math.pi * math.sqrt(self.semi_major_axis**3 / GRAVITATIONAL_PARAMETER)
 
 
@@ -103,7 +103,7 @@ class Orbit:
     solution: OdeSolution
 
     def states_at(self, times: FloatArray) -> FloatArray:
-        """Return positions (m) and velocities (m/s), (m, 6), at `times` (m,) s.
+        """Return the states (m, 6), position (m) and velocity (m/s), at `times` (m,), s.
 
         Raises OutOfRange for times before 0 or after `duration`.
         """
@@ -114,21 +114,21 @@ class Orbit:
         return np.asarray(self.solution(times).T) if times.size else np.zeros((0, 6))
 
     def positions_at(self, times: FloatArray) -> FloatArray:
-        """Return positions (m, 3) in m at `times` (m,) s."""
+        """Return the positions (m, 3), m, at `times` (m,), s."""
         return self.states_at(times)[:, :3]
 
 
 class Start(Protocol):
-    """The start of an orbit: elements, or a state."""
+    """The start of an orbit, such as Keplerian elements or a position and velocity."""
 
     def state(self) -> tuple[FloatArray, FloatArray]:
-        """Return position (3,) m and velocity (3,) m/s."""
+        """Return the position (3,), m, and the velocity (3,), m/s, at time zero."""
 
 
 def propagate(elements: Start, duration: float, j2: float = J2) -> Orbit:
-    """Return the orbit that starts at `elements` at time 0, over `duration` s (Sease 2.13, 2.14).
+    """Return the orbit over `duration` s that starts with `elements` at time 0 (Sease, eqs. 2.13, 2.14).
 
-    The integrator is the method of order 8 of Dormand and Prince with its own interpolant. `j2` = 0
+    The integrator is the eighth-order method of Dormand and Prince with dense output. `j2` = 0
     gives the two-body orbit. Raises OutOfRange if `duration` is not positive.
     """
     if not 0.0 < duration < math.inf:
@@ -136,7 +136,7 @@ def propagate(elements: Start, duration: float, j2: float = J2) -> Orbit:
     oblateness = 1.5 * j2 * GRAVITATIONAL_PARAMETER * EARTH_RADIUS**2
 
     def derivative(_: float, state: FloatArray) -> list[float]:
-        # Plain floats: for three components numpy costs five times as much.
+        # Plain floats are used because numpy takes five times as long for three components.
         x, y, z, vx, vy, vz = state.tolist()
         squared = x * x + y * y + z * z
         cubed = squared * math.sqrt(squared)
@@ -165,11 +165,12 @@ _PRECESSION = 1.3972 / 36_525.0
 
 
 def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
-    """Return the Sun's apparent geocentric position (..., 3), ICRS, in m, at Julian dates (...) TT.
+    """Return the Sun's apparent geocentric position (..., 3), m, ICRS, at Julian dates (...) TT.
 
-    Astronomical Almanac, "Low-precision formulas for the Sun" (0.01 deg, 1950 to 2050). The series gives the
-    longitude from the equinox of date; the drift of the equinox since J2000 is subtracted. The obliquity is
-    that of J2000. UTC instead of TT moves the Sun by 3".
+    The position follows the "Low-precision formulas for the Sun" of the Astronomical Almanac, accurate to
+    0.01 deg from 1950 to 2050. The series gives the longitude from the equinox of date, from which the drift
+    of the equinox since J2000 is subtracted. The obliquity is that of J2000. Passing UTC instead of TT
+    changes the Sun's direction by 3".
     """
     days = np.asarray(julian_date, dtype=float) - J2000
     anomaly = np.radians(357.528 + 0.9856003 * days)
@@ -183,12 +184,12 @@ def sun_position(julian_date: npt.ArrayLike) -> FloatArray:
 
 
 def julian_date(utc: str) -> float:
-    """Return the Julian date of an ISO 8601 time. Raises ValueError."""
+    """Return the Julian date of an ISO 8601 time. Raises ValueError for invalid text."""
     return UNIX_EPOCH + datetime.fromisoformat(utc).timestamp() / DAY
 
 
 def elements(orbit: OrbitSection, date: float) -> KeplerianElements:
-    """Return the elements of the orbit at a Julian date."""
+    """Return the Keplerian elements of a configured orbit at a Julian date."""
     node = math.radians(orbit.ascending_node_deg)
     if orbit.local_time is not None:
         x, y, _ = sun_position(date).tolist()
@@ -220,18 +221,20 @@ _PROFILE = np.array(
         [1000e3, 3.019e-15],
     ]
 )
-"""Heights (m) and air densities (kg/m^3)."""
+"""Heights (m) and air densities (kg/m^3) of the exponential profile."""
 _NIGHT, _DAY = 0.4, 1.6
-"""Factors of the air density at the antapex and the apex of the day bulge."""
+"""Factors of the air density opposite to the day bulge and at the apex of the day bulge."""
 _MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
-"""Mean factor over all directions."""
+"""Mean of the day bulge's density factor over all directions."""
 _LAG = math.radians(30.0)
 
 
 def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -> FloatArray:
-    """Return the logarithm (n,) of the density in kg/m^3 at positions (n, 3) m, the Sun at (n, 3) m, ICRS.
+    """Return the logarithm (n,) of the air density in kg/m^3.
 
-    `day_bulge` scales the day bulge; at zero its mean applies in all directions.
+    `position` (n, 3) and the Sun's position `sun` (n, 3) are geocentric, m, ICRS.
+
+        `day_bulge` scales the day bulge. If it is zero, the mean density applies in all directions.
     """
     distance = np.linalg.norm(position, axis=-1)
     profile = np.interp(distance - EARTH_RADIUS, _PROFILE[:, 0], np.log(_PROFILE[:, 1]))
@@ -244,25 +247,29 @@ def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -
 
 
 KNOT = 10.0
-"""Time between knots (s)."""
+"""Time (s) between the knots of the environment's interpolation."""
 _CHUNK, _LIGHT_KNOTS = 100, 1_000
-"""Knots, and knots of the sunlight, that are computed at once."""
+"""Number of knots, and of sunlight knots, that are computed at once."""
 _SPAN = KNOT * _CHUNK
 _FIRST_ORBIT = 12_000.0
-"""Time (s) over which the orbit is integrated at first."""
+"""Duration (s) of the first integration of the orbit, which is doubled when needed."""
 RING_CURRENT = 20e-9
 """Mean field (T) of the ring current on a quiet day."""
 _TURBULENCE, _TURBULENCE_TIME = 0.1, 600.0
-"""Standard deviation of the logarithm of the air density, and its correlation time (s)."""
+"""Standard deviation of the random walk of the logarithmic air density, and its correlation time (s)."""
 _WALK_TIME = 3_000.0
 """Correlation time (s) of the residual dipole's random walk."""
 _STORM_TIMES = np.array([3.0, 7.0, 17.0]) * 3600.0
-"""Periods (s) of the ring current."""
+"""Periods (s) of the variations of the ring current."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Knots of 1,000 s: cubics (knots, 4, columns), highest power first, and sunlight (seconds,)."""
+    """Interpolation of the environment over 1,000 s.
+
+    `cubics` (knots, 4, columns) holds polynomial coefficients, highest power first. `sunlit` (seconds,) holds
+    the visible fraction of the Sun's disc.
+    """
 
     start: float
     cubics: list[list[list[float]]]
@@ -270,7 +277,10 @@ class Chunk:
 
 
 class Environment:
-    """The environment from time 0 (s) on; within a chunk times may have any order, chunks only advance."""
+    """The environment of the craft from time 0 s on.
+
+    Times may be requested in any order within a chunk of 1,000 s, but no time before the current chunk.
+    """
 
     def __init__(
         self,
@@ -279,7 +289,7 @@ class Environment:
         generator: np.random.Generator,
         multiples: Disturbances | None = None,
     ) -> None:
-        """Start at a Julian date UTC; `multiples` scale ring current, day bulge and random walks."""
+        """Begin at a Julian date UTC; `multiples` scale ring current, day bulge and random walks."""
         self._multiples = multiples = multiples or Disturbances()
         self._elements = elements
         self._julian_date = julian_date
@@ -292,7 +302,7 @@ class Environment:
         self._next = 1
 
     def position_and_field(self, time: float) -> tuple[Floats, Floats]:
-        """Return position (3,) m and field (3,) T, ICRS."""
+        """Return the position (3,), m, and the magnetic field (3,), T, in ICRS axes at `time` s."""
         part, (a, b, c, d) = self._cubic(time)
         return (
             (
@@ -308,7 +318,7 @@ class Environment:
         )
 
     def at(self, time: float) -> OrbitEnvironment:
-        """Return the environment at `time` s."""
+        """Return the environment of the craft at `time` s."""
         part, (a, b, c, d) = self._cubic(time)
         values = [((i * part + j) * part + k) * part + m for i, j, k, m in zip(a, b, c, d, strict=True)]
         slope = [(3.0 * i * part + 2.0 * j) * part + k for i, j, k in zip(a[:3], b[:3], c[:3], strict=True)]
@@ -332,7 +342,7 @@ class Environment:
         )
 
     def _cubic(self, time: float) -> tuple[float, list[list[float]]]:
-        """Return the time since the knot before `time`, and its cubic."""
+        """Return the time (s) since the knot before `time`, and the cubics that begin at this knot."""
         since = time - self._chunk.start
         while since > _SPAN:
             self._chunk = self._make(self._next)
@@ -349,7 +359,7 @@ class Environment:
         date = self._julian_date + times / DAY
         position = self._orbit.positions_at(times)
         sun_there = sun_position(date)
-        # Four Gauss-Markov walks of unit deviation, that of the air first.
+        # The four Gauss-Markov walks have unit standard deviation, and the first one is the air density.
         keep = np.exp(-KNOT / np.array([_TURBULENCE_TIME, _WALK_TIME, _WALK_TIME, _WALK_TIME]))
         walks = [self._noise]
         for kick in np.sqrt(1.0 - keep**2) * self._generator.standard_normal((_CHUNK, 4)):
@@ -357,7 +367,7 @@ class Environment:
         self._noise = walks[-1]
         noise = self._multiples.walks * np.array(walks)
         density = log_density(position, sun_there, self._multiples.day_bulge) + _TURBULENCE * noise[:, 0]
-        # The ring current changes by hours and never reverses.
+        # The ring current varies over hours and never reverses.
         waves = np.sin(times[:, None] * (2.0 * math.pi / _STORM_TIMES) + self._phases)
         ring = magnetic_field.ring_current(date, self._storm) * (1.0 + np.mean(waves, axis=1))[:, None]
         field = magnetic_field.field(date, position) + ring
@@ -370,6 +380,6 @@ class Environment:
 
 
 def air_flow(environment: OrbitEnvironment) -> Floats:
-    """Return the craft's velocity (3,) m/s through air that turns with the Earth, ICRS."""
+    """Return the craft's velocity (3,), m/s, ICRS, relative to air that rotates with the Earth."""
     (x, y, _), (vx, vy, vz) = environment.position, environment.velocity
     return vx + ROTATION_RATE * y, vy - ROTATION_RATE * x, vz

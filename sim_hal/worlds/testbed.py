@@ -1,9 +1,10 @@
-"""The testbed: a rigid body on a thread in a Helmholtz coil's field, controlled by its torque coils.
+"""The testbed world: a rigid body on a thread in the field of a Helmholtz coil, controlled by torque coils.
 
-Sease 2013 ch. 5: one degree of freedom, the angle theta about the thread; J theta'' = m x B about the thread
-- k theta - c theta'. The testbed frame T has y down along the thread and the field along -z; at theta = 0 the
-body axes are those of T, so the coil on body x gives n A B I cos(theta) (5.4), the one on body z
-n A B I sin(theta), and the one on body y, which lies along the thread, none.
+The model is that of Sease 2013, chapter 5. Its one degree of freedom is the angle theta about the thread,
+with J theta'' = (m x B) along the thread - k theta - c theta'. The testbed frame T has y down along the
+thread and the magnetic field along -z. The body axes coincide with those of T at theta = 0. The coil on body
+x gives the torque n A B I cos(theta) (Sease, eq. 5.4), the coil on body z gives n A B I sin(theta), and the
+coil on body y has no effect because its axis lies along the thread.
 """
 
 from __future__ import annotations
@@ -25,29 +26,32 @@ VACUUM_PERMEABILITY = 4e-7 * math.pi
 
 
 def helmholtz_field(turns: float, current: float, radius: float) -> float:
-    """Return the field (T) at the centre of two coils of `turns` each; `current` in A, `radius` in m."""
+    """Return the field (T) at the centre of a Helmholtz pair.
+
+    Each coil has `turns` turns of `radius` m and carries `current` A.
+    """
     return math.pow(0.8, 1.5) * VACUUM_PERMEABILITY * turns * current / radius
 
 
 _LONGEST_STEP = 0.025
-"""Longest step of the integration (s)."""
+"""Longest step (s) of the integration."""
 
 
 @dataclass(frozen=True, slots=True)
 class TestbedModel:
-    """The true constants of the testbed, SI.
+    """The true constants of the testbed in SI units.
 
     Attributes:
-        inertia: kg m^2, about the thread.
-        dipole_per_ampere: n A of each coil, m^2.
-        field: T, horizontal.
-        stiffness: N m/rad, of the thread.
-        damping: N m s/rad, of thread and air.
-        resistance: (3,) ohm, of the coils.
-        supply_voltage: V across a coil that is fully on.
+        inertia: moment of inertia about the thread, kg m^2.
+        dipole_per_ampere: number of turns times area of each coil, m^2.
+        field: horizontal magnetic field, T.
+        stiffness: torsional stiffness of the thread, N m/rad.
+        damping: damping by thread and air, N m s/rad.
+        resistance: resistance (3,) of the coils, ohm.
+        supply_voltage: voltage across a coil that is fully on, V.
     """
 
-    __test__ = False  # for pytest: this is not a test
+    __test__ = False  # keeps pytest from collecting this class as a test
 
     inertia: float
     dipole_per_ampere: float
@@ -89,7 +93,7 @@ class Testbed:
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance the state to `time_ns` under the present currents, by classical Runge-Kutta."""
+        """Advance the state to `time_ns` under the present coil currents (classical Runge-Kutta)."""
         if self._held:
             if self._release_ns is None or time_ns < self._release_ns:
                 self.time_ns = max(self.time_ns, time_ns)
@@ -116,7 +120,7 @@ class Testbed:
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the present state."""
+        """Return the present coil currents and the energies so far."""
         return WorldTruth(self.mean_current, self.energy, self.supply_energy)
 
     def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
@@ -138,15 +142,16 @@ class Testbed:
 
 
 def make(inputs: WorldInputs) -> Testbed:
-    """Return the testbed of a configuration. Raises ConfigError without a release."""
+    """Return the testbed of a configuration. Raises ConfigError if `simulation.release` is missing."""
     model, angle, rate = model_of(as_testbed(inputs.config), inputs.section)
     return Testbed(model, angle, rate, inputs.currents, inputs.start_ns)
 
 
 def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, float, float]:
-    """Return the true constants, and angle (rad) and rate (rad/s) of the release.
+    """Return the true constants of the testbed, and the angle (rad) and rate (rad/s) at release.
 
-    Values of `section` override those of `config`. Raises ConfigError without a release.
+    Values of the simulation section `section` override those of `config`. Raises ConfigError if
+    `simulation.release` is missing.
     """
     release = section.release
     if release is None:
@@ -168,15 +173,16 @@ _CAGE_STREAM = 0xCA6E
 
 
 class OrbitField:
-    """The field of a Helmholtz cage that reproduces the field along an orbit, reference axes.
+    """The magnetic field of a Helmholtz cage that reproduces the field along an orbit.
 
-    The field is IGRF-14 with a ring current along an orbit under J2, in the local frame whose y axis is the
-    axis of the thread. The cage produces the components normal to the thread, multiplied by its scale and the
-    gain of its coils. `flight.bodies.testbed.control` is the model of the flight software.
+    The reproduced field is IGRF-14 with a ring current along an orbit under J2, in the local frame whose y
+    axis is the axis of the thread. The cage produces the components normal to the thread, multiplied by the
+    cage's scale and the gain of its coils. The flight software has its own model in
+    `flight.bodies.testbed.control`.
     """
 
     def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
-        # Imported late: a testbed without a cage needs no orbit.
+        # The orbit is imported here because a testbed without a cage does not need an orbit.
         from sim_hal.worlds.orbit import Environment, elements, julian_date  # noqa: PLC0415
 
         date = julian_date(utc)
@@ -186,7 +192,7 @@ class OrbitField:
         self._scale = scale * section.gain
 
     def at(self, seconds: float) -> tuple[float, float]:
-        """Return the components along x and z, T, at a time since the start."""
+        """Return the field's components along x and z (T) at `seconds` after the start."""
         position, velocity, field = (np.array(vector) for vector in self._environment.at(seconds)[:3])
         down = -position / np.linalg.norm(position)
         across = np.cross(velocity, position)
@@ -195,7 +201,7 @@ class OrbitField:
 
 
 class CagedTestbed(Testbed):
-    """The testbed with the field of the cage instead of the constant one."""
+    """The testbed in the variable field of the cage instead of the constant field."""
 
     def __init__(
         self,
@@ -212,7 +218,7 @@ class CagedTestbed(Testbed):
         self._bx, self._bz = field.at(0.0)
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance the state to `time_ns`; the field is constant during the few ms of an advance."""
+        """Advance the state to `time_ns` in a field that is constant during the few ms of the advance."""
         if time_ns > self.time_ns:
             self._bx, self._bz = self._orbit.at((time_ns - self._start_ns) * 1e-9)
         super().advance_to(time_ns)
@@ -235,7 +241,10 @@ class CagedTestbed(Testbed):
 
 
 def make_caged(inputs: WorldInputs) -> CagedTestbed:
-    """Return the caged testbed of a configuration. Raises ConfigError without its sections."""
+    """Return the testbed with a field cage of a configuration.
+
+    Raises ConfigError if the section `cage` or `simulation.cage` is missing.
+    """
     config, section = as_testbed(inputs.config), inputs.section
     if config.cage is None or section.cage is None:
         missing = "cage" if config.cage is None else "simulation.cage"

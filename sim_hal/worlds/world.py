@@ -1,7 +1,8 @@
 """The interface between simulated worlds and emulated devices, and the recorder of the true state.
 
-A configuration names its world in `simulation.world`: one of `WORLDS`, or a third party's factory as
-`module:factory`, which takes `WorldInputs` and returns a `World`. A world in orbit is an `OrbitingWorld`.
+A configuration names its world in `simulation.world`. The name is one of `WORLDS` or a third party's factory,
+written `module:factory`, which takes `WorldInputs` and returns a `World`. A world in orbit implements
+`OrbitingWorld`.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ class BodyMotion:
 
     Attributes:
         time_ns: simulation time.
-        quaternion: (4,) reference frame (the testbed's T) into body, scalar last.
-        rate: (3,) rad/s, body axes.
-        field_body: (3,) T, body axes.
-        specific_force_body: (3,) m/s^2, body axes; at rest it points up.
+        quaternion: attitude quaternion (4,), reference frame into body, scalar last.
+        rate: rotation rate (3,), rad/s, body axes.
+        field_body: magnetic field (3,), T, body axes.
+        specific_force_body: specific force (3,), m/s^2, body axes, which points up at rest.
     """
 
     time_ns: int
@@ -47,12 +48,15 @@ class BodyMotion:
 
 
 def about_thread(time_ns: int, angle: float, rate: float, field: float) -> BodyMotion:
-    """Return the motion of a body on the thread at `angle` rad and `rate` rad/s, with `field` T on -z_T."""
+    """Return the motion of a body on the testbed's thread at `angle` rad and `rate` rad/s.
+
+    The magnetic field of `field` T points along -z of the testbed frame.
+    """
     return BodyMotion(
         time_ns=time_ns,
         quaternion=about_axis_y(angle),
         rate=np.array([0.0, rate, 0.0]),
-        # (0, 0, -field) and the specific force of the thread (0, -g, 0), turned into body axes.
+        # The field (0, 0, -field) and the specific force (0, -g, 0) are rotated into body axes.
         field_body=np.array([field * math.sin(angle), 0.0, -field * math.cos(angle)]),
         specific_force_body=np.array([0.0, -STANDARD_GRAVITY, 0.0]),
     )
@@ -70,9 +74,9 @@ class WorldTruth:
     """The quantities of the truth log other than the motion.
 
     Attributes:
-        current: (3,) A, mean currents that acted on the body.
-        energy: J, integral of R I^2 over all coils since the release.
-        supply_energy: J, integral of V |I| over all coils since the release.
+        current: mean coil currents (3,) that acted on the body, A.
+        energy: integral of R I^2 over time since the release, summed over the coils, J.
+        supply_energy: integral of V |I| over time since the release, summed over the coils, J.
     """
 
     current: FloatArray
@@ -88,24 +92,24 @@ class World(Protocol):
         """Release the body at `time_ns`, now or later; until then it is held still."""
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance the state to `time_ns` under the present currents."""
+        """Advance the state to `time_ns` under the present coil currents."""
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Return attitude, rate, field and specific force at `time_ns`, which is never before the state."""
+        """Advance to `time_ns` and return attitude, rate, field and specific force."""
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the present state."""
+        """Return the present coil currents and the energies so far."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorldInputs:
-    """The inputs of a world.
+    """The inputs from which a factory makes a world.
 
     Attributes:
-        config: the flight configuration, for values that `section` leaves out.
-        section: the `simulation` section.
-        currents: returns (3,) A that the coils carry now.
-        start_ns: the simulation's time at the start.
+        config: flight configuration, used for values that the `simulation` section does not give.
+        section: `simulation` section of the configuration.
+        currents: function that returns the present coil currents (3,), A.
+        start_ns: simulation time at the start, ns.
     """
 
     config: Config
@@ -115,7 +119,7 @@ class WorldInputs:
 
 
 def make_world(inputs: WorldInputs) -> World:
-    """Return the world that a configuration names. Raises ConfigError."""
+    """Return the world that a configuration names. Raises ConfigError for an unknown world."""
     named = inputs.section.world
     module, colon, name = WORLDS.get(named, named).partition(":")
     if not (module and colon and name):
@@ -140,17 +144,17 @@ CAUSES = ("coils", "residual dipole", "gravity gradient", "drag", "sunlight")
 
 
 class OrbitEnvironment(NamedTuple):
-    """Position, field, light and air of the craft at one time; vectors in ICRS.
+    """Position, magnetic field, sunlight and air density of the craft at one time, with vectors in ICRS.
 
     Attributes:
-        position: (3,) m.
-        velocity: (3,) m/s.
-        field: (3,) T.
-        sun: (3,) direction from the craft to the Sun.
-        light: sunlight relative to its intensity at one astronomical unit; 0 in the umbra.
+        position: geocentric position (3,), m.
+        velocity: velocity (3,), m/s.
+        field: magnetic field (3,), T.
+        sun: direction (3,) from the craft to the Sun.
+        light: intensity of the sunlight relative to that at one astronomical unit, 0 in the umbra.
         sunlit: visible fraction of the Sun's disc.
-        density: kg/m^3, of the air.
-        walk: (3,) random walk of the residual dipole, of unit standard deviation, body axes.
+        density: air density, kg/m^3.
+        walk: random walk (3,) of the residual dipole, scaled to unit standard deviation, body axes.
     """
 
     position: Floats
@@ -165,20 +169,20 @@ class OrbitEnvironment(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrbitTruth(WorldTruth):
-    """The state of a world in orbit; vectors in ICRS unless stated otherwise.
+    """The true state of a world in orbit, with vectors in ICRS unless stated otherwise.
 
     Attributes:
-        utc: Julian date.
-        quaternion: (4,) ICRS into body.
-        rate: (3,) rad/s, body axes.
-        position: (3,) m.
-        velocity: (3,) m/s.
-        field: (3,) T.
-        sun: (3,) direction from the craft to the Sun.
+        utc: Julian date (UTC).
+        quaternion: attitude quaternion (4,), ICRS into body.
+        rate: rotation rate (3,), rad/s, body axes.
+        position: geocentric position (3,), m.
+        velocity: velocity (3,), m/s.
+        field: magnetic field (3,), T.
+        sun: direction (3,) from the craft to the Sun.
         sunlit: visible fraction of the Sun's disc.
-        residual_dipole: (3,) A m^2, body axes.
-        torques: evaluates the torques (3,) N m, body axes, by `CAUSES`; empty if the world does not know
-            them separately.
+        residual_dipole: residual dipole (3,), A m^2, body axes.
+        torques: function that returns the torque (3,), N m, body axes, of each cause in `CAUSES`, or an empty
+            dict if the world does not know the torques separately.
     """
 
     utc: float
@@ -195,27 +199,27 @@ class OrbitTruth(WorldTruth):
 
 @runtime_checkable
 class OrbitingWorld(World, Protocol):
-    """A world with an orbit, as GPS receiver, solar cells and horizon cameras need it."""
+    """A world with an orbit, which GPS receiver, solar cells and horizon cameras need."""
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return the environment of the craft at the present state."""
+        """Return the environment of the craft at the present time."""
 
     def utc_ns(self) -> int:
-        """Return UTC of the present state, ns since 1970."""
+        """Return the present UTC, ns since 1970."""
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the whole present state."""
+        """Return the present state of body, orbit and environment."""
 
 
 def orbiting(world: World, section: str) -> OrbitingWorld:
-    """Return the world if it has an orbit. Raises ConfigError, naming `section`, if it has none."""
+    """Return `world` if it has an orbit, else raise ConfigError with the name `section`."""
     if not isinstance(world, OrbitingWorld):
         raise ConfigError(section, "needs a world with an orbit, such as `simulation.world: free_body`")
     return world
 
 
 def utc_date(world: OrbitingWorld) -> float:
-    """Return the Julian date, UTC, of the present state of a world."""
+    """Return the present Julian date (UTC) of a world."""
     return UNIX_EPOCH + world.utc_ns() * 1e-9 / DAY
 
 
@@ -232,7 +236,7 @@ class PacketLog(Protocol):
 
 
 class TruthRecorder:
-    """Writes the true state at 40 Hz, and that of an orbit at 1 Hz, to a log; an emulated device."""
+    """Recorder that writes the true state at 40 Hz, and that of an orbit at 1 Hz, to a packet log."""
 
     def __init__(self, log: PacketLog) -> None:
         self._log = log
@@ -242,19 +246,19 @@ class TruthRecorder:
         self._due_ns = NEVER
 
     def watch(self, world: World) -> None:
-        """Record this world."""
+        """Set the world whose state is recorded."""
         self._world = world
 
     def begin(self, epoch_ns: int) -> None:
-        """Record from mission time zero, `epoch_ns`, on."""
+        """Begin recording at mission time zero, which is `epoch_ns`."""
         self._epoch_ns = self._due_ns = epoch_ns
 
     def next_event_ns(self) -> int:
-        """Return when the next record is due."""
+        """Return the time (ns) at which the next record is due."""
         return self._due_ns
 
     def advance(self, now_ns: int) -> None:
-        """Write the records that are due."""
+        """Write all records that are due by `now_ns`."""
         while self._due_ns <= now_ns:
             if self._world is not None:
                 self._write(self._world, self._due_ns)

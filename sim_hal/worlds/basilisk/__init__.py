@@ -1,4 +1,4 @@
 """The simulator Basilisk (AVS Lab, PyPI `bsk`, extra `worlds`) as a world."""
 
 STEP_NS = 25_000_000
-"""Step of Basilisk's integration."""
+"""Integration step (ns) of Basilisk."""

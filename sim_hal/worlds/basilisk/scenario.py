@@ -1,8 +1,9 @@
 """The Basilisk simulation of one craft: modules, messages and their wiring.
 
-Dynamics, gravity with J2, gravity gradient, field (WMM), drag, solar pressure and eclipse are Basilisk's own.
-The craft, the orbital elements, and the directions of Earth and Sun come from this simulator. Tables
-that Basilisk would download from the network are not used.
+Basilisk's own modules compute the dynamics, the gravity with J2, the gravity gradient, the magnetic field
+(WMM), drag, solar pressure and eclipses. This simulator provides the properties of the craft, the orbital
+elements, the Earth's orientation and the Sun's position. No table that Basilisk downloads from the network is
+used.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ from sim_hal.worlds.orbit import KeplerianElements, sun_position
 MASS = 1.0
 """Mass (kg); it affects the decay of the orbit only."""
 _DENSITY, _SCALE_HEIGHT, _HEIGHT = 0.8 * 6.967e-13, 63_822.0, 500e3
-"""Air density (kg/m^3), mean over the day bulge, scale height (m) and height (m): Vallado, Table 8-4."""
+"""Mean air density (kg/m^3), scale height (m) and height (m) from Vallado, Table 8-4."""
 _MAX_DIPOLE = 10.0
-"""Limit (A m^2) of each bar, larger than any dipole of coils and residual dipole together."""
+"""Dipole limit (A m^2) of each torque bar, above any sum of coil dipole and residual dipole."""
 _TASK = "craft"
 
 
 class BasiliskScenario:
-    """A craft in Basilisk; time begins at zero and moves in steps of 25 ms."""
+    """A craft in Basilisk, whose time begins at zero and advances in steps of 25 ms."""
 
     def __init__(
         self,
@@ -80,12 +81,12 @@ class BasiliskScenario:
         self._simulation.InitializeSimulation()
 
     def run_to(self, time_ns: int) -> None:
-        """Run to a time, a whole number of steps from the beginning."""
+        """Run the simulation to a time that is a whole number of steps after its start."""
         self._simulation.ConfigureStopTime(time_ns)
         self._simulation.ExecuteSimulation()
 
     def place_bodies(self, julian_date: float, time_ns: int) -> None:
-        """Write the Earth's orientation and the Sun's position, geocentric ICRS, at a Julian date UTC."""
+        """Give Basilisk the Earth's orientation and the Sun's position at a Julian date (UTC)."""
         earth = messaging.SpicePlanetStateMsgPayload()
         earth.PlanetName, earth.computeOrient = "earth", 1
         earth.J20002Pfix = celestial_to_terrestrial(julian_date).tolist()
@@ -95,13 +96,13 @@ class BasiliskScenario:
         self._sun.write(far, time_ns)
 
     def set_dipole(self, dipole: tuple[float, float, float], time_ns: int) -> None:
-        """Set the dipole (3,) A m^2, body axes, of coils and residual dipole together."""
+        """Set the sum (3,) of coil dipole and residual dipole, A m^2, body axes."""
         command = messaging.MTBCmdMsgPayload()
         command.mtbDipoleCmds = list(dipole)
         self._command.write(command, time_ns)
 
     def set_rotation(self, attitude: FloatArray, rate: FloatArray) -> None:
-        """Replace attitude (4,) and rate (3,) rad/s."""
+        """Set the craft's attitude quaternion (4,) and rotation rate (3,), rad/s."""
         states = self.craft.dynManager
         states.getStateObject(self.craft.hub.nameOfHubSigma).setState(_column(rodrigues(attitude)))
         states.getStateObject(self.craft.hub.nameOfHubOmega).setState(_column(rate))
@@ -109,7 +110,7 @@ class BasiliskScenario:
     def _gravity(self) -> Any:
         model = sphericalHarmonicsGravityModel.SphericalHarmonicsGravityModel()
         model.muBody, model.radEquator, model.maxDeg = GRAVITATIONAL_PARAMETER, EARTH_RADIUS, 2
-        # Normalised: C20 = -J2 / sqrt(5).
+        # The normalised coefficient is C20 = -J2 / sqrt(5).
         model.cBar = [[1.0], [0.0, 0.0], [-J2 / math.sqrt(5.0), 0.0, 0.0]]
         model.sBar = [[0.0], [0.0, 0.0], [0.0, 0.0, 0.0]]
         body = gravityEffector.GravBodyData()

@@ -1,9 +1,9 @@
 """Basilisk as the world of a flight: `simulation.world: sim_hal.worlds.basilisk.world:make`.
 
-It reads the section `simulation.free_body` and builds the same craft from the same seed as the world
-`free_body`, so that results can be compared. Basilisk steps by 25 ms; between two steps the motion is
-extrapolated at its rate. A change of currents acts from the next step on. The random walks of air and dipole,
-the ring current and the day bulge are not modelled.
+This world reads the section `simulation.free_body` and builds the same craft from the same seed as the world
+`free_body`, so that results can be compared. Basilisk integrates in steps of 25 ms, and between two steps the
+motion is extrapolated at its last rate. A change of the coil currents acts from the next step on. The random
+walks of air density and residual dipole, the ring current and the day bulge of the air are not modelled.
 """
 
 from __future__ import annotations
@@ -72,17 +72,17 @@ class BasiliskWorld:
         )
         self._currents, self._supply = currents, supply
         self._acting: FloatArray = np.zeros(3)
-        self._stepped_ns = 0  # since the start; Basilisk's own time
+        self._stepped_ns = 0  # Basilisk's own time, counted from the start
         self._placed_ns = 0
         self.time_ns = start_ns
         self.energy = self.supply_energy = 0.0
 
     def release_at(self, time_ns: int) -> None:
-        """Release the body at `time_ns`, now or later; in effect at the next step."""
+        """Release the body at the first step not before `time_ns`."""
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
-        """Advance to `time_ns` under the present currents."""
+        """Advance the world to `time_ns` under the present coil currents."""
         if time_ns <= self.time_ns:
             return
         self._acting = self._currents()
@@ -99,7 +99,7 @@ class BasiliskWorld:
             self._step(since)
 
     def motion(self, time_ns: int) -> BodyMotion:
-        """Advance to `time_ns` and return the motion; the specific force is zero."""
+        """Advance to `time_ns` and return the motion, whose specific force is zero in free fall."""
         self.advance_to(time_ns)
         attitude, rate = self._attitude, np.zeros(3)
         if not self._held:
@@ -111,7 +111,7 @@ class BasiliskWorld:
         return BodyMotion(self.time_ns, attitude, rate, field, np.zeros(3))
 
     def surroundings(self) -> OrbitEnvironment:
-        """Return the environment of the craft at the present state."""
+        """Return the environment of the craft at the present time."""
         state = self._scenario.craft.scStateOutMsg.read()
         velocity = np.array(state.v_BN_N)
         position = np.array(state.r_BN_N) + velocity * self._behind()
@@ -130,15 +130,15 @@ class BasiliskWorld:
         )
 
     def utc_ns(self) -> int:
-        """Return UTC of the present state, ns since 1970."""
+        """Return the present UTC, ns since 1970."""
         return self._utc_start_ns + self.time_ns - self._start_ns
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the present state."""
+        """Return the present coil currents and the energies so far."""
         return WorldTruth(self._acting, self.energy, self.supply_energy)
 
     def orbit_truth(self) -> OrbitTruth:
-        """Return the present state; Basilisk does not give the torques by their causes."""
+        """Return the present state without torques, which Basilisk does not give separately."""
         motion, around = self.motion(self.time_ns), self.surroundings()
         return OrbitTruth(
             current=self._acting,
@@ -157,7 +157,7 @@ class BasiliskWorld:
         )
 
     def _step(self, until_ns: int) -> None:
-        """Run all steps before `until_ns`, the release and the next whole second."""
+        """Run all steps up to the earliest of `until_ns`, the release and the next whole second."""
         ends = min(until_ns, (self._stepped_ns // SECOND_NS + 1) * SECOND_NS)
         if self._held and self._release_ns < NEVER:
             ends = min(ends, max(self._stepped_ns + STEP_NS, self._release_ns - self._start_ns))
@@ -195,7 +195,7 @@ def _scenario() -> type[BasiliskScenario]:
 
 
 def _of_rodrigues(parameters: FloatArray) -> FloatArray:
-    """Return the quaternion (4,) of modified Rodrigues parameters (3,)."""
+    """Return the quaternion (4,) that corresponds to modified Rodrigues parameters (3,)."""
     square = float(parameters @ parameters)
     return np.append(2.0 * parameters, 1.0 - square) / (1.0 + square)
 
@@ -206,7 +206,10 @@ def _floats(vector: FloatArray) -> Floats:
 
 
 def make(inputs: WorldInputs) -> BasiliskWorld:
-    """Return the world of a configuration. Raises ConfigError without its section, or without Basilisk."""
+    """Return the Basilisk world of a configuration.
+
+    Raises ConfigError if the section `simulation.free_body` or Basilisk is missing.
+    """
     section, currents = inputs.section, inputs.currents
     if section.free_body is None:
         raise ConfigError("simulation.free_body", "is missing: this world needs it")
