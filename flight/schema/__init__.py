@@ -1,1 +1,1 @@
-"""The shape of one YAML configuration and its reader; each limit and default is written once."""
+"""The structure of a YAML configuration and its reader; each limit and default is defined once."""

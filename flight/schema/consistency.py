@@ -1,4 +1,4 @@
-"""Checks of configuration values against each other, and the networks that the link accepts."""
+"""Consistency checks between values of a configuration, and the networks that the link accepts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flight.schema.testbed import TestbedConfig
 from flight.schema.values import Quaternion, check_aim
 
 Refuse = Callable[[str, str], None]
-"""Function of a dotted name and a problem that raises the error about the value."""
+"""Function that raises the error about a value; its arguments are the value's dotted name and the problem."""
 
 PIXEL_BITS = {
     "GREY": range(8, 9),
@@ -26,14 +26,14 @@ PIXEL_BITS = {
     "Y16": range(9, 17),
     "Mono16": range(9, 17),
 }
-"""Bits per pixel that each pixel format can hold."""
+"""Permitted numbers of bits per pixel of each pixel format."""
 LOOPBACK = IPv4Network("127.0.0.0/8")
 _PREFIX = 24
-"""Default prefix length of the network around an address of the link."""
+"""Default prefix length of the network whose hosts may send frames to the link."""
 
 
 def check_consistency(config: Config, document: Document) -> None:
-    """Refuse values that contradict each other. Raises ConfigError."""
+    """Raise ConfigError for values that contradict each other. Raises ConfigError."""
 
     def refuse(dotted: str, problem: str) -> None:
         raise document.error(dotted, problem)
@@ -47,14 +47,17 @@ def check_consistency(config: Config, document: Document) -> None:
         _check_link(config.link, config.commands, refuse)
     _check_coils(config, refuse)
     unit = config.inertial_unit
-    # A reading waits for its cycle, and the current that follows from it flows until the next cycle.
+    # A reading waits for its control cycle, and the current computed from it flows until the next cycle.
     least = 1.0 / unit.rate_hz + 2.0 / CONTROL_RATE_HZ
     if unit.max_age < least:
-        problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
+        problem = f"is {unit.max_age!r}: the rates of inertial unit and control loop require {least:g} s"
         refuse("inertial_unit.max_age", problem)
     telemetry = config.telemetry
     if telemetry.budget_bytes < 2 * telemetry.segment_bytes:
-        refuse("telemetry.budget_bytes", f"is {telemetry.budget_bytes}: must hold two segments")
+        refuse(
+            "telemetry.budget_bytes",
+            f"is {telemetry.budget_bytes}: must be at least twice `telemetry.segment_bytes`",
+        )
     if config.camera is not None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)
@@ -66,7 +69,7 @@ def check_consistency(config: Config, document: Document) -> None:
             if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
                 refuse(
                     f"wide_cameras[{index}].{name}",
-                    f"is {value!r}: all respond alike, the first has {wanted!r}",
+                    f"is {value!r}: must be equal for all wide-angle cameras, the first has {wanted!r}",
                 )
     if config.solar_strings is not None:
         _check_strings(config, config.solar_strings, refuse)
@@ -78,7 +81,7 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
     times = [step.at for step in config.steps]
     _check_order("steps", times, refuse)
     if config.duration <= times[-1]:
-        refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
+        refuse("duration", f"is {config.duration!r}: must be later than the last target, at {times[-1]!r} s")
 
 
 def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
@@ -103,7 +106,7 @@ def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
         refuse(f"{section}[0].at", f"is {times[0]!r}: the first target must be given at 0")
     for index in range(1, len(times)):
         if times[index] <= times[index - 1]:
-            refuse(f"{section}[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
+            refuse(f"{section}[{index}].at", f"is {times[index]!r}: targets must be in order of time")
 
 
 def _check_coils(config: Config, refuse: Refuse) -> None:
@@ -113,8 +116,8 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
     if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
         refuse(
             "power_monitor.address",
-            f"is 0x{config.power_monitor.address:02x}, the PWM chip's: both leave the factory at 0x40, "
-            "set the monitor's address pins (0x45) and say so here",
+            f"is 0x{config.power_monitor.address:02x}, the address of the PWM chip: "
+            "set another address (0x45) by the monitor's address pins, and give it here",
         )
 
 
@@ -126,7 +129,7 @@ def _check_strings(config: Config, strings: SolarStringsSection, refuse: Refuse)
         if string.address in others:
             refuse(f"{place}.address", f"is 0x{string.address:02x}, the address of another chip on the bus")
         if (string.address, string.channel) in inputs:
-            refuse(f"{place}.channel", f"is {string.channel}: another string is measured there")
+            refuse(f"{place}.channel", f"is {string.channel}: this ADC channel measures another string")
         inputs.add((string.address, string.channel))
         if abs(math.hypot(*string.normal) - 1.0) > 1e-6:
             refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
@@ -145,16 +148,17 @@ def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> Non
         if len(given) != 1:
             refuse(dotted, f"gives {given}: must give one of mode, slew, point, clear")
         if step.point is not None and on_testbed:
-            refuse(f"{dotted}.point", "is of a satellite: the testbed turns by `slew`")
+            refuse(f"{dotted}.point", "is a command for satellites: use `slew` for the testbed")
         check_aim(dotted, step, step.point, refuse)
     if not _is_loopback(commands):
-        problem = "is plain and open beyond this machine: give `link` with keys, and here a loopback address"
-        refuse("commands.udp", f"{commands.udp} {problem}")
+        problem = "accepts unprotected commands from other machines"
+        cure = "give a loopback address, and use `link` with keys"
+        refuse("commands.udp", f"{commands.udp} {problem}: {cure}")
 
 
 def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
     if commands.socket is None:
-        refuse("link", "needs `commands.socket`, by which it hands commands to the flight")
+        refuse("link", "needs `commands.socket`, through which it passes commands to the flight")
     if link.udp is None and link.tcp is None and link.serial is None:
         refuse("link", "has no line: give `udp`, `tcp` or `serial`")
     if link.telemetry_to is not None and link.udp is None:
@@ -171,32 +175,32 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
     if camera.streak_exposure is not None:
         least, most = camera.streak_exposure
         if not least <= most < camera.period:
-            refuse("camera.streak_exposure", "must rise, and stay below `camera.period`")
+            refuse("camera.streak_exposure", "must be a minimum and a maximum below `camera.period`")
     if camera.objects is not None:
         if camera.star_tracker is None:
             refuse(
-                "camera.objects", "needs `camera.star_tracker`: objects are sighted among identified stars"
+                "camera.objects", "needs `camera.star_tracker`: objects are detected among identified stars"
             )
         if camera.objects.needed > camera.objects.within:
             refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
     if camera.fine_period is not None and not camera.period <= camera.fine_period < camera.max_age:
         refuse(
             "camera.fine_period",
-            f"is {camera.fine_period:g}: from `camera.period`, {camera.period:g}, to less than "
-            f"`camera.max_age`, {camera.max_age:g}",
+            f"is {camera.fine_period:g}: must be at least `camera.period` ({camera.period:g}) and less than "
+            f"`camera.max_age` ({camera.max_age:g})",
         )
     if camera.device is not None:
         pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
         if camera.bits not in possible:
             span = f"{possible[0]}" if len(possible) == 1 else f"{possible[0]} to {possible[-1]}"
-            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {span}")
+            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {span} bits")
 
 
 def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
-    """Return the networks from which the link accepts frames, none without UDP and TCP.
+    """Return the networks from which the link accepts frames; without UDP and TCP there are none.
 
-    The sandbox of the service (`deploy/board_dropin.py`) blocks all other packets. Raises ValueError for an
-    impossible network, and for an address that requires `link.peers`.
+    The sandbox of the systemd service (`deploy/board_dropin.py`) blocks packets of all other networks. Raises
+    ValueError for an invalid network, and for an address that requires `link.peers`.
     """
     hosts = [address.rpartition(":")[0] for address in (link.udp, link.tcp) if address is not None]
     if hosts and link.peers is not None:
@@ -206,15 +210,17 @@ def peer_networks(link: Link) -> tuple[IPv4Network, ...]:
         try:
             own = IPv4Address("127.0.0.1" if host == "localhost" else host)
         except ValueError as error:
-            raise ValueError(f"{host} may be anywhere: say who may connect in `link.peers`") from error
+            raise ValueError(
+                f"{host} is not an IPv4 address: list the permitted senders in `link.peers`"
+            ) from error
         if own.is_unspecified:
-            raise ValueError(f"{host} is every network: say who may connect in `link.peers`")
+            raise ValueError(f"{host} listens on every network: list the permitted senders in `link.peers`")
         networks.append(LOOPBACK if own.is_loopback else IPv4Network((own, _PREFIX), strict=False))
     return tuple(dict.fromkeys(networks))
 
 
 def _is_loopback(commands: Commands) -> bool:
-    """Return whether plain UDP commands, if any, can come from this machine only."""
+    """Return whether unprotected UDP commands are disabled or accepted from this machine only."""
     host = (commands.udp or "localhost:0").rpartition(":")[0]
     try:
         return host == "localhost" or IPv4Address(host).is_loopback

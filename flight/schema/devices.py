@@ -1,6 +1,6 @@
-"""The devices' sections of a configuration: their wiring, and what the flight assumes about them.
+"""The configuration sections of the devices: their wiring, and their assumed properties.
 
-SI units unless the name says otherwise.
+Values are in SI units, unless their name contains another unit.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
 
 
 class InertialUnitSection(Section, frozen=True, kw_only=True):
-    """The VN-100 and its serial line.
+    """The inertial unit, a VN-100, and its serial line.
 
-    The coils stay off when a reading would be older than `max_age` s before the next reading is used.
+    The coils are switched off if a reading would become older than `max_age` s before the next reading is
+    used.
     """
 
     device: str = "/dev/knightcube-imu"
@@ -48,7 +49,7 @@ class InertialUnitSection(Section, frozen=True, kw_only=True):
 
 
 class Coils(Section, frozen=True, kw_only=True):
-    """The PWM chip, the H-bridges and the coils; `bus` is the number or the device file of the I2C bus."""
+    """The PWM chip, the H-bridges and the coils; `bus` is the number or device file of the I2C bus."""
 
     bus: Bus = 1
     address: Address = 0x40
@@ -65,17 +66,17 @@ class Coils(Section, frozen=True, kw_only=True):
 
 
 class PowerMonitorSection(Section, frozen=True, kw_only=True):
-    """The INA219 in the coils' supply."""
+    """The INA219, which measures voltage and current of the coils' supply."""
 
     address: Address = 0x45
     shunt: Positive = 0.1
 
 
 class CameraLens(Section, frozen=True, kw_only=True):
-    """The lens as `python -m flight calibrate` reports it.
+    """The lens parameters that `python -m flight calibrate` reports.
 
-    `focal_length` in px, `centre` is the pixel (x, y) on the optical axis, `k1` and `k2` are the radial
-    distortion.
+    The focal length `focal_length` is in px, `centre` is the pixel (x, y) on the optical axis, and `k1` and
+    `k2` are the coefficients of radial distortion.
     """
 
     focal_length: Positive
@@ -85,11 +86,12 @@ class CameraLens(Section, frozen=True, kw_only=True):
 
 
 class CameraAccuracy(Section, frozen=True, kw_only=True):
-    """Standard deviations of the camera model, on which the reported uncertainty of a streak's rate depends.
+    """Standard deviations of the camera model, which affect the reported uncertainty of rates from streaks.
 
-    `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of a corner
-    relative to its radius, `line_time` is in s. Zero is exact, as in an emulated camera. Without a
-    `line_time` here, a `line_time` of the camera counts as exact.
+    The error `focal_length` is relative, `centre` is in px along x and y, `distortion` is the displacement of
+    an image corner relative to its distance from the centre, and `line_time` is in s. A zero means that the
+    value is exact, as in an emulated camera. Without a `line_time` in this section, the `line_time` of the
+    camera section is considered exact.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
@@ -101,9 +103,10 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
 class StarTrackerSection(Section, frozen=True, kw_only=True):
     """The star tracker.
 
-    `index` is the file of the sky index, by default the one in the cache folder. `scale_error` is the
-    largest relative error of the focal length, 0 for a calibrated camera. `velocity` (m/s with respect to
-    the Sun, in the axes of the attitude) corrects stellar aberration; a testbed has none.
+    The value `index` is the file of the sky index; by default the index in the cache folder is used. The
+    value `scale_error` is the largest relative error of the focal length, or 0 for a calibrated camera. The
+    value `velocity` is the velocity relative to the Sun (m/s, in the reference axes of the attitude) for
+    which stellar aberration is corrected; it is omitted for a testbed.
     """
 
     index: str | None = None
@@ -112,10 +115,10 @@ class StarTrackerSection(Section, frozen=True, kw_only=True):
 
 
 class ObjectTracking(Section, frozen=True, kw_only=True):
-    """Search for moving objects among the stars of each frame, and their tracks.
+    """Search for moving objects among the stars of each frame, and tracking of these objects.
 
-    Detections fainter than magnitude `faintest` (V) are ignored. A track begins after `needed` sightings in
-    `within` frames and ends after `coast` s without a sighting.
+    Detections fainter than the V magnitude `faintest` are ignored. A track begins after `needed` detections
+    in `within` frames, and ends after `coast` s without a detection.
     """
 
     faintest: Annotated[float, Meta(ge=-5.0, le=8.0)] = 7.0
@@ -125,7 +128,11 @@ class ObjectTracking(Section, frozen=True, kw_only=True):
 
 
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
-    """A Video for Linux camera (`hal.drivers.v4l2_camera`); `gain` in its own steps, `stamp_delay` in s."""
+    """A Video for Linux camera (`hal.drivers.v4l2_camera`).
+
+    The value `gain` is in the camera's own steps, `stamp_delay` in s. `gain` in its own steps, `stamp_delay`
+    in s.
+    """
 
     path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"
     pixel_format: Literal["GREY", "Y10", "Y12", "Y16"] = "GREY"
@@ -135,7 +142,7 @@ class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2
 
 
 class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="aravis"):
-    """A GenICam camera by the name that `arv-tool-0.8` lists (`hal.drivers.aravis_camera`)."""
+    """A GenICam camera (`hal.drivers.aravis_camera`), named as the tool `arv-tool-0.8` lists it."""
 
     name: Annotated[str, Meta(min_length=1)]
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
@@ -143,14 +150,17 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="ar
 
 
 class Camera(Section, frozen=True, kw_only=True):
-    """The star camera: properties that are needed to read its frames; `device` is the real camera.
+    """The star camera: properties that are needed to process its frames, and the real camera `device`.
 
-    The stars of a streaked frame are exposed for a time within `streak_exposure` s that follows the rate, all
-    other frames and those without `streak_exposure` for `exposure` s. While the attitude is fine, a frame is
-    taken every `fine_period` s, if that is given, else every `period` s. No exposure begins while the body
-    rotates faster than `max_rate` rad/s, if that is given. A frame is late `late_after` s after the end of
-    its exposure; vision is slow after `vision_slow_after` s. The newest `keep_frames` frames are kept in the
-    folder `frames` of the run.
+    `device` is the real camera.
+
+    A frame in which stars form streaks is exposed for a time within the range `streak_exposure` (s) that
+    depends on the body's rate. All other frames, and all frames without `streak_exposure`, are exposed for
+    `exposure` s. While the attitude is fine, a frame is taken every `fine_period` s, if this value is given,
+    otherwise every `period` s. If `max_rate` is given, no exposure begins while the body rotates faster than
+    `max_rate` rad/s. A frame counts as late `late_after` s after the end of its exposure, and vision counts
+    as slow if a frame takes longer than `vision_slow_after` s. The newest `keep_frames` frames are kept in
+    the folder `frames` of the run.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -183,9 +193,9 @@ class Camera(Section, frozen=True, kw_only=True):
 
 
 class Gps(Section, frozen=True, kw_only=True):
-    """The u-blox receiver on its own serial line.
+    """The u-blox GPS receiver on its own serial line.
 
-    It reports a fix every `period` s; the position is unknown when no fix arrives for `max_age` s.
+    The receiver reports a fix every `period` s; the position is unknown after `max_age` s without a fix.
     """
 
     device: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-gps"
@@ -195,10 +205,11 @@ class Gps(Section, frozen=True, kw_only=True):
 
 
 class SolarString(Section, frozen=True, kw_only=True):
-    """A string of solar cells and the ADC input that measures its current.
+    """A string of solar cells, and the ADC input that measures its current.
 
-    `normal` is its outward unit vector in body axes, `peak` its current (A) at perpendicular sunlight. An
-    amplifier of `volt_per_ampere` feeds input `channel` of the ADS1115 at `address`.
+    The string's outward unit vector `normal` is in body axes; its current is `peak` A at perpendicular
+    sunlight. An amplifier of `volt_per_ampere` feeds the input `channel` of the ADS1115 chip at the I2C
+    address `address`.
     """
 
     normal: Vector
@@ -209,7 +220,7 @@ class SolarString(Section, frozen=True, kw_only=True):
 
 
 class SolarStringsSection(Section, frozen=True, kw_only=True):
-    """The solar strings, measured every `period` s; a reading is stale after `max_age` s."""
+    """The solar cell strings, which are measured every `period` s; a reading is stale after `max_age` s."""
 
     strings: Annotated[tuple[SolarString, ...], Meta(min_length=4, max_length=16)]
     period: Annotated[float, Meta(ge=0.04, le=60.0)] = 0.5
@@ -219,10 +230,10 @@ class SolarStringsSection(Section, frozen=True, kw_only=True):
 class WideCamera(Section, frozen=True, kw_only=True):
     """A wide-angle camera for Sun and horizon.
 
-    A logarithmic `response` spreads `decades` of intensity over the counts above `pedestal`; all cameras
-    have the same response. All cameras are triggered together at the shortest `period`, or at the shortest
-    `fine_period` while the attitude is known to 0.05 deg. `lens_error_deg` is the residual error of the
-    calibrated lens and mounting.
+    A logarithmic `response` maps `decades` decades of intensity to the counts above `pedestal`; all
+    wide-angle cameras must have the same response. All cameras are triggered together, with the shortest
+    `period` of the cameras or, while the attitude is known to 0.05 deg, with the shortest `fine_period`. The
+    angle `lens_error_deg` is the residual error of the calibrated lens and mounting.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -242,14 +253,14 @@ class WideCamera(Section, frozen=True, kw_only=True):
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
     def counts_per_decade(self) -> float:
-        """Return the increase of the counts at ten times the intensity, for a logarithmic response."""
+        """Return the increase of a logarithmic camera's counts for a tenfold increase of the intensity."""
         return float((1 << self.bits) - 1 - self.pedestal) / self.decades
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:
-    """Return the calibrated camera if the section has a lens, else the pinhole of its field of view.
+    """Return the calibrated camera of a section with a lens, otherwise a pinhole of its field of view.
 
-    Raises LensError for an impossible lens.
+    Raises LensError for a lens that cannot exist.
     """
     if camera.lens is None:
         return Pinhole.from_field_of_view(camera.columns, camera.rows, math.radians(camera.field_of_view_deg))
@@ -258,9 +269,10 @@ def camera_model(camera: Camera | WideCamera) -> CameraModel:
 
 
 def camera_knowledge(camera: Camera) -> CameraKnowledge:
-    """Return the uncertainty of the pinhole that represents the camera in the fit of streaks.
+    """Return the uncertainty of the pinhole camera by which the streak fit represents the camera.
 
-    The fit has no lens model, so the deviation of a calibrated lens from the pinhole adds to the uncertainty.
+    The streak fit has no lens model, so the difference between a calibrated lens and the pinhole adds to the
+    uncertainty.
     """
     accuracy = camera.accuracy
     line_time = accuracy.line_time

@@ -1,7 +1,7 @@
-"""Configuration text as plain values and typed sections; errors name file, line, value and what is permitted.
+"""Converts configuration text into plain values and typed sections; errors name file, line, value and cure.
 
 Plain scalars follow the core schema of YAML 1.2: `1e-5` and `0o17` are numbers, `yes` and `12:30` are texts.
-Aliases, duplicate keys, application tags and numbers that are not finite are refused.
+Aliases, duplicate keys, application tags, infinite numbers and NaN are rejected.
 """
 
 from __future__ import annotations
@@ -21,29 +21,32 @@ from msgspec import inspect
 from knightcube.errors import InputError
 
 FOLDER = Path(__file__).parent / "configurations"
-"""Folder of the configurations inside the package, a link to config/ of the repository."""
+"""Folder of the configurations in the package, a link to the folder config of the repository."""
 _LONGEST = 1 << 20
-"""Largest length of a configuration file, in characters."""
+"""Maximum length of a configuration file, in characters."""
 
 
 class ConfigError(InputError):
-    """A configuration that cannot be flown; `where` is the file and, if known, the line of the value."""
+    """A configuration that cannot be flown.
+
+    The attribute `where` is the file and, if known, the line of the wrong value.
+    """
 
 
 class UnreadConfigError(ConfigError):
-    """A configuration with unchecked values: it could not be read whole, or is not the accepted one."""
+    """A configuration whose values were not checked: it cannot be read, or was never accepted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The values of a file, its name, and the lines of the values by dotted name, as `steps[1].at`."""
+    """The values of a configuration file, its name, and the line of each dotted name (`steps[1].at`)."""
 
     values: dict[str, Any]
     name: str
     lines: dict[str, int]
 
     def error(self, dotted: str, problem: str) -> ConfigError:
-        """Return an error about a value, with its line or the line of the nearest section above it."""
+        """Return an error about a value, with the line of the value or of the nearest enclosing section."""
         known = dotted
         while known and known not in self.lines:
             known = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", known)
@@ -52,9 +55,9 @@ class Document:
 
 
 class _Loader(yaml.SafeLoader):
-    """Loads the core schema of YAML 1.2 and refuses aliases.
+    """Loads the core schema of YAML 1.2 and rejects aliases.
 
-    A few lines of aliases can stand for more values than the memory holds.
+    Aliases are rejected, because a few lines of them can expand to more values than the memory holds.
     """
 
     yaml_constructors: ClassVar[dict[Any, Any]] = {
@@ -63,28 +66,28 @@ class _Loader(yaml.SafeLoader):
     }
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Return the next node. Raises ComposerError for an alias."""
+        """Return the next node. Raises ComposerError if the node is an alias."""
         if self.check_event(yaml.AliasEvent):
             mark = self.get_event().start_mark  # type: ignore[no-untyped-call]  # of PyYAML's stubs
             raise yaml.composer.ComposerError(None, None, "an alias (*): write the value out", mark)
         return super().compose_node(parent, index)
 
     def construct_integer(self, node: yaml.ScalarNode) -> int:
-        """Return a decimal, octal (0o) or hexadecimal (0x) number. Raises ValueError."""
+        """Return the integer of a decimal, octal (0o) or hexadecimal (0x) number. Raises ValueError."""
         text = self.construct_scalar(node)
         return int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
 
     def construct_number(self, node: yaml.ScalarNode) -> float:
-        """Return a floating-point number; `.inf` and `.nan` are spelled as in YAML. Raises ValueError."""
+        """Return a floating-point number; infinity and NaN are `.inf` and `.nan`. Raises ValueError."""
         text = self.construct_scalar(node)
         return float(re.sub(r"\.(?=inf|nan)", "", text.lower()))
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the texts that the core schema of YAML 1.2 would read as another kind of value."""
+    """Quotes the texts that the core schema of YAML 1.2 would otherwise read as numbers, booleans or null."""
 
 
-# PyYAML resolves plain scalars by YAML 1.1.
+# The following patterns replace those of PyYAML, which resolve plain scalars by YAML 1.1.
 _Loader.yaml_implicit_resolvers = _Dumper.yaml_implicit_resolvers = {}
 for _kind, _pattern in (
     ("null", r"(?:null|Null|NULL|~|)$"),
@@ -99,16 +102,20 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
 
 
 def config_path(text: str) -> Path:
-    """Return the file that an argument names: a configuration of the package by its bare name, or a path.
+    """Return the file of a command line argument, which is the name of a packaged configuration or a path.
 
-    `step_demo` is a name; `step_demo.yaml` and `./step_demo` are paths.
+    `step_demo` is a name; For example, `step_demo` is a name, whereas `step_demo.yaml` and `./step_demo` are
+    paths.
     """
     packaged = FOLDER / f"{text}.yaml"
     return packaged if re.fullmatch(r"\w+", text) and packaged.is_file() else Path(text)
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file. Raises ConfigError when it cannot be read or is longer than 1 MiB."""
+    """Return the text of a configuration file.
+
+    Raises ConfigError if it cannot be read or is longer than 1 MiB.
+    """
     try:
         with path.open(encoding="utf-8") as file:
             text = file.read(_LONGEST + 1)  # a device may have no end
@@ -122,36 +129,36 @@ def read_text(path: Path) -> str:
 
 
 def names() -> list[str]:
-    """Return the bare names of the package's configurations."""
+    """Return the bare names of the packaged configurations."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
 def no_such_file() -> str:
-    """Return the message about a missing file, with the names of the package's configurations."""
-    return f"no such file; by name there are {', '.join(names())}"
+    """Return the message about a missing file, which lists the names of the packaged configurations."""
+    return f"no such file; the packaged configurations are {', '.join(names())}"
 
 
 def checked_length(text: str, path: Path) -> str:
-    """Return the text of a file. Raises ConfigError when it is longer than 1 MiB."""
+    """Return the text of a file unchanged. Raises ConfigError if the text is longer than 1 MiB."""
     if len(text) > _LONGEST:
         raise ConfigError(str(path), f"is longer than {_LONGEST} characters")
     return text
 
 
 def read_document(text: str, name: str) -> Document:
-    """Return the values of YAML text; `name` stands for the file in messages. Raises ConfigError."""
+    """Return the values of a YAML text. In messages, `name` stands for the file. Raises ConfigError."""
     lines: dict[str, int] = {}
     try:
         loader = _Loader(text)
         node = loader.get_single_node()
         for child, line in _lines_of(node, ""):
             if child in lines:
-                raise ConfigError(f"{name}:{line}", f"`{child}` stands twice, first in line {lines[child]}")
+                raise ConfigError(f"{name}:{line}", f"`{child}` is given twice, first in line {lines[child]}")
             lines[child] = line
         values = None if node is None else loader.construct_document(node)
     except RecursionError as error:
         raise ConfigError(name, "is nested too deeply") from error
-    # The other exceptions come from a value that does not fit its explicit tag, such as `!!int x`.
+    # Apart from YAMLError, these exceptions come from values that do not fit their explicit tag (`!!int x`).
     except (yaml.YAMLError, ValueError, LookupError, ArithmeticError, AttributeError, TypeError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark else name
@@ -165,18 +172,18 @@ def read_document(text: str, name: str) -> Document:
 
 
 def to_yaml(values: dict[str, Any]) -> str:
-    """Return plain values as YAML text, in their order."""
-    # ASCII only: PyYAML folds some Unicode line breaks that it does not escape.
+    """Return plain values as YAML text, without changing their order."""
+    # The text is ASCII only, because PyYAML folds some Unicode line breaks that it does not escape.
     return yaml.dump(values, Dumper=_Dumper, default_flow_style=False, sort_keys=False)
 
 
 def join(prefix: str, key: str) -> str:
-    """Return the dotted name of a key, or of an index in brackets, under a prefix."""
+    """Return the dotted name of a key, or of an index in brackets, below a prefix."""
     return f"{prefix}.{key}" if prefix and key and not key.startswith("[") else prefix + key
 
 
 def _lines_of(node: yaml.Node | None, dotted: str) -> Iterator[tuple[str, int]]:
-    """Yield the dotted name and the line of every value under a node."""
+    """Yield the dotted name and the line of every value below a node."""
     if isinstance(node, yaml.MappingNode):
         children = [(join(dotted, str(key.value)), key, value) for key, value in node.value]
     elif isinstance(node, yaml.SequenceNode):
@@ -210,13 +217,13 @@ _NOUNS = {
     "`bool`": "true or false",
     "`null`": "nothing",
 }
-"""Plain nouns for msgspec's names of types."""
+"""Plain nouns for the type names in the messages of msgspec."""
 _LONGEST_VALUE = 200
-"""Largest number of characters of a value in a message."""
+"""Maximum number of characters of a value in a message."""
 
 
 def convert(document: Document, shape: type[T], section: str = "") -> T:
-    """Return a section of a document, or all of it, as `shape`. Raises ConfigError."""
+    """Return a document, or one section of it, as an object of the type `shape`. Raises ConfigError."""
     tree: Any = document.values[section] if section else document.values
     try:
         return msgspec.convert(tree, shape)
@@ -238,7 +245,7 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
             for key, index in _steps_of(path):
                 value = value[key] if key else value[int(index)]
         except (KeyError, IndexError, TypeError, ValueError):
-            pass  # msgspec writes [...] for an element whose index it does not know
+            pass  # msgspec writes [...] for an unknown index
         else:
             if not isinstance(value, dict):
                 text = repr(value)
@@ -248,12 +255,12 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
 
 
 def _steps_of(path: str) -> list[tuple[str, str]]:
-    """Return the steps of a msgspec path such as `.coils.channels[1]`: (key, "") or ("", index)."""
+    """Split a msgspec path such as `.coils.channels[1]` into keys (key, "") and indices ("", index)."""
     return re.findall(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]", path)
 
 
 def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
-    """Suggest the right name for an unknown key of the struct found along `path`."""
+    """Suggest the right name for an unknown key of the msgspec struct at `path`."""
     for step in re.findall(r"\.([^.\[]+)", path):
         fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
         tree = tree.get(step) if isinstance(tree, dict) else None
@@ -266,9 +273,9 @@ def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
 
 
 def _struct_of(annotation: Any, tree: Any) -> Any:
-    """Return the struct inside an annotation such as `Camera | None` or `tuple[Step, ...]`.
+    """Return the struct class in an annotation such as `Camera | None` or `tuple[Step, ...]`.
 
-    Of several tagged structs it is the one whose tag is in `tree`.
+    If the annotation holds several tagged structs, return the struct whose tag is in `tree`.
     """
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
         config = annotation.__struct_config__
@@ -281,7 +288,7 @@ def _struct_of(annotation: Any, tree: Any) -> Any:
 
 
 def _permitted(message: str, shape: Any, path: str) -> str:
-    """Return msgspec's message about the value at a `path` of a `shape`, with the permitted values."""
+    """Return msgspec's message about the value at `path`, with the permitted values of the type `shape`."""
     kinds: list[inspect.Type] = _alternatives(inspect.type_info(shape))
     for key, index in _steps_of(path):
         kinds = [
@@ -301,7 +308,7 @@ def _permitted(message: str, shape: Any, path: str) -> str:
 
 
 def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
-    """Return the members of a union, with the descriptions of each."""
+    """Return the members of a union type, with the metadata of each."""
     if isinstance(kind, inspect.Metadata):
         return [kind, *_alternatives(kind.type)]
     if isinstance(kind, inspect.UnionType):
@@ -310,7 +317,7 @@ def _alternatives(kind: inspect.Type) -> list[inspect.Type]:
 
 
 def _within(kind: inspect.Type, key: str, index: str) -> list[inspect.Type]:
-    """Return the types at a key or an index of a type; the tag of a union's section is a choice."""
+    """Return the types permitted at a key or index of a type; for the tag of a union, its choices."""
     if isinstance(kind, inspect.StructType) and key:
         if key == kind.tag_field:
             return [inspect.LiteralType((kind.tag,))]

@@ -1,4 +1,4 @@
-"""The configuration of a satellite in orbit: its own sections beside those of every body."""
+"""The configuration of a satellite in orbit, whose sections supplement those of every body."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from flight.schema.values import Aim, GoalName, NotNegative, Positive, Section, 
 from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
-"""Range of valid magnetometer readings, T: 1.5e-5 to 6.5e-5 in a low orbit, and as much from the coils."""
+"""Range of valid magnetometer readings, T.
+
+In a low orbit the field is 1.5e-5 to 6.5e-5 T, and the coils may add as much.
+"""
 
 ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
 class Craft(Section, frozen=True, kw_only=True):
-    """The flight application's model of the satellite.
+    """The model of the satellite that the flight application uses.
 
-    `inertia` are the moments of inertia about the body axes, kg m^2; `dipole_per_ampere` is turns times area
-    of each coil, m^2.
+    Each satellite has the moments of inertia `inertia` about the body axes, kg m^2. The value
+    `dipole_per_ampere` is the number of turns times the area of each coil, m^2.
     """
 
     inertia: tuple[Positive, Positive, Positive]
@@ -32,10 +35,10 @@ class Craft(Section, frozen=True, kw_only=True):
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control`).
 
-    `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. `torque_noise` (rad/s
-    per sqrt(s)) stands for unmodelled torques. The plan covers `horizon` s and is renewed every `replan` s. A
-    body slower than `gentle` rad/s at the start never exceeds its initial rate; a faster body may reach
-    `spin_up` times its initial rate.
+    The noise `field_noise` (T, per axis and sample) includes constant errors of the magnetometer. The noise
+    `torque_noise` (rad/s per sqrt(s)) represents unmodelled torques. The momentum plan covers `horizon` s and
+    is renewed every `replan` s. A body that starts slower than `gentle` rad/s never exceeds its initial rate;
+    a faster body may reach `spin_up` times its initial rate.
     """
 
     field_noise: Positive = 5.0e-7
@@ -47,13 +50,15 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
 
 
 class OrbitEstimation(Estimation, frozen=True, kw_only=True):
-    """The filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
+    """The attitude filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
 
-    `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s); `field_noise` the noise per axis of a
-    magnetometer sample, T. `torque_start` is the torque expected before any is estimated, N m: drag at 500 km
-    and twice the solar pressure. `torque_walk` is its random walk, N m per sqrt(s). Both are smaller for a
-    light satellite, because an estimated torque along the field enters plans for an hour. Since the last boot
-    the gyro bias may have changed by 10 deg/h, the dipole by the part `changed` of its initial deviation.
+    The value `bias_walk` is the random walk of the gyro bias, rad/s per sqrt(s), and `field_noise` is the
+    noise of a magnetometer sample, T per axis. The value `torque_start` is the expected size (N m) of the
+    disturbance torques before they are estimated: drag at an altitude of 500 km plus twice the solar
+    radiation pressure. The value `torque_walk` is the random walk of these torques, N m per sqrt(s). Both
+    torque values should be smaller for a light satellite, because plans extrapolate an estimated torque along
+    the field for an hour. From one boot to the next, the gyro bias may change by 10 deg/h, and the residual
+    dipole by the fraction `changed` of its initial standard deviation.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -66,26 +71,28 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
 
 
 class ExclusionCones(Section, frozen=True, kw_only=True):
-    """Smallest angles between the star camera's boresight and the Sun, the Moon and the limb of the Earth."""
+    """Minimum angles from the star camera's boresight to the Sun, the Moon and the limb of the Earth."""
 
     sun_deg: ConeAngle | None = None
     earth_deg: ConeAngle | None = None
     moon_deg: ConeAngle | None = None
 
     def angles(self) -> dict[str, float]:
-        """Return the angles of the given cones, rad, by the name of the body."""
+        """Return the configured cone angles, rad, by the name of the celestial body."""
         found = {"sun": self.sun_deg, "earth": self.earth_deg, "moon": self.moon_deg}
         return {name: math.radians(angle) for name, angle in found.items() if angle is not None}
 
 
 class PointingSection(Section, frozen=True, kw_only=True):
-    """Pointing of a satellite (`knightcube.gnc.control`).
+    """Pointing of a satellite in orbit (`knightcube.gnc.control`).
 
-    `axis` of the body points at the target; a given roll is measured from `across`, perpendicular to it.
-    Errors of `turn` rad and `rate` rad/s and a dipole of `dipole` A m^2 have equal cost, as does a rotation
-    of `roll` rad about `axis`; without `roll` this costs as any other rotation. The coils act for `act` s
-    between pauses as long as the detumbler's. Plans are renewed every `replan_period` s. A slew to a distant
-    target takes `slew` s, if that suffices, with the star camera outside the `cones`.
+    The body axis `axis` points at the target; a commanded roll angle is measured from the body axis `across`,
+    which is perpendicular to it. An attitude error of `turn` rad, a rate error of `rate` rad/s and a dipole
+    of `dipole` A m^2 have equal cost. A roll error of `roll` rad about `axis` has the same cost; without
+    `roll`, a roll error costs as much as any other attitude error. Between pauses, which last as long as
+    those of detumbling, the coils act for `act` s. Plans are renewed every `replan_period` s. A slew to a
+    distant target takes `slew` s, or longer if necessary, and respects the exclusion `cones` of the star
+    camera.
     """
 
     axis: Vector = (0.0, 0.0, 1.0)
@@ -101,22 +108,23 @@ class PointingSection(Section, frozen=True, kw_only=True):
 
 
 class TargetStep(Aim, frozen=True, kw_only=True):
-    """A goal to point to from `at` s of mission time on."""
+    """A pointing goal that is in force from mission time `at` (s) on."""
 
     at: NotNegative
     point: GoalName
 
     def target(self) -> PointingTarget:
-        """Return the target. Raises UsageError for a missing value or one of another goal."""
+        """Return the target. Raises UsageError for a missing value, and for a value of another goal."""
         return self.target_at(self.point)
 
 
 class Requirements(Section, frozen=True, kw_only=True):
-    """Requirements that `flight report` checks for an orbit flight; an absent requirement is not checked.
+    """Requirements that `flight report` checks for an orbit flight; an omitted requirement is not checked.
 
-    `slow_within` s is the longest time from the start to the end of detumbling, `fine_within` s from there to
-    a fine attitude. `knowledge_deg` limits the rms error of the attitude with stars, all axes; `pointing_deg`
-    limits the rms error of the pointed axis after a target was pointed to for ten minutes.
+    Detumbling must end within `slow_within` s of the start, and the attitude must be fine within
+    `fine_within` s after that. The value `knowledge_deg` limits the rms error of the attitude with star
+    fixes, over all axes. The value `pointing_deg` limits the rms error of the pointing axis from ten minutes
+    after the start of pointing on.
     """
 
     slow_within: Positive | None = None
@@ -137,25 +145,28 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     requirements: Requirements = Requirements()
 
     def looks_for_objects(self) -> bool:
-        """Return whether the star camera finds moving objects."""
+        """Return whether the star camera searches for moving objects."""
         camera = self.camera
         return camera is not None and camera.star_tracker is not None and camera.objects is not None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
+        """Return the minimum and the maximum strength (T) of a valid magnetometer reading."""
         return LEAST_FIELD, LARGEST_FIELD
 
     def replan_period(self) -> float:
-        """Return the period of planning, s."""
+        """Return the planning period, s."""
         return self.pointing.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of the hardware to which learned parameters apply."""
+        """Return the hardware sections on which the validity of learned parameters depends."""
         return (self.craft, *super().hardware())
 
 
 def as_orbit(config: Config) -> OrbitConfig:
-    """Return the configuration of a satellite in orbit. Raises ConfigError for another body."""
+    """Return a configuration, which must be that of a satellite in orbit.
+
+    Raises ConfigError for any other body.
+    """
     if not isinstance(config, OrbitConfig):
         raise ConfigError("body", f"is {config.body}: this needs the configuration of a satellite in orbit")
     return config

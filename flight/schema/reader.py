@@ -1,6 +1,6 @@
-"""Reading of a configuration: from YAML to a validated `flight.schema.sections.Config`.
+"""Reads configurations: from YAML to a validated `flight.schema.sections.Config`.
 
-Each error is one line with the file, the line, the value and its cure.
+Each error is one line that names the file, the line, the value and its cure.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
 
 _FIELDS = {*TestbedConfig.__struct_fields__, *OrbitConfig.__struct_fields__}
-"""Names of the sections of all bodies."""
+"""Names of the top-level sections of all bodies."""
 
 
 def load(path: Path) -> Config:
@@ -31,12 +31,12 @@ def load(path: Path) -> Config:
 
 
 def parse(text: str, name: str = "configuration") -> Config:
-    """Validate configuration text; `name` stands for the file in messages. Raises ConfigError."""
+    """Validate a configuration text. In messages, `name` stands for the file. Raises ConfigError."""
     document = read_document(text, name)
     for optional in ("camera", "power_monitor", "gps", "solar_strings"):
         if document.values.get(optional) == "none":
             document.values[optional] = None
-    # A body outside this repository has the testbed's sections.
+    # A body defined outside this repository uses the sections of the testbed.
     shape = OrbitConfig if document.values.get("body") == "orbit" else TestbedConfig
     config: Config = convert(document, shape)
     check_consistency(config, document)
@@ -44,7 +44,10 @@ def parse(text: str, name: str = "configuration") -> Config:
 
 
 def load_testbed(path: Path) -> TestbedConfig:
-    """Read and validate a configuration of the testbed. Raises ConfigError, also for another body's."""
+    """Read and validate a configuration of the testbed.
+
+    Raises ConfigError, also for the configuration of another body.
+    """
     try:
         return as_testbed(load(path))
     except ConfigError as error:
@@ -54,7 +57,7 @@ def load_testbed(path: Path) -> TestbedConfig:
 def load_camera(path: Path) -> Camera:
     """Read the camera of a configuration, or of a file with only a `camera` section.
 
-    Raises ConfigError, also when there is no camera.
+    Raises ConfigError, also if there is no camera.
     """
     text = read_text(path)
     document = read_document(text, str(path))
@@ -67,7 +70,7 @@ def load_camera(path: Path) -> Camera:
 
 
 def placed(error: UsageError, text: str, name: str) -> UsageError:
-    """Add file and line to an error that begins with the dotted name of a value; return others unchanged."""
+    """Add file and line to an error that begins with a value's dotted name; return other errors unchanged."""
     where, _, problem = str(error).partition(": ")
     if where.partition(".")[0].partition("[")[0] not in _FIELDS:
         return error
@@ -75,14 +78,15 @@ def placed(error: UsageError, text: str, name: str) -> UsageError:
 
 
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
-    """Return the `simulation` section of configuration text as `shape`, None when there is none.
+    """Return the `simulation` section of a configuration text as `shape`, or None if there is none.
 
-    The section's shape belongs to the simulator, which this package does not know. Raises ConfigError.
+    The type `shape` of this section is defined by the simulator, which this package does not import. Raises
+    ConfigError.
     """
     document = read_document(text, name)
     return None if document.values.get("simulation") is None else convert(document, shape, "simulation")
 
 
 def replace(section: S, **changes: Any) -> S:
-    """Return a section with some values changed."""
+    """Return a copy of a section with some values changed."""
     return msgspec.structs.replace(section, **changes)

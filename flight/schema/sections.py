@@ -1,8 +1,8 @@
-"""The sections of every body's configuration, each value with its bounds.
+"""The configuration sections that every body has, with the bounds of each value.
 
-A configuration holds what the flight application assumes and how its devices are wired. The simulated world
-is described by the `simulation` section, whose shape belongs to sim_hal (`sim_hal.settings`). SI units unless
-the name says otherwise.
+A configuration contains the assumptions of the flight application and the wiring of its devices. The
+simulated world is described by the section `simulation`, whose type is defined in `sim_hal.settings`. Values
+are in SI units, unless their name contains another unit.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CONTROL_RATE_HZ = 40.0
 
 
 class Executive(Section, frozen=True, kw_only=True):
-    """Time limits of the workers, s."""
+    """Time limits (s) for the jobs of the workers."""
 
     planner_timeout: Positive = 2.0
     vision_timeout: Positive = 10.0
@@ -49,11 +49,11 @@ class Executive(Section, frozen=True, kw_only=True):
 class Estimation(Section, frozen=True, kw_only=True):
     """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance.
 
-    `bias_start` (rad/s, gyro bias), `gain_start` (coils) and `latency_start` (s, age of the inertial unit's
-    samples at their stamp) are initial standard deviations; zero fixes the state. The latency walks by
-    `latency_walk` s per sqrt(s). For `coast` s without a measurement the model propagates the estimate, but
-    drives no coil (`inertial_unit.max_age`). A value that an earlier boot learned may have changed by the
-    part `changed` of its initial standard deviation.
+    The initial standard deviations are `bias_start` (gyro bias, rad/s), `gain_start` (coil gains) and
+    `latency_start` (age of an inertial unit's sample at its time stamp, s). A zero keeps the state fixed. The
+    latency has the random walk `latency_walk`, s per sqrt(s). Without measurements, the estimate is
+    propagated by the model for `coast` s, but the coils stay off (`inertial_unit.max_age`). From one boot to
+    the next, a learned value may change by the fraction `changed` of its initial standard deviation.
     """
 
     current_noise: NotNegative = 2.0e-3
@@ -69,15 +69,16 @@ class Estimation(Section, frozen=True, kw_only=True):
 
 
 class Modes(Section, frozen=True, kw_only=True):
-    """The first mode, and the conditions for mode changes (`flight.loop.modes`).
+    """The initial mode, and the conditions of mode changes (`flight.loop.modes`).
 
-    After `crash_limit` recent unclean shutdowns the first mode is safe instead of `initial`. A slew has
-    arrived when it stays within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s; it is late
-    after `slew_limit` s. Holding fails when the error exceeds `hold_error` rad for `hold_patience` s; in the
-    demonstration this is checked from the end of the first path to a target. Above `tumble_rate` rad/s the
-    body rotates too fast to hold or slew. After `blind_limit` s without an estimate the mode is safe. A body
-    that acquires its attitude changes to the mode `acquired` when the attitude has been known for `known_for`
-    s, and acquires the attitude again after `lost_for` s without it.
+    After `crash_limit` recent unclean shutdowns, the flight starts in the mode safe instead of `initial`. A
+    slew has arrived when its error stays within `arrived_angle` rad and `arrived_rate` rad/s for
+    `arrived_for` s, and is late after `slew_limit` s. Holding fails when the error exceeds `hold_error` rad
+    for `hold_patience` s. In the demonstration, this is checked only after the end of the first path to a
+    target. A body faster than `tumble_rate` rad/s is too fast to hold an attitude or to slew. After
+    `blind_limit` s without an estimate, the mode changes to safe. A body that acquires its attitude changes
+    to the mode `acquired` when the attitude has been known for `known_for` s, and returns to acquisition when
+    the attitude has been unknown for `lost_for` s.
     """
 
     initial: PlainMode = "testbed-demo"
@@ -97,10 +98,11 @@ class Modes(Section, frozen=True, kw_only=True):
 
 
 class Detumble(Section, frozen=True, kw_only=True):
-    """Detumbling by the magnetometer, which measures while the coils are off.
+    """Detumbling with the magnetometer, which is read while the coils are off.
 
-    Each cycle waits `settle` s for the coils' field to decay, averages the field for `measure` s and drives
-    the coils for `act` s. Detumbling ends when the rate has been below `low_rate` rad/s for `low_for` s.
+    In each cycle, the coils are off for `settle` s until their field has decayed, the field is averaged for
+    `measure` s, and the coils act for `act` s. Detumbling ends when the rate has been below `low_rate` rad/s
+    for `low_for` s.
     """
 
     settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
@@ -111,11 +113,12 @@ class Detumble(Section, frozen=True, kw_only=True):
 
 
 class Health(Section, frozen=True, kw_only=True):
-    """Limits of the board's resources (`flight.loop.health`), checked every `look_period` s.
+    """Limits of the board's resources (`flight.loop.health`), which are checked every `look_period` s.
 
-    `cpu_share` is relative to one core. `memory` and `disk_free` are in bytes. `memory_slope` is in bytes per
-    hour over at least `slope_window` s, from `warm_up` s on. Temperatures are in degree C: `temperature`
-    causes a warning, `hottest` is too hot.
+    The processor load `cpu_share` is relative to one core. The limits `memory` and `disk_free` are in bytes.
+    The growth limit `memory_slope`, in bytes per hour, applies after `warm_up` s and over at least
+    `slope_window` s. Temperatures are in degrees Celsius: exceeding `temperature` causes a warning, exceeding
+    `hottest` a reaction.
     """
 
     look_period: Annotated[float, Meta(ge=0.5, le=600.0)] = 5.0
@@ -130,9 +133,10 @@ class Health(Section, frozen=True, kw_only=True):
 
 
 class CommandStep(Aim, frozen=True, kw_only=True):
-    """One command of a time line, sent at `at` s of mission time.
+    """A command of the time line, executed at mission time `at` (s).
 
-    The command is a mode, a slew to q2, a goal to point to with its values, or an event to clear.
+    The command is one of: a mode, a slew to a q2, a pointing goal with its values, or the clearing of an
+    event.
     """
 
     at: NotNegative
@@ -143,9 +147,10 @@ class CommandStep(Aim, frozen=True, kw_only=True):
 
 
 class Commands(Section, frozen=True, kw_only=True):
-    """Sources of commands: a UNIX datagram socket, UDP on a bench, and a time line.
+    """Sources of commands: a UNIX datagram socket, UDP on a test bench, and a time line.
 
-    `udp` (HOST:PORT) must be a loopback address; other machines send commands through the `link`, with keys.
+    The address `udp` (HOST:PORT) must be a loopback address; other machines send protected commands through
+    the `link`.
     """
 
     socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
@@ -154,7 +159,7 @@ class Commands(Section, frozen=True, kw_only=True):
 
 
 class LinkSerial(Section, frozen=True, kw_only=True):
-    """A serial line to a radio: device file and bits per second."""
+    """A serial line to a radio: its device file and bit rate (bit/s)."""
 
     device: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")]
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
@@ -163,11 +168,12 @@ class LinkSerial(Section, frozen=True, kw_only=True):
 class Link(Section, frozen=True, kw_only=True):
     """The link process (`python -m flight link`), which exchanges protected frames with the ground.
 
-    `keys` is the folder of keys and counters (`python -m ground keys`), `spacecraft` the identifier in each
-    frame. `udp` and `tcp` listen at HOST:PORT and accept frames from `peers` only. Without `peers`, a
-    loopback address accepts this machine, any other address its network of 256 addresses. `serial` is the
-    line of a radio. Telemetry goes to authenticated senders, to `telemetry_to` (HOST:PORT, UDP), to all
-    clients of `tcp` and to `serial`, in frames of `frame_bytes` bytes and at most `rate` bytes/s per line.
+    The folder `keys` contains keys and counters (`python -m ground keys`), and `spacecraft` is the identifier
+    in each frame. The addresses `udp` and `tcp` (HOST:PORT) accept frames only from the networks `peers`.
+    Without `peers`, a loopback address accepts frames from this machine, any other address from its network
+    of 256 addresses. The value `serial` describes the line of a radio. Telemetry is sent to authenticated
+    senders, to `telemetry_to` (HOST:PORT, UDP), to all clients of `tcp` and to `serial`. Its frames have
+    `frame_bytes` bytes, and each line carries at most `rate` bytes/s.
     """
 
     keys: Annotated[str, Meta(min_length=1)]
@@ -182,7 +188,7 @@ class Link(Section, frozen=True, kw_only=True):
 
 
 class Telemetry(Section, frozen=True, kw_only=True):
-    """Largest sizes of a log segment, of all segments of a log, and of all runs of an archive."""
+    """Maximum sizes (bytes) of a log segment, of all segments of a log, and of all runs in an archive."""
 
     segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
     budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
@@ -190,9 +196,10 @@ class Telemetry(Section, frozen=True, kw_only=True):
 
 
 class State(Section, frozen=True, kw_only=True):
-    """Storage of the state that outlives the process (`flight.loop.state`), written every `period` s.
+    """Storage of the state that survives a restart (`flight.loop.state`), written every `period` s.
 
-    Without a `folder`, a flight of real devices uses systemd's STATE_DIRECTORY and any other stores nothing.
+    Without `folder`, a flight with real devices uses systemd's STATE_DIRECTORY, and any other flight stores
+    nothing.
     """
 
     folder: Annotated[str, Meta(min_length=1)] | None = None
@@ -200,9 +207,9 @@ class State(Section, frozen=True, kw_only=True):
 
 
 class Config(Section, frozen=True, kw_only=True):
-    """The sections of every body's configuration; the configuration of a body adds its own.
+    """The configuration sections of every body; the configuration of a body adds more sections.
 
-    `body` names the body; a body outside this repository is named as `module:object`.
+    The value `body` names the body; a body outside this repository is named as `module:object`.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
@@ -227,17 +234,17 @@ class Config(Section, frozen=True, kw_only=True):
     simulation: dict[str, Any] | None = None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
+        """Return the minimum and the maximum strength (T) of a valid magnetometer reading."""
         return 0.0, self.inertial_unit.field_range
 
     def replan_period(self) -> float | None:
-        """Return the period of planning from the newest estimate, s; None for a body that plans nothing."""
+        """Return the period (s) of planning from the newest estimate, or None for a body without plans."""
         return None
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of the hardware to which learned parameters apply."""
+        """Return the hardware sections on which the validity of learned parameters depends."""
         return (self.coils, self.inertial_unit)
 
     def shortened(self, duration: float) -> Self:
-        """Return the configuration of a flight of `duration` s."""
+        """Return the configuration with another flight duration, s."""
         return msgspec.structs.replace(self, duration=duration)

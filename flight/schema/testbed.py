@@ -1,4 +1,4 @@
-"""The configuration of the testbed: its own sections beside those of every body."""
+"""The configuration of the testbed, whose sections supplement those of every body."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flight.schema.values import Q2, NotNegative, Positive, Section
 
 
 class Plant(Section, frozen=True, kw_only=True):
-    """The flight application's model of the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
+    """The flight application's model of body and actuator (Sease thesis, tables 5.1, 5.3 and 5.4)."""
 
     inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
     coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
@@ -24,7 +24,7 @@ class Plant(Section, frozen=True, kw_only=True):
 
 
 class ThreadEstimation(Estimation, frozen=True, kw_only=True):
-    """The filter on the thread, which also estimates torsion (1/s^2) and damping (1/s) beyond the plant's."""
+    """The testbed's filter, which also estimates changes of the plant's torsion (1/s^2) and damping (1/s)."""
 
     torsion_start: NotNegative = 0.02
     damping_start: NotNegative = 4.0e-3
@@ -33,8 +33,9 @@ class ThreadEstimation(Estimation, frozen=True, kw_only=True):
 class BdotDetumble(Detumble, frozen=True, kw_only=True):
     """Detumbling by B-dot (`knightcube.gnc.control.detumble`).
 
-    Each cycle removes the part `share` of the rate, as far as the coils can. If the direction of the field
-    rotates by `field_turn` rad/s, the share follows from that; a testbed without a cage has zero.
+    Each cycle removes the fraction `share` of the rate, as far as the coils' limits permit. If the direction
+    of the field rotates at `field_turn` rad/s, this fraction is computed from that rate. On a testbed without
+    a cage, `field_turn` is zero.
     """
 
     share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
@@ -42,9 +43,11 @@ class BdotDetumble(Detumble, frozen=True, kw_only=True):
 
 
 class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15); `flight.bodies.testbed.control` explains the strategies.
+    """Path planning by virtual motion camouflage (Sease thesis, eqs. 5.8-5.15).
 
-    `cost` is the energy that paths minimise: heat R I^2 of the mean current, or V |I| taken from the supply.
+    The planning strategies are described in `flight.bodies.testbed.control`.
+
+    Paths minimise the energy `cost`: the heat R I^2 of the mean current, or the supplied power V |I|.
     """
 
     strategy: Literal["goal", "receding", "step"] = "goal"
@@ -58,7 +61,7 @@ class Guidance(Section, frozen=True, kw_only=True):
 
 
 class PidGains(Section, frozen=True, kw_only=True):
-    """Gains of the PID controller on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
+    """Gains of the PID controller for the angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
 
     proportional: Positive
     integral: Positive
@@ -68,9 +71,10 @@ class PidGains(Section, frozen=True, kw_only=True):
 class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
-    `lq` and `thesis` use the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight. `pid` and
-    `adaptive` use the bandwidth and the values after it; `gains` replace the bandwidth of `pid`.
-    `python -m flight identify` flies `excitation`.
+    The controllers `lq` and `thesis` use the weights of the Sease thesis, eqs. 5.30-5.32: Q = state_weight I
+    and R = control_weight. The controllers `pid` and `adaptive` use `bandwidth` and the values that follow
+    it. If `gains` are given, `pid` uses them instead of the bandwidth. The controller `excitation` is used by
+    `python -m flight identify`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
@@ -86,8 +90,8 @@ class Control(Section, frozen=True, kw_only=True):
 class Identification(Section, frozen=True, kw_only=True):
     """Motion of the body during `python -m flight identify`.
 
-    The coils use the part `current_share` of their current. The body stays within `largest_q2`; each free
-    swing lasts `swing` s.
+    The coils use at most the fraction `current_share` of their current limit. The body stays within
+    `largest_q2`, and each free oscillation lasts `swing` s.
     """
 
     current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
@@ -96,7 +100,7 @@ class Identification(Section, frozen=True, kw_only=True):
 
 
 class Step(Section, frozen=True, kw_only=True):
-    """One commanded attitude: q2 from `at` s of mission time on, at `rate` rad/s; rate 0 holds it."""
+    """One commanded attitude: `q2` at mission time `at` (s), then rotation at `rate` rad/s."""
 
     at: NotNegative
     q2: Q2
@@ -104,10 +108,10 @@ class Step(Section, frozen=True, kw_only=True):
 
 
 class Cage(Section, frozen=True, kw_only=True):
-    """A Helmholtz cage that reproduces the field of an orbit (`bodies.testbed.cage`), by UTC.
+    """A Helmholtz cage that reproduces the magnetic field of an orbit by UTC (`bodies.testbed.control`).
 
-    `elements` are two-line elements of the orbit, `scale` is the ratio of the cage's field to the orbit's.
-    `plant.field` is then the weakest field that plans assume.
+    The orbit is given by the two-line elements `elements`; `scale` is the ratio of the cage's field to the
+    orbit's field. With a cage, `plant.field` is the weakest field that plans assume.
     """
 
     elements: tuple[str, str]
@@ -117,7 +121,7 @@ class Cage(Section, frozen=True, kw_only=True):
 class TestbedConfig(Config, frozen=True, kw_only=True):
     """The testbed's configuration."""
 
-    __test__ = False  # pytest would collect a class of this name
+    __test__ = False  # without this, pytest would collect the class
 
     plant: Plant
     estimation: ThreadEstimation = ThreadEstimation()
@@ -129,25 +133,25 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
     cage: Cage | None = None
 
     def field_range(self) -> tuple[float, float]:
-        """Return the smallest and the largest magnitude of a valid magnetometer reading, T."""
+        """Return the minimum and the maximum strength (T) of a valid magnetometer reading."""
         return 0.2 * self.plant.field, 3.0 * self.plant.field
 
     def replan_period(self) -> float:
-        """Return the period of planning from the newest estimate, s."""
+        """Return the period (s) of planning from the newest estimate."""
         return self.guidance.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
-        """Return the sections of the hardware to which learned parameters apply."""
+        """Return the hardware sections on which the validity of learned parameters depends."""
         return (self.plant, *super().hardware())
 
     def shortened(self, duration: float) -> Self:
-        """Return the configuration of a flight of `duration` s, without the later steps."""
+        """Return the configuration with another flight duration (s), without the steps after its end."""
         steps = tuple(step for step in self.steps if step.at < duration)
         return msgspec.structs.replace(self, duration=duration, steps=steps)
 
 
 def as_testbed(config: Config) -> TestbedConfig:
-    """Return the configuration of the testbed. Raises ConfigError for another body."""
+    """Return a configuration, which must be that of the testbed. Raises ConfigError for any other body."""
     if not isinstance(config, TestbedConfig):
         raise ConfigError("body", f"is {config.body}: this needs a configuration of the testbed")
     return config

@@ -1,4 +1,4 @@
-"""Types of the values in a configuration, with their bounds, and the values of a pointing goal."""
+"""Types of configuration values with their bounds, and the values of a pointing goal."""
 
 from __future__ import annotations
 
@@ -54,21 +54,21 @@ _OWN = {
     "ground": ("latitude_deg", "longitude_deg"),
     "object": ("right_ascension_deg", "declination_deg"),
 }
-"""Keys that a goal requires and no other goal accepts; `object` accepts both of its keys or none."""
+"""Keys that a goal requires and no other goal accepts; `object` requires both of its keys or none."""
 _LENGTH_ERROR = 1e-3
-"""Largest deviation of a commanded quaternion from unit length."""
+"""Largest accepted deviation of a commanded quaternion's norm from 1."""
 
 
 class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """One section of the configuration; unknown keys are refused."""
+    """A section of the configuration, in which unknown keys are errors."""
 
 
 class Aim(Section, frozen=True, kw_only=True):
-    """The values of a pointing goal.
+    """The values that describe a pointing goal.
 
-    The goal `inertial` requires `quaternion` (ICRS into body, scalar last), and `ground` latitude and
-    longitude. Right ascension and declination tell the goal `object` where to search. Without `roll_deg` the
-    roll is free.
+    The goal `inertial` requires `quaternion` (ICRS to body, scalar last), and `ground` requires latitude and
+    longitude. For the goal `object`, right ascension and declination give the direction of the search. If
+    `roll_deg` is omitted, the roll angle is free.
     """
 
     quaternion: Quaternion | None = None
@@ -79,7 +79,10 @@ class Aim(Section, frozen=True, kw_only=True):
     roll_deg: Longitude | None = None
 
     def target_at(self, goal: str) -> PointingTarget:
-        """Return the target at a goal. Raises UsageError for a missing value or one of another goal."""
+        """Return the pointing target for a goal.
+
+        Raises UsageError for a missing value, and for a value of another goal.
+        """
         angles = (self.latitude_deg, self.longitude_deg, self.right_ascension_deg, self.declination_deg)
         numbers = tuple(math.radians(value) for value in angles if value is not None)
         roll = None if self.roll_deg is None else math.radians(self.roll_deg)
@@ -87,7 +90,7 @@ class Aim(Section, frozen=True, kw_only=True):
 
 
 def check_aim(dotted: str, aim: Aim, goal: str | None, refuse: Callable[[str, str], None]) -> None:
-    """Refuse missing values and values of another goal; without a goal, refuse all values."""
+    """Report wrong values through `refuse`: missing values, and values of another goal or without a goal."""
     for owner, names in _OWN.items():
         needed = owner == goal and (
             owner != "object" or any(getattr(aim, name) is not None for name in names)

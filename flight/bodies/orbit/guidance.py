@@ -96,7 +96,8 @@ class PointingPaths:
         flown = table.below(self._fastest)
         if flown is None:
             turn, most = np.rad2deg([table.fastest, self._fastest])
-            return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
+            limit = f"above {most:.2f} it is detumbled or the camera pauses"
+            return f"it turns the body at {turn:.2f} deg/s, and {limit}"
         self._law, self._target, self._origin_ns = PointingLaw(flown, self._limit), target, origin_ns
         self.off, self._arrival_ns = 0.0, None
         self.astray.planned()
@@ -419,7 +420,8 @@ class PointingPlanner:
         self._objects.aim(goal)
         if astray.since is not None:
             if not self._held:
-                text = f"{math.degrees(self._paths.off):.0f} deg off its path: held still, then planned for"
+                degrees = math.degrees(self._paths.off)
+                text = f"{degrees:.0f} deg off its path: damping the rotation before a new plan"
                 self._events.report(events.ASTRAY, now_ns, text)
             self._held = True
             if not astray.ready:

@@ -583,7 +583,7 @@ class CageField:
         if least < weakest:
             raise ConfigError(
                 "plant.field",
-                f"is {weakest:g}: the cage's field falls to {least:.3g} T, plans may count on no more",
+                f"is {weakest:g}: must not exceed {least:.3g} T, the weakest field of the cage",
             )
 
     def at(self, now_ns: int) -> FloatArray:

@@ -40,8 +40,11 @@ def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expec
 @pytest.mark.parametrize(
     ("lines", "problem"),
     [
-        ("udp: '0.0.0.0:5000'", r"`link.udp` 0\.0\.0\.0 is every network: say who may connect"),
-        ("tcp: 'board:5000'", r"`link.tcp` board may be anywhere: say who may connect"),
+        (
+            "udp: '0.0.0.0:5000'",
+            r"`link.udp` 0\.0\.0\.0 listens on every network: list the permitted senders",
+        ),
+        ("tcp: 'board:5000'", r"`link.tcp` board is not an IPv4 address: list the permitted senders"),
         ("udp: '10.0.0.1:5000', peers: [10.0.0.5/24]", r"`link.peers` 10\.0\.0\.5/24 has host bits"),
         ("udp: '10.0.0.1:5000', peers: [10.0.0.500]", "`link.peers` .*not permitted"),
         ("udp: '10.0.0.1:5000', peers: [ground]", "`link.peers"),
@@ -57,7 +60,9 @@ def test_lines_that_make_no_sense_are_refused_with_what_would(lines: str, proble
 
 @pytest.mark.parametrize("address", ["192.168.7.2:5000", "0.0.0.0:5000", "board:5000"])
 def test_plain_commands_from_beyond_the_machine_are_refused(address: str) -> None:
-    with pytest.raises(ConfigError, match=r"`commands.udp` .* is plain and open beyond this machine"):
+    with pytest.raises(
+        ConfigError, match=r"`commands.udp` .* accepts unprotected commands from other machines"
+    ):
         networks("udp: '10.0.0.1:5000'", f"{{socket: /run/x, udp: '{address}'}}")
 
 
@@ -79,7 +84,7 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "complaint"),
     [
-        ("channel: 1}", "channel: 0}", r"`solar_strings.strings\[1\].channel` is 0: another string"),
+        ("channel: 1}", "channel: 0}", r"`solar_strings.strings\[1\].channel` is 0: this ADC channel"),
         (
             "channel: 0}",
             "channel: 0, address: 0x40}",
@@ -94,7 +99,7 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         (
             "period: 10.0}\n\n",
             "period: 10.0, bits: 9}\n\n",
-            r"wide_cameras\[5\].bits` is 9: all respond alike.*8",
+            r"wide_cameras\[5\].bits` is 9: must be equal for all wide-angle cameras.*8",
         ),
         ("  star_tracker: {}", "  objects: {}", "`camera.objects` needs `camera.star_tracker`"),
         (
@@ -105,12 +110,12 @@ def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
         (
             "  star_tracker: {}",
             "  star_tracker: {}\n  device: {kind: v4l2, pixel_format: Y10}",
-            "`camera.bits` is 16: pixels of Y10 have 10$",
+            "`camera.bits` is 16: pixels of Y10 have 10 bits$",
         ),
         (
             "duration:",
             "telemetry: {segment_bytes: 9000, budget_bytes: 17999}\nduration:",
-            "hold two segments",
+            "at least twice `telemetry.segment_bytes`",
         ),
     ],
 )

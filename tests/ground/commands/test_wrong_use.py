@@ -73,7 +73,7 @@ def test_the_plan_s_configuration_is_found_in_any_folder(
         ),
         ("name: step-demo", "body: nobody\nname: x", ":5: `body` is 'nobody': name one of testbed"),
         ("inertia:", "coil_tuns: 1\n  #", "`plant.coil_tuns` is an unknown key, did you mean"),
-        ("steps:", "telemetry: {segment_bytes: 9000, budget_bytes: 17000}\nsteps:", "must hold two segments"),
+        ("steps:", "telemetry: {segment_bytes: 9000, budget_bytes: 17000}\nsteps:", "must be at least twice"),
         ("steps:", "commands: {udp: nowhere}\nsteps:", "expected HOST:PORT, such as"),
         (
             "steps:",

@@ -113,7 +113,7 @@ def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, 
     first, last = sample.law.span
     assert first == table.path.times[0]
     assert last == table.path.times[6 * count // 10 - 1]
-    assert "braked" in paths.offer(soon, NADIR, 0)
+    assert "detumbled" in paths.offer(soon, NADIR, 0)
     assert sample.law is paths.sample(SECOND_NS).law  # type: ignore[union-attr] # it was not replaced
 
 

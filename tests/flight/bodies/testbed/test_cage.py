@@ -113,7 +113,7 @@ def test_plans_may_not_count_on_more_field_than_the_cage_makes(
     config: TestbedConfig, section: Simulation
 ) -> None:
     strong = configuration.replace(config, plant=configuration.replace(config.plant, field=4.5e-4))
-    with pytest.raises(ConfigError, match=r"plant.field.*the cage's field falls to 0.000189 T"):
+    with pytest.raises(ConfigError, match=r"plant.field.*must not exceed 0.000189 T"):
         _field(strong, section)
     assert config.cage is not None
     none = configuration.replace(config, cage=Cage(elements=("1 nothing", "2 nothing")))
