@@ -1,4 +1,4 @@
-"""Frames of the real sky with satellites in it, as jobs of the vision worker."""
+"""Frames of the real sky with satellites, as jobs of the vision worker."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ TIMES = np.linspace(-0.1, 0.1, 9)
 def frame_job(
     held: FloatArray, turn: FloatArray, satellites: Sequence[SourceTrack], knows: bool = True, seed: int = 11
 ) -> FrameJob:
-    """Return the job of a frame of a camera at `held` (4,) in mid-exposure that turns by `turn` (3,) rad/s.
+    """Return the job for a frame with attitude `held` (4,) at mid-exposure and rate `turn` (3,) rad/s.
 
-    `knows`: whether attitude and rate are known before, to 1e-4.
+    `knows` states whether attitude and rate are known in advance, to 1e-4.
     """
     rng = np.random.default_rng(seed)
     attitudes = np.array([multiply(from_rotation_vector(turn * t), held) for t in TIMES])

@@ -1,4 +1,4 @@
-"""Properties of a frame: background, regions, hot pixels and saturation."""
+"""Tests of the properties of a frame: background, regions, hot pixels and saturation."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def test_a_sloping_background_is_followed_within_its_sampling_error() -> None:
     pixels = np.rint(slope + rng.normal(0.0, 12.0, slope.shape)).astype(np.uint16)
     background = estimate_background(pixels)
     error = background.map(background.level) - slope
-    # 256 samples a block give 12/16 counts: six times that for the worst of 64 blocks, the rim apart.
+    # The error is 12/16 counts for 256 samples per block. The worst of 64 blocks may have six times as much.
     assert np.abs(error[:, 32:-32]).max() < 4.5
-    # Within a block the slope spans 12.8 counts: sqrt(12^2 + 12.8^2/12) = 12.6.
+    # The slope spans 12.8 counts within a block, so that the noise is sqrt(12^2 + 12.8^2/12) = 12.6.
     assert background.noise.mean() == pytest.approx(12.6, rel=0.03)
 
 
@@ -44,7 +44,7 @@ def test_streaks_hardly_move_level_and_noise() -> None:
     camera = star_camera(512)
     pixels = star_frame(camera, rate_at(0.5 * np.pi, 0.02), 1.0, seed=2)
     background = estimate_background(pixels)
-    # Pedestal 100 and 50 electrons of dark; read noise 10 and the dark's own: sqrt(150).
+    # The level is 100 counts plus 50 electrons of dark current, with a noise of sqrt(100 + 50).
     assert np.median(background.level) == pytest.approx(150.0, abs=1.0)
     assert np.median(background.noise) == pytest.approx(np.sqrt(150.0), rel=0.05)
 
@@ -94,7 +94,7 @@ SPIRAL = (np.hypot(Y - 100, X - 75) + np.arctan2(Y - 100, X - 75) * 6.0 / np.pi)
         (X + Y) % 40 < 3,
         (X % 7 < 2) | (RNG.random((200, 150)) < 0.02),
         SPIRAL,
-        X % 149 == 0,  # the ends of rows touch nothing
+        X % 149 == 0,  # regions at the ends of rows must not be joined
     ],
 )
 def test_regions_are_scipys_numbered_by_their_first_pixels(mask: BoolArray) -> None:
@@ -157,7 +157,7 @@ def test_weights_interpolate_between_block_centres_and_are_constant_beyond() -> 
 
 
 def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> None:
-    """A line of 12 px along the first diagonal, each of its 12,001 points spread evenly over 1 px^2."""
+    """The line is 12 px long and diagonal, and each of its 12,001 points is spread evenly over 1 px^2."""
     rng = np.random.default_rng(5)
     along = np.linspace(-6.0, 6.0, 12_001)
     spread = rng.normal(0.0, 0.8, (2, len(along)))
@@ -165,7 +165,7 @@ def test_moments_are_those_of_a_uniform_line_on_any_side_of_a_point_spread() -> 
     x, y = 40.0 + along * np.sqrt(0.5) + spread[0], 30.0 + along * np.sqrt(0.5) + spread[1]
     light = np.full(len(along), 2.0)
     owner = np.zeros(len(along), dtype=np.int64)
-    # The second region has light in one pixel, the third none.
+    # The second region has counts in one pixel only, and the third region has zero counts.
     both = np.append(owner, [1, 2])
     found = moments(both, np.append(x, [7.0, 9.0]), np.append(y, [8.0, 9.0]), np.append(light, [4.0, 0.0]), 3)
     assert found.flux.tolist() == pytest.approx([24_002.0, 4.0, 0.0])
@@ -191,10 +191,10 @@ def test_the_line_of_second_moments_has_their_length_and_direction() -> None:
     ("neighbours", "hot"),
     [
         ([0.0] * 8, True),  # one bright pixel alone
-        ([17.9, 17.9, *[0.0] * 6], True),  # 15 % of 100 counts and three sigmas of 1 count are 18 counts
+        ([17.9, 17.9, *[0.0] * 6], True),  # 15 % of 100 counts plus three sigmas of 1 count are 18 counts
         ([18.1, 18.1, *[0.0] * 6], False),
         ([90.0, *[0.0] * 7], True),  # two bright pixels alone
-        ([90.0, 15.9, *[0.0] * 6], True),  # the third pixel is below 15 % of the brightest and one sigma
+        ([90.0, 15.9, *[0.0] * 6], True),  # third pixel below 15 % of the brightest pixel plus one sigma
         ([90.0, 16.1, *[0.0] * 6], False),
     ],
 )
@@ -207,14 +207,14 @@ def test_hot_pixels_are_one_or_two_bright_pixels_with_dark_neighbours(
 
 
 def test_the_limit_of_a_faint_hot_pixel_is_a_fraction_of_its_light() -> None:
-    for second, hot in ((2.9, True), (3.1, False)):  # 30 % of 10 counts, at a noise of 1 count
+    for second, hot in ((2.9, True), (3.1, False)):  # limit: 30 % of 10 counts, at a noise of 1 count
         assert are_hot(np.array([10.0, second, *[0.0] * 7])[:, None], np.ones(1)).tolist() == [hot]
 
 
 def test_hot_pixels_are_found_where_they_stand_and_nowhere_on_the_border() -> None:
     signal = np.zeros((12, 15), dtype=np.float32)
     signal[4, 6] = signal[0, 3] = signal[11, 14] = 100.0
-    signal[8:10, 9:11] = 100.0  # four in a square are not hot
+    signal[8:10, 9:11] = 100.0  # four bright pixels in a square are not hot
     row, column = find_hot_pixels(signal, np.ones_like(signal))
     assert (row.tolist(), column.tolist()) == ([4], [6])
     assert not len(find_hot_pixels(signal, np.full_like(signal, 13.0**2))[0])  # below eight sigmas
@@ -237,7 +237,7 @@ def test_a_plateau_of_bright_counts_holds_more_pixels_than_the_counts_below_it()
     assert saturation_of_bright(bright, frame, None) == 1000.0
     assert saturation_of_bright(bright, frame, 800.0) == 800.0
     assert saturation_of_bright(bright[:-1], frame, None) == 65_535.0  # three pixels are too few
-    crowded = np.concatenate([bright, np.full(3, 995.0)])  # within 2 % of the range below the plateau
+    crowded = np.concatenate([bright, np.full(3, 995.0)])  # counts within 2 % of the range below the plateau
     assert saturation_of_bright(crowded, frame, None) == 65_535.0
     assert saturation_of_bright(np.zeros(0), frame, None) == 65_535.0
 

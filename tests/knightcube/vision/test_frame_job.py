@@ -1,4 +1,4 @@
-"""The vision worker's job: whatever a frame shows, one answer of rate and attitude, none of them false."""
+"""Tests of the vision worker's job, which never returns a wrong rate or attitude."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _ESTIMATORS: list[LikelihoodSettings | StreakEstimator] = [
     LikelihoodSettings(saturation=65_535),
     CornerEstimator(StreakSettings()),
 ]
-# rad, whole angle: the turn about the boresight, ten times the worst, within a pixel at the frame's corner.
+# Rotation angle (rad) about the boresight that moves the frame's corner by one pixel.
 _RIGHT = 1.0 / NARROW.pinhole.half_diagonal / NARROW.pinhole.focal_length
 
 
@@ -83,7 +83,10 @@ def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost
 def test_a_streaked_frame_without_a_known_rate_is_solved_all_the_same(
     estimator: LikelihoodSettings | StreakEstimator,
 ) -> None:
-    """The direction of time is in doubt, the middle of the exposure is not."""
+    """Without a rate prior, the sign of the rotation is unknown.
+
+    The attitude at mid-exposure is not affected.
+    """
     frame = _frame(40.0)
     found = run(replace(_job(frame, estimator), rate_prior=None))
     assert found.motion.status is StreakStatus.AMBIGUOUS

@@ -1,4 +1,4 @@
-"""The job of the wide cameras: the solar strings' Sun where no camera has it."""
+"""Tests of the job of the horizon cameras, with the Sun from the solar strings if no camera shows it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from knightcube.vision.solar_cells import SolarStringModel
 
 SUN, NADIR = np.array([-0.59, 0.13, 0.80]), np.array([0.66, -0.62, -0.42])
 SHARES = np.array([0.14, 0.14, 0.83, 0.61, 0.15, 0.11])
-"""Of the strings' peaks, in a flight with the Earth opposite to the Sun: it lights +x and -y, too."""
+"""Currents relative to the peak currents, with the Earth opposite to the Sun and illuminating +x and -y."""
 CAMERA = MountedCamera(Pinhole.from_field_of_view(64, 64, 1.0), np.array([0.0, 0.0, 0.0, 1.0]))
 POSITION, SUNWARD = np.array([-4e6, 4e6, -3.9e6]), np.array([0.2, 0.3, 0.9])
 
 
 def attitude() -> FloatArray:
-    """Return the attitude (4,) whose nadir is NADIR."""
+    """Return the attitude (4,) in which the nadir is NADIR."""
 
     def frame(first: FloatArray, second: FloatArray) -> FloatArray:
         x, z = first / np.linalg.norm(first), np.cross(first, second)
@@ -30,7 +30,7 @@ def attitude() -> FloatArray:
 
 
 def off_deg(sigma: float) -> float:
-    """Return how far off the strings' Sun is, deg, with an attitude known to `sigma` rad."""
+    """Return the error (deg) of the Sun from the solar strings, with an attitude known to `sigma` rad."""
     knowledge = HorizonKnowledge(position=POSITION, attitude=RoughAttitude(attitude(), sigma))
     dark = np.zeros((64, 64), dtype=np.uint8)
     found = run(HorizonCameraJob({0: dark}, (CAMERA,), knowledge, (SolarStringModel(), SHARES))).sun

@@ -1,4 +1,4 @@
-"""The calibration of a lens: drawn lenses are found, and undetermined terms are named and left out."""
+"""Tests of the lens calibration: recovery of simulated lenses, and omission of undetermined terms."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _begun(field_deg: float = 20.0) -> Pinhole:
 
 
 def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
-    """Return a lens some 2 %, 10 px and, at the corners, several px off the one begun with."""
+    """Return a lens that differs from the initial camera by about 2 %, 10 px and some corner distortion."""
     return Lens(
         begun.columns,
         begun.rows,
@@ -50,7 +50,7 @@ def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
 def _frames(
     rng: np.random.Generator, lens: Lens, count: int, stars: int, wrong: float = 0.0, noise: float = 0.1
 ) -> tuple[list[MatchedFrame], FloatArray]:
-    """Return frames at random attitudes (count, 4); a part `wrong` of all matches are exchanged stars."""
+    """Return frames at random attitudes (count, 4), with a fraction `wrong` of matches exchanged."""
     frames, attitudes = [], []
     for _ in range(count):
         attitude = normalise(rng.normal(size=4))
@@ -96,7 +96,7 @@ def test_without_a_prior_the_stars_alone_give_the_same_lens() -> None:
     assert _squared_error(found, truth) < chi2.ppf(0.9999, 5)
     assert found.sigma["centre_x"] < 1.0
     assert found.degrees == 10 * 40 * 2 - 5 - 30
-    # A turn of 0.1 px/sqrt(40) across; more about the boresight, and where the centre is off.
+    # The error across the axis is 0.1 px/sqrt(40), and the error about the boresight is larger.
     assert np.max(angle_between(found.attitudes, attitudes)) < 5.0 / truth.focal_length
 
 
@@ -123,7 +123,7 @@ def test_the_wrong_matches_are_reported() -> None:
 
 
 def test_a_lens_begun_with_far_off_is_found_too() -> None:
-    """Eight per cent of the focal length, and distortion of 40 px at the corners."""
+    """The initial focal length is wrong by 8 %, and the distortion is 40 px at the corners."""
     rng = np.random.default_rng(85)
     begun = _begun()
     truth = Lens(1024, 1024, 1.08 * begun.focal_length, (540.0, 490.0), -1.0, 0.5)
@@ -144,7 +144,7 @@ def test_one_narrow_frame_leaves_the_centre_and_the_distortion_to_the_prior_and_
 
 
 def test_what_the_prior_leaves_is_as_uncertain_as_it_says() -> None:
-    """Lenses drawn from the prior, two narrow frames each: the whole error still matches the covariance."""
+    """For lenses drawn from the prior and two narrow frames each, the error agrees with the covariance."""
     rng = np.random.default_rng(87)
     prior = LensPrior(0.01, 8.0, 0.1, 0.2)
     runs, errors = 40, 0.0
@@ -178,7 +178,7 @@ def test_sigmas_that_are_too_small_are_made_up_for_in_the_covariance() -> None:
 
 
 def test_the_derivatives_are_those_of_the_projection() -> None:
-    """One step from nearby lands on the truth to the square of the distance, and so only with all of them."""
+    """A step from nearby reaches the truth with a quadratic error if all derivatives are correct."""
     rng = np.random.default_rng(89)
     truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3)
     frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)
@@ -234,7 +234,7 @@ def test_each_sigma_has_its_parameters_name() -> None:
 
 
 def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, float]:
-    """Return the error of each key of `camera.accuracy`, as the schema describes it."""
+    """Return the error of each key of `camera.accuracy`, as the configuration schema describes it."""
     lens = found.calibration.lens
     square = (math.hypot(*begun.centre) / lens.focal_length) ** 2
     corner = [
@@ -251,7 +251,7 @@ def _errors(found: DeterminedLens, truth: Lens, begun: Pinhole) -> dict[str, flo
 
 @pytest.mark.parametrize(("field_deg", "count", "stars"), [(20.0, 1, 40), (12.0, 1, 15), (20.0, 3, 20)])
 def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: int, stars: int) -> None:
-    """Terms that were left out count: what they would have changed is part of the error claimed."""
+    """Omitted terms contribute to the accuracy: the change of the fit without them is part of the error."""
     rng, begun = np.random.default_rng(61), _begun(field_deg)
     ratios: dict[str, list[float]] = {"focal_length": [], "centre": [], "distortion": []}
     for _ in range(12):
@@ -266,7 +266,7 @@ def test_the_accuracy_of_a_lens_is_that_of_its_errors(field_deg: float, count: i
 
 
 def test_a_term_that_the_stars_do_not_fix_is_none_of_the_lens_whatever_the_fit_makes_of_it() -> None:
-    """The case of the field: a narrow picture whose k2 comes out at half its prior, and means nothing."""
+    """In a narrow image, the fitted k2 has half its prior standard deviation and is meaningless."""
     rng, begun = np.random.default_rng(62), _begun(6.0)
     for _ in range(5):
         truth = _lens(rng, begun)
@@ -301,7 +301,7 @@ def test_a_lens_without_distortion_is_given_none_and_the_axis_of_one_narrow_fram
 def test_the_distortion_is_stated_if_the_stars_halve_what_the_prior_leaves_open(
     share: float, known: bool
 ) -> None:
-    """The displacement of a corner by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
+    """The expected displacement of a corner is that by k1 = 1 and k2 = 3 at a squared tangent of 0.25."""
     lens = Lens(1024, 1024, 2.0 * math.hypot(511.5, 511.5), (511.5, 511.5), 0.0, 0.0)
     corner = math.hypot(1.0 * 0.25, 3.0 * 0.25**2)
     covariance = np.diag([0.0, 4.0, 4.0, (share * corner / 0.25) ** 2, 0.0])

@@ -1,4 +1,4 @@
-"""Solar strings, simulated and read: coarse Sun, eclipse, the Earth's light; which camera comes first."""
+"""Tests of the solar strings with simulated currents: Sun, eclipse, Earth light, and camera order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 
 def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray, FloatArray, int, int]:
-    """Return errors (n,) rad and normalised squares (n,) of sunlit readings, and mistakes about darkness."""
+    """Return errors (n,) rad and normalised squares (n,) of readings, and counts of wrong darkness."""
     generator = np.random.default_rng(seed)
     errors, squares, false_dark, false_light = [], [], 0, 0
     for _ in range(count):
@@ -47,12 +47,15 @@ def _reading(seed: int, nadir_known: bool, count: int = 400) -> tuple[FloatArray
 
 @pytest.mark.parametrize(("nadir_known", "limit"), [(True, 2.0), (False, 3.5)])
 def test_the_coarse_sun_is_good_to_a_few_degrees_and_knows_how_good(nadir_known: bool, limit: float) -> None:
-    """400 random orbits' points and attitudes, seed 5; 2 % of gain error a string, albedo 0.3."""
+    """The readings are from 400 random positions and attitudes.
+
+    Each string has a gain error of 2 %, and the albedo is 0.3.
+    """
     errors, squares, false_dark, false_light = _reading(5, nadir_known)
     assert len(errors) > 250
     assert np.degrees(np.sqrt(np.mean(errors**2))) < limit
     assert np.mean(squares) < 2.3
-    assert np.percentile(squares, 95) < 6.0  # what 95 of 100 honest ones keep
+    assert np.percentile(squares, 95) < 6.0  # 95 % quantile for two degrees of freedom
     assert false_dark == 0
     assert false_light == 0
 
@@ -72,9 +75,9 @@ def test_ideal_strings_have_the_cosine_law_and_give_the_direction_back() -> None
 
 
 def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_the_view_factor() -> None:
-    """Close above the subsolar point of a matt sphere: of the plate's half of the sky it fills (R/r)^2.
+    """Close above the subsolar point of a diffuse sphere, the Earth fills (R/r)^2 of the plate's half sky.
 
-    The mean solar cosine of the ground, weighted by the plate's, is near one: within some percent at 200 km.
+    The mean solar cosine of the ground in view is near one, within a few per cent at 200 km.
     """
     position = np.array([EARTH_RADIUS + 200e3, 0.0, 0.0])
     model = SolarCellsModel(STRINGS.normals, STRINGS.peaks, np.zeros(6), grazing=0.0, noise=0.0)
@@ -83,14 +86,14 @@ def test_earthlight_on_a_plate_that_faces_the_subsolar_ground_is_albedo_times_th
     view = (EARTH_RADIUS / position[0]) ** 2
     assert currents[0] == pytest.approx(1.0, abs=1e-4)
     assert currents[3] == pytest.approx(0.3 * view, rel=0.05)
-    # On a plate upright to the ground half of that or less, alike on all four sides.
+    # A plate perpendicular to the ground receives half of that or less, equally on all four sides.
     sides = currents[[1, 2, 4, 5]]
     assert np.ptp(sides) < 2e-3
     assert 0.2 * currents[3] < sides.mean() < 0.5 * currents[3]
 
 
 def test_an_unknown_nadir_gives_the_mean_and_the_covariance_of_all_directions_and_albedos() -> None:
-    """Readings of strings under an Earth of random direction and albedo, 200,000 draws."""
+    """The readings are simulated for 200,000 random nadir directions and albedos."""
     generator = np.random.default_rng(11)
     directions = generator.standard_normal((200_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -113,7 +116,7 @@ def test_in_eclipse_the_strings_say_dark() -> None:
 
 
 def test_currents_that_no_sun_makes_are_uncertain() -> None:
-    """A string that gives half as much again as the Sun can; full currents on faces back to back."""
+    """One string has 1.5 times the largest possible current, or opposite faces have full currents."""
     towards = np.array([1.0, 1.0, 1.0]) / np.sqrt(3.0)
     good = np.maximum(STRINGS.normals @ towards, 0.0)
     assert coarse_sun(good, STRINGS).status is CoarseSunStatus.FOUND
@@ -135,7 +138,7 @@ def test_wrong_currents_and_strings_are_refused() -> None:
 
 
 def _cameras() -> list[MountedCamera]:
-    """Return the cameras of UW: three sides 120 deg apart about z, and the top (Meller 4.2)."""
+    """Return the cameras of UW: three sides 120 deg apart and the top (Meller et al., section 4.2)."""
     angles = np.radians([0.0, 120.0, 240.0])
     sides = [np.array([np.cos(a), np.sin(a), 0.0]) for a in angles]
     down = np.array([0.0, 0.0, -1.0])
@@ -156,7 +159,7 @@ def test_the_camera_that_has_the_sun_is_read_first() -> None:
 
 
 def test_a_sun_between_the_fields_is_likely_in_none_and_possible_in_the_nearest() -> None:
-    """2 deg beyond a field's edge with a coarse Sun of 3 deg."""
+    """The Sun is 2 deg beyond the edge of a field of view, and the coarse Sun has an error of 3 deg."""
     towards = np.array([np.cos(np.radians(35.5)), np.sin(np.radians(35.5)), 0.0])
     basis = np.array([[-towards[1], towards[0], 0.0], [0.0, 0.0, 1.0]])
     sun = CoarseSun(CoarseSunStatus.FOUND, towards, basis, np.radians(3.0) ** 2 * np.eye(2))

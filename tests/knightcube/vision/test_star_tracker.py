@@ -1,4 +1,4 @@
-"""The public star tracker, against frames of known attitude."""
+"""Tests of the public star tracker on frames with known attitude."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_an_image_gives_its_attitude_within_the_covariance(resting: SkyFrame) ->
 
 
 def test_right_ascension_declination_and_roll_are_those_of_the_quaternion(resting: SkyFrame) -> None:
-    """The boresight is the third row of the attitude matrix; north is up where the roll is zero."""
+    """The boresight is the third row of the attitude matrix, and north is up if the roll is zero."""
     solution = StarTracker(fov_deg=12.0).solve(resting.pixels)
     x, y, z, w = solution.quaternion
     boresight = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
@@ -100,7 +100,7 @@ def test_a_predicted_attitude_is_used_and_a_wrong_one_does_no_harm(resting: SkyF
 
 
 def test_the_date_corrects_aberration_by_at_most_its_constant(resting: SkyFrame) -> None:
-    """The frame was drawn without aberration, so a date moves the answer, by 20.5" at most."""
+    """The frame is simulated without aberration, so that a date changes the attitude by 20.5" at most."""
     tracker = StarTracker(camera=resting.camera.pinhole)
     plain = tracker.solve(resting.pixels)
     naive, aware = datetime(2026, 7, 2, 12), datetime(2026, 7, 2, 12, tzinfo=UTC)

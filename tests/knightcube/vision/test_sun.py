@@ -1,6 +1,7 @@
-"""The Sun's direction from simulated frames, against where it was put; and frames that have none.
+"""Tests of the Sun direction on simulated frames with and without the Sun.
 
-The Sun of several cameras: the strings choose the camera to read, and stand in where none finds it.
+Tests of several cameras: the solar strings choose the camera to read, and give the direction if no camera
+finds the Sun.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
 
 @cache
 def _campaign(name: str) -> Outcome:
-    """Return the results of frames with the Sun in them."""
+    """Return the outcome for frames with the Sun."""
     return frames_with_sun(name, 12, seed=11)
 
 
 @pytest.mark.parametrize(("name", "limit"), [("logarithmic", 0.005), ("linear", 0.01)])
 def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str, limit: float) -> None:
-    """A pixel has 0.15 deg; the disc's core is saturated in both cameras. Twelve frames, seed 11."""
+    """A pixel has 0.15 deg, and the core of the disc is saturated in both cameras. Twelve frames, seed 11."""
     outcome = _campaign(name)
     assert outcome.statuses["found"] + outcome.statuses["partial"] >= 11
     assert np.degrees(np.sqrt(np.mean(np.square(outcome.errors)))) < limit
@@ -46,7 +47,7 @@ def test_the_sun_is_found_to_hundredths_of_a_degree_wherever_it_stands(name: str
 
 @pytest.mark.parametrize("name", ["logarithmic", "linear"])
 def test_the_covariance_is_honest(name: str) -> None:
-    """The mean of 12 chi-squares of two degrees is below 4.3 in 999 of 1,000 honest campaigns."""
+    """The mean of 12 chi-squares with two degrees of freedom is below 4.3 in 99.9 % of cases."""
     squares = _campaign(name).squares
     assert np.mean(squares) < 4.3
     assert max(squares) < 25.0
@@ -54,13 +55,16 @@ def test_the_covariance_is_honest(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_no_frame_without_the_sun_shows_one(name: str) -> None:
-    """Limb, clouds and hot pixels, in the overexposed camera great saturated ones. Three frames, seed 12."""
+    """The frames show limb, clouds and hot pixels, in the overexposed camera large saturated ones.
+
+    Three frames, seed 12.
+    """
     outcome = frames_without_sun(name, 3, seed=12)
     assert outcome.statuses["found"] + outcome.statuses["partial"] == 0
 
 
 def _space_scene(ray: FloatArray) -> EarthScene:
-    """Return a scene that looks away from the Earth, the Sun along `ray` (3,) in camera axes."""
+    """Return a scene that looks away from the Earth, with the Sun along `ray` (3,) in camera axes."""
     position = (6.378e6 + LOW) * np.array([0.0, 0.0, 1.0])
     attitude = pointing(np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
     empty = EarthScene(position, attitude, position + ASTRONOMICAL_UNIT * np.array([0.0, 0.0, 1.0]))
@@ -74,7 +78,7 @@ def _frame_at(x: float, y: float, model: EarthCameraModel, seed: int = 1) -> tup
 
 
 def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_edge() -> None:
-    """The linear camera's disc has a radius of 11 px: its centre stands 2 px in the frame, then outside."""
+    """The disc has a radius of 11 px, and its centre is 2 px inside or outside of the frame."""
     model, settings = CAMERAS["linear"]
     whole, _ = _frame_at(200.0, 300.0, model)
     entire = find_sun(whole, model.lens, settings).sun
@@ -92,7 +96,7 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
 
 
 def test_the_corners_of_a_field_of_92_deg_show_it_too() -> None:
-    """There a pinhole draws the disc out to 1.7 times its width, but not the blur about it."""
+    """In the corners, a pinhole stretches the disc to 1.7 times its width, but not the blur around it."""
     model = wide_model(WideCamera(columns=512, rows=512, field_of_view_deg=92.0))
     for number, (x, y) in enumerate(
         [(36.0, 40.0), (51.0, 479.0), (470.0, 38.5), (466.2, 470.7), (256.0, 30.0)]
@@ -114,7 +118,10 @@ def test_the_same_sun_is_found_in_twelve_bits() -> None:
 
 
 def test_a_sun_that_blooms_over_whole_columns_is_refused_not_guessed() -> None:
-    """All of its charge spills: a streak from top to bottom, of no round rim. Expose for less."""
+    """The charge of the Sun spreads over a whole column, so that the patch has no round rim.
+
+    Expose for less.
+    """
     blooming = replace(CAMERAS["linear"][0], blooming=True)
     frame, _ = _frame_at(300.3, 240.8, blooming)
     solution = find_sun(frame, blooming.lens, LINEAR)
@@ -134,7 +141,7 @@ def test_without_settings_the_camera_is_a_linear_one() -> None:
 
 
 def test_few_pixels_are_read() -> None:
-    """A third of the rows, and those about the Sun once more."""
+    """A third of the rows are read first, and then all rows around the Sun."""
     frame, _ = _frame_at(250.0, 250.0, MODEL)
     solution = find_sun(frame, MODEL.lens, SETTINGS)
     rows = solution.pixels_read / 512
@@ -192,20 +199,20 @@ WIDE_MODEL = EarthCameraModel.fuga15d(seed=1)
 JOINT_SETTINGS = SunSettings()
 DARK = np.full((512, 512), 8, dtype=np.uint8)
 TURNS = np.array([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0]])
-"""Mountings of three cameras, body into camera, as rotation vectors."""
+"""Mountings of three cameras as rotation vectors from body axes to camera axes."""
 MOUNTED = [MountedCamera(WIDE_MODEL.lens, from_rotation_vector(turn)) for turn in TURNS]
 
 
 @pytest.fixture(scope="module")
 def seen() -> tuple[EarthScene, Image]:
-    """Return the Sun in a picture: that of camera 1."""
+    """Return a scene and an image in which camera 1 shows the Sun."""
     generator = np.random.default_rng(3)
     scene = random_sun_scene(generator, WIDE_MODEL, margin=40.0)
     return scene, render(WIDE_MODEL, scene, generator)
 
 
 def _in_body(scene: EarthScene, number: int = 1) -> FloatArray:
-    """Return the true Sun (3,), body axes, of a scene as one camera sees it."""
+    """Return the true Sun (3,) in body axes for a scene of one camera."""
     return MOUNTED[number].in_body(sun_direction(scene))
 
 
@@ -240,7 +247,7 @@ def test_the_strings_stand_in_where_the_cameras_algorithm_fails(seen: tuple[Eart
 
 
 def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthScene, Image]) -> None:
-    """The picture that has the Sun comes from a camera whose field the strings' Sun only brushes."""
+    """The image with the Sun is from a camera whose field of view barely includes the coarse direction."""
     scene, frame = seen
     true = MOUNTED[0].in_body(np.array([0.0, np.sin(0.5), np.cos(0.5)]))
     assert float(true @ _in_body(scene, 0)) < np.cos(0.3)
@@ -252,7 +259,7 @@ def test_a_reflection_far_from_the_strings_sun_is_not_the_sun(seen: tuple[EarthS
 
 
 def test_a_sun_cut_by_the_frames_edge_claims_less(seen: tuple[EarthScene, Image]) -> None:
-    """Its error is the same in frame after frame: up to 0.03 deg where 0.007 was claimed."""
+    """The error of a truncated disc is equal in every frame, up to 0.03 deg for a sigma of 0.007 deg."""
     scene, _ = seen
     turn = shortest_turn(sun_direction(scene), WIDE_MODEL.lens.unit_vectors(np.array([[510.7, 300.0]]))[0])
     cut = replace(scene, attitude=from_matrix(turn @ scene.camera_matrix))

@@ -1,4 +1,4 @@
-"""Image files of each supported kind: written by Pillow, by hand, or kept by the vision worker."""
+"""Tests of image files of each supported kind: from Pillow, from the test, or stored by the vision worker."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SIXTEEN = RNG.integers(0, 65_536, (13, 21)).astype(np.uint16)
 
 
 def _tiff(pixels: Image, order: str, photometric: int = 1, channels: int = 1) -> bytes:
-    """Return an uncompressed 16-bit TIFF of `pixels` in byte order "<" or ">", as TIFF 6.0 has it."""
+    """Return an uncompressed 16-bit TIFF 6.0 file of `pixels` in byte order "<" or ">"."""
     rows, columns = pixels.shape[:2]
     body = pixels.astype(order + "u2").tobytes()
     tags = [
@@ -52,7 +52,7 @@ def _tiff(pixels: Image, order: str, photometric: int = 1, channels: int = 1) ->
     ]
     entries = b""
     for tag, kind, count, value in tags:
-        # A short value stands in the first two of the four bytes.
+        # A two-byte value occupies the first two of the four bytes.
         form = "HHIHxx" if kind == 3 else "HHII"
         entries += struct.pack(order + form, tag, kind, count, value)
     mark = b"II" if order == "<" else b"MM"
@@ -61,7 +61,7 @@ def _tiff(pixels: Image, order: str, photometric: int = 1, channels: int = 1) ->
 
 
 def _png(pixels: Image, colour_type: int, channels: int) -> bytes:
-    """Return a 16-bit PNG of `pixels` repeated over `channels`."""
+    """Return a 16-bit PNG file in which all `channels` are equal to `pixels`."""
 
     def chunk(name: bytes, content: bytes) -> bytes:
         check = zlib.crc32(name + content)
@@ -115,9 +115,9 @@ def test_a_jpeg_is_read_to_its_compression(tmp_path: Path) -> None:
     ("mode", "name"), [("RGB", "a.png"), ("RGBA", "a.png"), ("RGB", "a.tif"), ("P", "a.png"), ("P", "a.tif")]
 )
 def test_colour_becomes_luminance(tmp_path: Path, mode: str, name: str) -> None:
-    """ITU-R BT.601: 0.299 R + 0.587 G + 0.114 B."""
+    """The luminance of ITU-R BT.601 is 0.299 R + 0.587 G + 0.114 B."""
     colours = np.array([[[200, 0, 0], [0, 200, 0], [0, 0, 200], [10, 20, 30]]], dtype=np.uint8)
-    # Of four colours a palette keeps each.
+    # The palette holds all four colours exactly.
     pillow.fromarray(colours).convert(mode, palette=pillow.Palette.ADAPTIVE).save(tmp_path / name)
     image = read_image(tmp_path / name)
     assert image.dtype == np.uint8
@@ -138,7 +138,7 @@ def test_one_bit_becomes_black_and_white(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (6, 4)])
 def test_16_bit_colour_becomes_luminance_of_16_bits(tmp_path: Path, colour_type: int, channels: int) -> None:
-    """All channels the same: the luminance is each pixel's own count, its low byte too."""
+    """If all channels are equal, the luminance equals the 16-bit count of each pixel."""
     path = tmp_path / "a.png"
     path.write_bytes(_png(SIXTEEN, colour_type, channels))
     found = read_image(path)
@@ -266,7 +266,7 @@ def test_photographs_of_the_sky_are_dark_with_bright_stars(
     image = read_image(SKY / name)
     assert image.shape == shape
     assert image.dtype == kind
-    # Bytes in the wrong order would make noise of the 16-bit frames: neighbours would not be alike.
+    # A wrong byte order would turn the 16-bit frames into noise, in which neighbouring pixels differ.
     assert np.median(image) < 0.25 * image.max()
     smooth = np.abs(np.diff(image.astype(float), axis=1))
     assert np.median(smooth) < 0.05 * image.max()
@@ -292,7 +292,7 @@ def test_every_kind_of_pixel_keeps_its_type_and_value(bits: int, kind: str, expe
 
 
 def test_unsigned_numbers_are_what_they_are() -> None:
-    """Stored as value - BZERO (4.4.2.5): 0, 32768 and 65535 as -32768, 0 and 32767."""
+    """FITS 4.4.2.5 stores value - BZERO, so that 0, 32768 and 65535 are stored as -32768, 0 and 32767."""
     stored = np.array([[-32768, 0, 32767]])
     image = primary_image(fits_file(stored.astype(">i2"), 16, BZERO=32768, BSCALE=1), "x.fits")
     assert image.dtype == np.uint16
@@ -304,7 +304,7 @@ def test_unsigned_numbers_are_what_they_are() -> None:
 
 
 def test_a_scale_gives_physical_values() -> None:
-    """Value = BZERO + BSCALE x stored; the exponent of a double with a D."""
+    """The value is BZERO + BSCALE times the stored value, with a D in the exponent of a double."""
     image = primary_image(fits_file(PIXELS.astype(">i2"), 16, BZERO="-1.5", BSCALE="2.5D-1"), "x.fits")
     assert image.dtype == np.float64
     assert image.tolist() == (-1.5 + 0.25 * PIXELS).tolist()

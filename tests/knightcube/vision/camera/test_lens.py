@@ -1,8 +1,8 @@
-"""The calibrated camera: against the pinhole, against its own polynomial, and what it refuses.
+"""Tests of the calibrated lens against the pinhole and against its own polynomial, and of rejected lenses.
 
-The pinhole camera against its definition.
+Tests of the pinhole camera against its definition.
 
-Exposures follow the rate, so that streaks have a length of use.
+The exposure time is chosen by the rate, so that streaks have a measurable length.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def test_without_distortion_it_is_the_pinhole() -> None:
 
 
 def test_a_star_falls_where_the_polynomial_says() -> None:
-    """At tan 10 deg east of the axis, f = 1000 px: 176.33 (1 - 0.3 x 0.031091 + 0.1 x 0.00096666) px."""
+    """For f = 1000 px, a star 10 deg off the axis is at 176.33 (1 - 0.3 x 0.031091 + 0.1 x 0.00096666) px."""
     lens = Lens(2000, 2000, 1000.0, (990.0, 1010.0), -0.3, 0.1)
     direction = np.array([[np.sin(np.radians(10.0)), 0.0, np.cos(np.radians(10.0))]])
     expected = [990.0 + 176.326981 * (1.0 - 0.3 * 0.0310912041 + 0.1 * 0.000966662976), 1010.0]
@@ -57,7 +57,7 @@ def test_unit_vectors_undo_the_projection_to_a_nanopixel(
     except LensError:
         assume(False)
     points = _points(2)
-    # Where the curve is all but flat at the edge a pixel says little of the direction, yet is met again.
+    # Even if the distortion curve is nearly flat at the edge, a direction is projected back onto its pixel.
     vectors = lens.unit_vectors(points)
     assert np.max(np.abs(lens.project(vectors) - points)) < 1e-9
     assert np.allclose(np.linalg.norm(vectors, axis=-1), 1.0, rtol=0.0, atol=1e-14)
@@ -65,7 +65,7 @@ def test_unit_vectors_undo_the_projection_to_a_nanopixel(
 
 @given(k1=st.floats(-2.0, 2.0), k2=st.floats(-2.0, 2.0))
 def test_a_lens_is_refused_exactly_when_its_image_folds_within_the_detector(k1: float, k2: float) -> None:
-    """The stretched tangent, followed step by step, reaches the corner's before it stops to grow, or not."""
+    """A lens is valid if the distorted tangent grows up to the corner of the image."""
     corner = np.hypot(512.0, 512.0) / 512.0
     tangent = np.linspace(0.0, 6.0, 60_001)
     stretched = tangent * (1.0 + k1 * tangent**2 + k2 * tangent**4)
@@ -83,7 +83,7 @@ def test_a_direction_beyond_the_fold_is_not_seen_again_within() -> None:
     lens = Lens(200, 200, 1000.0, (99.5, 99.5), -0.5)
     tangents = np.array([0.1, 0.8, 1.0, 1.4])
     points = lens.project(np.stack([tangents, 0.0 * tangents, np.ones(4)], axis=-1))
-    # The fold is at the tangent 1/sqrt(1.5) = 0.816; 1.4 (1 - 0.98) would be pixel 127.
+    # The distorted tangent decreases beyond 1/sqrt(1.5) = 0.816. At 1.4 it would give pixel 127.
     assert np.isfinite(points[:2]).all()
     assert np.isnan(points[2:]).all()
     assert np.isnan(lens.unit_vectors(np.array([[99.5 + 545.0, 99.5]]))).all()
@@ -112,7 +112,10 @@ def test_the_boresight_falls_between_the_middle_pixels() -> None:
 
 
 def test_the_field_of_view_ends_at_the_outer_edge_of_the_outermost_pixel() -> None:
-    """Sease 2.4: half the field of view is half the columns; pixel 0 is a centre, so its edge is -0.5."""
+    """Sease, section 2.4: half the field of view is half the columns.
+
+    Pixel 0 is a pixel centre, so that its edge is at -0.5.
+    """
     edge = np.radians(10.0)
     points = CAMERA.project(np.array([[np.sin(edge), 0.0, np.cos(edge)], [-np.sin(edge), 0.0, np.cos(edge)]]))
     assert points[:, 0] == pytest.approx([1023.5, -0.5], abs=1e-9)
@@ -144,7 +147,7 @@ def test_projection_does_not_depend_on_distance(x: float, y: float, distance: fl
 
 @given(COLUMN, ROW)
 def test_what_is_behind_the_camera_has_no_pixel(x: float, y: float) -> None:
-    """Errata to 2.1: the mirrored direction would project to the same pixel."""
+    """Errata to section 2.1 of the thesis: a direction and its opposite would project to the same pixel."""
     behind = CAMERA.project(-CAMERA.unit_vectors(np.array([[x, y]])))
     assert np.all(np.isnan(behind))
     assert not CAMERA.contains(behind, margin=1e9)[0]

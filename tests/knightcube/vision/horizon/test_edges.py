@@ -1,4 +1,4 @@
-"""Edges of drawn steps: their position, scale, brightness and noise follow from the drawing."""
+"""Tests of edge detection on drawn steps of known position, scale, brightness and noise."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from knightcube.vision.horizon.settings import EdgeSettings
 SIZE = 256
 FEW = EdgeSettings(lines=8)
 CENTRES = np.arange(16, 256, 32)
-"""Middles of eight equal strips of 256 px, between the pixels 15 and 16 of each."""
+"""Centres of eight equal strips of 256 px, each between the pixels 15 and 16 of the strip."""
 
 
 def step(place: float, width: float = 0.5, dark: float = 10.0, bright: float = 110.0) -> FloatArray:
-    """Return an image that is bright to the right of `place`, px, blurred by a Gaussian of `width` px."""
+    """Return an image that is bright to the right of `place` px, blurred by a Gaussian of `width` px."""
     line = dark + (bright - dark) * ndtr((np.arange(SIZE) - place) / width)
     return np.tile(line, (SIZE, 1))
 
 
 def border(place: float) -> FloatArray:
-    """Return an image that is bright from `place`, px, to 60 px."""
+    """Return an image that is bright from `place` px to 60 px."""
     return np.where(np.arange(SIZE) < 60, step(place), 10.0)
 
 
 def bars(*levels: float) -> FloatArray:
-    """Return an image of upright bars of equal width and the given brightness."""
+    """Return an image of vertical bars of equal width and given brightness."""
     return np.tile(np.repeat(np.array(levels), SIZE // len(levels)), (SIZE, 1))
 
 
 def test_a_majority_of_the_window_decides_and_ends_are_continued() -> None:
     line = np.array([[0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 0, 1, 1, 1, 0]], dtype=bool)
     assert run_filtered(line, 3).astype(int).tolist() == [[0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0]]
-    # Pairs vanish in a window of five, and groups of three remain.
+    # A window of five removes pairs and keeps groups of three.
     assert run_filtered(line, 5).astype(int).tolist() == [[0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 0]]
     assert run_filtered(line).tolist() == run_filtered(line, 5).tolist()
     assert run_filtered(line, 1).tolist() == line.tolist()
@@ -48,14 +48,17 @@ def test_a_majority_of_the_window_decides_and_ends_are_continued() -> None:
 def test_an_edge_is_placed_at_its_steepest_point_at_the_scale_that_covers_it(
     width: float, scale: float
 ) -> None:
-    """The slope of a Gaussian edge of w px is (1 + (w/s)^2)^-1/2 at the scale s: 1.4 is gained at 1.37 s."""
+    """The slope of a Gaussian edge of w px at the scale s is (1 + (w/s)^2)^-1/2.
+
+    The next scale is chosen at a gain of 1.4, which is w = 1.37 s.
+    """
     edges, lines = find_edges(step(130.3, width), FEW)
     assert len(edges) == 8
     assert edges.points[:, 0] == pytest.approx(np.full(8, 130.3), abs=0.02 + 0.01 * width)
     assert edges.points[:, 1].tolist() == CENTRES.tolist() == lines.rows.tolist() == lines.columns.tolist()
     assert edges.towards.tolist() == [[1.0, 0.0]] * 8
     assert edges.scale.tolist() == [scale] * 8
-    # The same edge upright, with its bright side above.
+    # The same edge is tested in the vertical direction, with its bright side above.
     upright, _ = find_edges(step(130.3, width).T[::-1], FEW)
     assert upright.points[:, 1] == pytest.approx(np.full(8, SIZE - 1 - 130.3), abs=0.02 + 0.01 * width)
     assert upright.towards.tolist() == [[0.0, -1.0]] * 8
@@ -70,7 +73,7 @@ def test_the_profile_and_the_background_are_the_pixels_across_the_edge() -> None
     assert np.all(edges.profile_steps.min(axis=1) < -8.0)
     assert np.all(edges.profile_steps.max(axis=1) > 4.0)
     assert edges.background == pytest.approx(np.full(8, 10.0), abs=0.1)
-    # From the right, the same samples stand in the other order.
+    # From the right, the same samples follow in reverse order.
     turned, _ = find_edges(image[:, ::-1], FEW)
     assert turned.profile == pytest.approx(edges.profile)
     assert turned.profile_steps == pytest.approx(edges.profile_steps, abs=1e-9)
@@ -87,7 +90,7 @@ def test_samples_outside_the_image_are_missing_from_a_profile() -> None:
 
 @pytest.mark.parametrize(("place", "count"), [(3.4, 0), (4.6, 8), (250.4, 8), (251.6, 0)])
 def test_edges_within_four_pixels_of_the_border_are_ignored(place: float, count: int) -> None:
-    """The image ends at 0 and 255: distances of 3.4, 4.6, 4.6 and 3.4 px."""
+    """The image ends at 0 and 255 px, so that the distances are 3.4, 4.6, 4.6 and 3.4 px."""
     line = border(place) if place < 128 else border(255.0 - place)[:, ::-1]
     edges, _ = find_edges(line, FEW)
     assert np.count_nonzero(np.abs(edges.points[:, 0] - place) < 1.0) == count
@@ -101,7 +104,7 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
     assert lines.levels.noise == pytest.approx(3.0, rel=0.08)
     assert lines.pixels == 16 * SIZE
     assert lines.space == SIZE / 8
-    # Neither the span nor the median is that of a small disc of the Sun.
+    # A small disc of the Sun changes neither the span nor the median.
     sun = step(128.0) + noise
     sun[14:20, 14:20] = 4000.0
     assert find_edges(sun, FEW)[1].levels.bright == pytest.approx(110.0, abs=2.0)
@@ -109,7 +112,7 @@ def test_levels_are_those_of_a_dark_and_a_bright_half_and_the_noise_of_the_dark(
 
 @pytest.mark.parametrize(("lit", "found"), [(7, False), (8, True)])
 def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None:
-    """Every pixel is read on its row and on its column: seven count as 14, eight as 16."""
+    """Every pixel is read on its row and on its column, so that seven pixels count as 14 and eight as 16."""
     image = np.random.default_rng(2).normal(10.0, 1.0, (32, 64))
     image[10, 20 : 20 + lit] = 100.0
     levels = find_edges(image, EdgeSettings(lines=64))[1].levels
@@ -118,7 +121,7 @@ def test_fewer_than_sixteen_lit_pixels_are_a_star(lit: int, found: bool) -> None
 
 @pytest.mark.parametrize(("low", "high", "found"), [(22.0, 38.0, True), (24.0, 36.0, False)])
 def test_the_weakest_edge_is_a_seventh_of_the_span(low: float, high: float, found: bool) -> None:
-    """A step across the threshold of 0.3, on both sides of the contrast of 0.15, between 0 and 100 counts."""
+    """The step crosses the brightness threshold of 0.3, with contrasts on both sides of the limit 0.15."""
     edges, _ = find_edges(bars(0.0, 0.0, low, high, 100.0, 100.0, 100.0, 100.0), FEW)
     at = edges.points[:, 0]
     assert np.count_nonzero(np.abs(at - 95.5) < 1.0) == (8 if found else 0)
@@ -132,7 +135,7 @@ def test_pixels_above_three_tenths_of_the_span_are_bright(grey: float, place: fl
 
 @pytest.mark.parametrize(("sigmas", "lit"), [(5.5, False), (6.5, True)])
 def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, lit: bool) -> None:
-    """A quarter at 100 sigma sets the span; a threshold of one per cent of it lies below the noise."""
+    """A quarter at 100 sigma determines the span, and a threshold of 1 % of the span is below the noise."""
     noise = np.random.default_rng(3).normal(0.0, 1.0, (SIZE, SIZE))
     image = bars(0.0, sigmas, 0.0, 100.0) + noise
     low = EdgeSettings(lines=8, threshold=0.01, run=1)
@@ -141,7 +144,7 @@ def test_pixels_within_six_sigma_of_the_dark_ones_are_not_bright(sigmas: float, 
 
 
 def test_of_too_many_edges_those_with_the_darkest_side_are_kept() -> None:
-    """Eight bars with a rising background: 8 rows x 4 rising edges, of which two per line are kept."""
+    """In eight bars on a rising background, each of 8 rows has 4 rising edges, of which two are kept."""
     image = bars(0.0, 100.0, 4.0, 100.0, 8.0, 100.0, 12.0, 100.0)
     settings = EdgeSettings(lines=8, most=2)
     edges, _ = find_edges(image, settings)
@@ -188,7 +191,7 @@ def test_directions_steps_and_samples_are_those_of_the_lens() -> None:
     assert seen.rays.brighter == pytest.approx(seen.across)
     assert seen.rays.pixel == pytest.approx(np.linalg.norm(seen.across, axis=1))
     assert len(seen.rays) == len(edges)
-    # Every 32nd pixel of eight columns and eight rows; the right half is bright.
+    # The samples are every 32nd pixel of eight columns and eight rows, and the right half of them is bright.
     places = np.stack(np.meshgrid(CENTRES, CENTRES, indexing="ij"), axis=-1).reshape(-1, 2)
     points = np.concatenate([places, places[:, ::-1]]).astype(float)
     assert seen.samples.rays == pytest.approx(camera.unit_vectors(points))

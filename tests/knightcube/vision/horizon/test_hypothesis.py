@@ -1,4 +1,4 @@
-"""A horizon is one that chance edges do not explain; photographs without a limb show none."""
+"""Tests of the chance that random edges form a horizon, and photographs without a limb."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hal
 
 
 def test_scan_lines_cross_a_circle_as_often_as_its_extent_in_x_and_y_says() -> None:
-    """Of each quarter the part less oblique than 0.3: columns over 2 r 0.954, there and back; rows alike."""
+    """A column crosses the part of the circle that is less oblique than 0.3, which is 0.954 of the radius."""
     angle = np.linspace(0.0, 2.0 * np.pi, 7200, endpoint=False)
     circle = 256.0 + 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inside = np.ones(len(angle), dtype=bool)
@@ -36,7 +36,7 @@ def test_edges_all_along_a_limb_are_not_due_to_chance_and_a_tenth_of_them_may_be
     others = generator.uniform(-200.0, 200.0, 100)
     assert log10_chance(limb, generator.normal(0.0, 0.1, 40), others, CAMERA, 2) < -50.0
     assert log10_chance(limb, generator.uniform(-2.0, 2.0, 4), others, CAMERA, 2) > 0.0
-    # An unknown altitude, and other edges beside the limb, make chance more likely.
+    # An unknown altitude and other edges beside the limb increase the probability of a chance horizon.
     good = generator.normal(0.0, 0.3, 25)
     known, unknown = (log10_chance(limb, good, others, CAMERA, n) for n in (2, 3))
     crowded = log10_chance(limb, good, generator.uniform(-20.0, 20.0, 200), CAMERA, 2)
@@ -52,7 +52,7 @@ def test_points_that_the_lens_does_not_image_are_not_part_of_a_limb() -> None:
 
 
 def test_a_small_disc_is_the_limb_of_no_low_orbit() -> None:
-    """A ghost of the lens, 10.6 deg in radius: the Earth's from 28,000 km."""
+    """A lens ghost with a radius of 10.6 deg looks like the Earth from an altitude of 28,000 km."""
     y, x = np.mgrid[0:512, 0:512]
     disc = np.clip(74.0 - np.hypot(x - 200.0, y - 230.0), 0.0, 1.0)
     pixels = np.random.default_rng(1).normal(10.0 + 100.0 * disc, 1.0).clip(0, 255).astype(np.uint8)
@@ -67,7 +67,7 @@ def test_a_small_disc_is_the_limb_of_no_low_orbit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
 def test_a_photograph_of_the_sky_shows_no_horizon(name: str) -> None:
-    """Trees, a dome and a comet's tail among the stars, taken from the ground."""
+    """The photographs from the ground show trees, a dome and a comet's tail among the stars."""
     path = DATA / "sky" / name
     if not path.exists():
         pytest.skip("needs ../shared/data/sky")

@@ -1,4 +1,4 @@
-"""Pictures that a known attitude denies, and sound ones that it never does."""
+"""Tests of images that contradict a known attitude, and of sound images that must never do so."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ PINHOLE = Pinhole.from_field_of_view(128, 128, math.radians(80.0))
 CAMERA = MountedCamera(PINHOLE, np.array([0.0, 0.0, 0.0, 1.0]))
 AWAY = 1.496e11
 ERROR = math.radians(0.3)
-"""rad an axis, of the attitude that judges."""
+"""Error (rad per axis) of the attitude that judges the images."""
 
 
 def view(seed: int) -> tuple[Image, FloatArray, float, FloatArray]:
-    """Return a picture from a random place and attitude, with believed nadir, altitude and Sun."""
+    """Return an image at a random position and attitude, with the assumed nadir, altitude and Sun."""
     draw = np.random.default_rng(seed)
     attitude = normalise(draw.normal(size=4))
     up, sun = (vector / np.linalg.norm(vector) for vector in draw.normal(size=(2, 3)))
@@ -58,14 +58,14 @@ def test_no_sound_picture_is_false() -> None:
     ("fault", "least"), [("black", 6), ("saturated", 30), ("blinded", 30), ("garbage", 30)]
 )
 def test_pictures_of_a_broken_camera_are_false(fault: str, least: int) -> None:
-    """Of 60 views, many of them of the night or beside the Sun."""
+    """Many of the 60 views show the night side or space beside the Sun."""
     views = [view(seed) for seed in range(60)]
     false = [bool(judged(np.asarray(SPOILT[fault](one[0], 1)), *one[1:])) for one in views]
     assert sum(false) >= least
 
 
 def test_what_is_under_the_camera_decides() -> None:
-    """A nadir camera at noon sees ground, on its night side none."""
+    """A nadir camera shows bright ground at noon, and dark ground on the night side."""
     down, overhead, beside = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
     dark, lit = np.zeros((128, 128), np.uint8), np.full((128, 128), 200, np.uint8)
     assert "dark" in judged(dark, down, 500e3, overhead)
@@ -81,19 +81,19 @@ DOWN = np.array([0.0, 0.0, 1.0])
 
 
 def at(angle: float, count: int = 1) -> FloatArray:
-    """Return rays (count, 3) at an angle, rad, from nadir."""
+    """Return rays (count, 3) at an `angle` (rad) from nadir."""
     return np.tile([math.sin(angle), 0.0, math.cos(angle)], (count, 1))
 
 
 def ground_angle(angle: float) -> float:
-    """Return the angle at the Earth's centre, rad, between nadir and the ground at `angle` from nadir."""
+    """Return the angle (rad) at the Earth's centre between nadir and the ground at `angle` from nadir."""
     return math.asin(math.sin(angle) * (1.0 + ALTITUDE / MEAN_RADIUS)) - angle
 
 
 def sun_at(elevation: float, angle: float) -> FloatArray:
-    """Return the Sun (3,) at `elevation`, rad, above the ground seen at `angle`, rad, from nadir."""
+    """Return the Sun (3,) at an `elevation` (rad) above the ground seen at `angle` (rad) from nadir."""
     zenith = ground_angle(angle) - (0.5 * math.pi - elevation)
-    # The ground's normal is opposite to nadir, turned by the angle at the Earth's centre.
+    # The ground's normal is opposite to nadir, rotated by the angle at the Earth's centre.
     return np.array([math.sin(zenith), 0.0, -math.cos(zenith)])
 
 
@@ -155,7 +155,7 @@ def test_stray_light_of_the_sun_excuses_a_bright_sky(apart_deg: float, false: bo
 def test_samples_are_compared_by_day_by_night_and_above_the_air(
     angle: float, elevation_deg: float, dark: int, lit: int
 ) -> None:
-    """The air reaches 60 km above a limb that is 2,575 km away: 0.0233 rad."""
+    """The atmosphere extends 60 km above a limb at a distance of 2,575 km, which is 0.0233 rad."""
     view = LimbView(np.eye(3), -(MEAN_RADIUS + ALTITUDE) * DOWN, mean_sphere(), 0.0)
     sun = sun_at(math.radians(elevation_deg), min(angle, LIMB - 1e-9))
     for bright in (True, False):
@@ -173,7 +173,7 @@ def test_the_surroundings_of_the_sun_are_not_compared(apart_deg: float, count: i
 
 
 def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> None:
-    """800 even directions under the Sun overhead: ground is bright, sky dark."""
+    """In 800 evenly spread directions with the Sun overhead, the ground is bright and the sky is dark."""
     number = np.arange(800) + 0.5
     z, turn = 1.0 - 2.0 * number / 800, math.pi * (3.0 - math.sqrt(5.0)) * number
     rays = np.column_stack([np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z])
@@ -188,7 +188,7 @@ def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> 
     assert error < 2.0 * found.sigma < math.radians(6.0)
     assert found.covariance @ found.direction == pytest.approx(np.zeros(3), abs=1e-6)
     assert 0.9 < found.explained < 1.0
-    # Without the Sun a dark sample may be ground.
+    # Without the Sun direction, a dark sample may be ground.
     blind = coarse_nadir([ImageBrightness(rays, bright)], ALTITUDE)
     assert blind is not None
     assert blind.explained < found.explained
@@ -198,7 +198,7 @@ def test_samples_all_around_give_a_coarse_nadir_with_the_error_of_its_grid() -> 
 
 
 def test_the_samples_of_an_image_stand_in_the_middle_of_its_cells() -> None:
-    """Cells of 16 px: the rays of the pixels 8, 24, ... on columns and rows."""
+    """In cells of 16 px, the samples are the rays of pixels 8, 24, ... in columns and rows."""
     image = np.zeros((128, 128), np.uint8)
     image[:64, 40] = 31
     image[64:, 40] = 30

@@ -1,4 +1,4 @@
-"""First guesses from drawn edges: cones that many edges share, and orientations from known directions."""
+"""Tests of initial guesses from drawn edges: cones through many edges, and orientations from directions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COSINE = math.cos(math.radians(65.0))
 
 
 def ring(nadir: FloatArray, half_angle: float, count: int, off: float = 0.0) -> EdgeRays:
-    """Return edges on a cone about `nadir` (3,), bright inside, all of them `off` px outside of it."""
+    """Return edges on a cone about `nadir` (3,), bright inside, each `off` px outside of the cone."""
     turn = shortest_turn(NADIR, nadir)
     azimuth = np.arange(count) * (2.0 * np.pi / count)
     angle = half_angle + off * PIXEL
@@ -112,14 +112,14 @@ def test_two_edges_leave_a_known_cone_three_an_unknown_one_and_one_none() -> Non
     edges = ring(NADIR, math.acos(COSINE), 3)
     assert best_cone(edges, np.arange(3) < 2, (COSINE, COSINE), 0.5, 400) is not None
     assert best_cone(edges, np.arange(3) < 1, (COSINE, COSINE), 0.5, 400) is None
-    # The second triple that is tried of three edges is all three.
+    # The second of the tried triples contains all three edges.
     cone = best_cone(edges, free(edges), (0.0, 1.0), 0.5, 2)
     assert cone is not None
     assert cone.members.all()
 
 
 def test_few_tries_are_spread_over_all_pairs() -> None:
-    """The first third of the edges lies on no common cone with the rest: its pairs are tried first."""
+    """The first third of the edges is on no common cone with the others, and its pairs are tried first."""
     draw = np.random.default_rng(1)
     good = ring(NADIR, math.acos(COSINE), 30)
     stray = EdgeRays(
@@ -132,14 +132,14 @@ def test_few_tries_are_spread_over_all_pairs() -> None:
 
 
 def true_attitude() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return a quaternion (4,), its nadir in camera axes, and in inertial axes."""
+    """Return a quaternion (4,), and the nadir in camera axes and in inertial axes."""
     quaternion = normalise(np.array([0.3, -0.5, 0.4, 0.6]))
     down = normalise(np.array([0.2, -0.7, 0.5]))
     return quaternion, attitude_matrix(quaternion) @ down, down
 
 
 def sensed(inertial: FloatArray, sigma: float, error: FloatArray | None = None) -> SensedDirection:
-    """Return what a sensor measures at the true attitude, turned by `error` (3,), rad, in camera axes."""
+    """Return a sensor's measurement at the true attitude, rotated by `error` (3,), rad, in camera axes."""
     quaternion, _, _ = true_attitude()
     seen = attitude_matrix(quaternion) @ inertial
     if error is not None:
@@ -148,7 +148,7 @@ def sensed(inertial: FloatArray, sigma: float, error: FloatArray | None = None) 
 
 
 def across(down: FloatArray, angle: float) -> FloatArray:
-    """Return the direction (3,) at `angle`, rad, from nadir."""
+    """Return the direction (3,) at an `angle` (rad) from nadir."""
     side = normalise(np.cross(down, [1.0, 0.0, 0.0]))
     return np.asarray(math.cos(angle) * down + math.sin(angle) * side)
 
@@ -160,13 +160,13 @@ def test_one_direction_gives_the_rotation_about_nadir_with_the_error_of_its_leve
     assert found.rotation == pytest.approx(attitude_matrix(quaternion), abs=1e-9)
     assert found.sigma == pytest.approx(0.01 / math.sin(angle))
     assert found.mismatch == pytest.approx(0.0, abs=1e-9)
-    # Four directions of the same error halve it.
+    # Four directions with equal errors halve the standard deviation.
     four = orientation(nadir, down, HorizonKnowledge(sensed=4 * (sensed(across(down, angle), 0.01),)))
     assert four.sigma == pytest.approx(0.5 * found.sigma)
 
 
 def test_the_more_accurate_direction_decides_and_the_average_is_weighted() -> None:
-    """Two directions at 90 deg from nadir, turned about it by 0.03 rad, of 0.01 and 0.02 rad: 4 to 1."""
+    """Two directions with errors of 0.01 and 0.02 rad, which are 0.03 rad apart, have weights of 4 to 1."""
     quaternion, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
     pair = sensed(level, 0.01), sensed(level, 0.02, 0.03 * nadir)
@@ -187,7 +187,7 @@ def test_a_direction_along_nadir_gives_no_rotation(lever: float, known: bool) ->
 def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
     off_deg: float, accepted: bool
 ) -> None:
-    """A guessed nadir is wrong by up to 0.3 deg in flights: four times 0.2 deg are granted."""
+    """An initial nadir guess is wrong by up to 0.3 deg in flight, and four times 0.2 deg are tolerated."""
     _, nadir, down = true_attitude()
     level = across(down, 0.5 * math.pi)
     axis = normalise(np.cross(nadir, sensed(level, 1.0).camera))
@@ -195,13 +195,16 @@ def test_an_exact_direction_may_contradict_a_guessed_nadir_by_its_error(
         error = side * math.radians(off_deg) * axis
         found = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, 1e-6, error),)))
         assert (found.mismatch <= MOST_MISMATCH) is accepted
-        # With a sensor of one degree, the same is less than one standard deviation.
+        # For a sensor error of one degree, the same deviation is less than one standard deviation.
         coarse = orientation(nadir, down, HorizonKnowledge(sensed=(sensed(level, math.radians(1.0), error),)))
         assert coarse.mismatch == pytest.approx(off_deg / math.hypot(1.0, 0.2), rel=1e-6)
 
 
 def test_the_share_of_nadirs_that_a_direction_allows_is_that_of_a_belt_of_the_sphere() -> None:
-    """Within four sigma of a great circle lies the fraction sin(4 sigma); two belts cross."""
+    """The fraction of the sphere within four sigma of a great circle is sin(4 sigma).
+
+    Two such belts intersect.
+    """
     _, nadir, down = true_attitude()
     one = sensed(across(down, 0.5 * math.pi), 0.03)
     draw = normalise(np.random.default_rng(1).normal(size=(200_000, 3)))
@@ -271,7 +274,7 @@ def test_the_place_is_the_position_or_the_altitude_or_unknown() -> None:
     sphere = place_of(HorizonKnowledge(altitude=4e5), settings)
     assert sphere is not None
     assert float(np.linalg.norm(sphere.position)) == pytest.approx(MEAN_RADIUS + 4e5)
-    # The Earth's radius lies between 6,356.8 and 6,378.1 km: 7 km to 14 km from the mean.
+    # The Earth's radius lies between 6,356.8 and 6,378.1 km, which is 7 km to 14 km from the mean radius.
     assert 7e3 < sphere.altitude_sigma < 14e3 < UNKNOWN
     assert place_of(HorizonKnowledge(), settings) is None
     sunny = HorizonKnowledge(sun=np.array([0.0, 3.0, 4.0]))

@@ -1,4 +1,4 @@
-"""The limb's geometry: tangents computed another way, gradients by differences, covariance by many fits."""
+"""Tests of the limb: tangents by another method, gradients by differences, covariance by many fits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _view(
 
 
 def test_rays_along_the_limb_touch_the_ellipsoid_at_its_height() -> None:
-    """The least of (x/a)^2 + (y/a)^2 + (z/b)^2 along each ray is one."""
+    """The minimum of (x/a)^2 + (y/a)^2 + (z/b)^2 along each ray is one."""
     view = _view(np.random.default_rng(1))
     rays = limb_rays(view, 90) @ view.rotation
     axes = np.array([SEMI_MAJOR_AXIS, SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS]) + HEIGHT
@@ -47,7 +47,7 @@ def test_rays_along_the_limb_touch_the_ellipsoid_at_its_height() -> None:
 
 
 def test_the_limb_is_the_simulators_and_so_is_the_suns_elevation() -> None:
-    """The simulator's limb is written independently of this one."""
+    """The simulator computes the limb with independent code."""
     generator = np.random.default_rng(2)
     attitude = normalise(generator.standard_normal(4))
     sun = 1.5e11 * normalise(generator.standard_normal(3))
@@ -62,7 +62,7 @@ def test_the_limb_is_the_simulators_and_so_is_the_suns_elevation() -> None:
 
 
 def test_the_quadratic_cone_is_zero_on_the_limb_and_positive_within() -> None:
-    """M = Q r r' Q - (r' Q r - 1) Q is the discriminant of |L (r + t u)| = 1 in t, with Q = L' L."""
+    """M = Q r r' Q - (r' Q r - 1) Q is the discriminant in t of |L (r + t u)| = 1, with Q = L' L."""
     view = _view(np.random.default_rng(3))
     stretching = view.surface.stretching(view.limb_height)
     form = stretching @ stretching
@@ -112,16 +112,19 @@ def test_pairs_and_triples_of_rays_leave_the_cone_they_lie_on() -> None:
 
 
 def _arc(view: LimbView, generator: np.random.Generator, sigma: float) -> FloatArray:
-    """Return forty rays of a quarter of the limb with errors across it."""
+    """Return forty rays along a quarter of the limb, with errors across the limb."""
     rays = limb_rays(view, 160)[:40]
-    # Normal to the ray, away from nadir.
+    # `outward` is normal to the ray and points away from nadir.
     outward = (rays @ view.nadir)[:, None] * rays - view.nadir
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     return np.asarray(normalise(rays + sigma * generator.standard_normal((40, 1)) * outward))
 
 
 def test_the_fits_covariance_is_that_of_its_errors() -> None:
-    """200 fits, seed 7: the summed NEES is a chi-square of 400, within its 99.9 % limits 310 and 497."""
+    """The summed NEES of 200 fits is a chi-square of 400 degrees of freedom.
+
+    Its 99.9 % limits are 310 and 497.
+    """
     generator = np.random.default_rng(7)
     sigma, prior = 3e-4, Prior(0.05, 1000.0, 50.0)
     total = 0.0
@@ -165,7 +168,7 @@ def test_edges_all_in_one_place_give_no_limb() -> None:
 
 
 def test_points_that_are_drawn_the_same_way_as_their_neighbours_count_for_fewer() -> None:
-    """Of errors in pairs half are known twice: neither covariance nor truth may gain from the copies."""
+    """If points have equal errors in pairs, the duplicates must reduce neither covariance nor error."""
     generator = np.random.default_rng(8)
     view = _view(generator)
     rays = limb_rays(view, 240)[:80]

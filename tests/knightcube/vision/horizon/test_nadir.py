@@ -1,6 +1,6 @@
-"""Nadir from rendered frames: in daylight, by the terminator, without help, and when there is none.
+"""Tests of the nadir from rendered frames: in daylight, at the terminator, and without a limb.
 
-Nadir of several cameras: one limb through all their points, and a coarse one where no limb is in view.
+Tests of the nadir from several cameras: a joint fit of the limb, and a coarse nadir without a limb in view.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _error_deg(found: HorizonSolution, scene: EarthScene) -> float:
 
 @pytest.fixture(scope="module")
 def day() -> tuple[EarthScene, Image]:
-    """Return a sunlit limb across the middle, from 600 km above 45 deg north."""
+    """Return a sunlit limb across the image centre, from 600 km above 45 deg north."""
     generator = np.random.default_rng(1)
     scene = limb_scene(zenith=np.array([1.0, 0.0, 1.0]), sun=np.array([1.0, 0.6, 0.5]), texture=3)
     return scene, render(MODEL, scene, generator)
@@ -67,7 +67,7 @@ def _gps(scene: EarthScene) -> HorizonKnowledge:
 
 
 def test_the_airs_profile_is_the_simulators() -> None:
-    """Two independent ways to the optical depth: Chapman's function there, the sum along the ray here."""
+    """The simulator's optical depth is Chapman's function, and the estimator's is a sum along the ray."""
     air, _, _, _ = limb_light(np.array([[0.0, 10e3, UNIT_DEPTH_HEIGHT, 18.4e3, 40e3]]), np.array([500.0]))[
         :, 0
     ]
@@ -117,7 +117,7 @@ def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthSce
 def test_without_the_flattenings_direction_the_allowance_covers_the_error(
     day: tuple[EarthScene, Image],
 ) -> None:
-    """At 45 deg the ellipsoid tilts the horizon most."""
+    """At a latitude of 45 deg, the ellipsoid tilts the horizon most."""
     scene, frame = day
     for knowledge in (_gps(scene), HorizonKnowledge(altitude=600e3)):
         found = find_nadir(frame, MODEL.lens, knowledge, SETTINGS)
@@ -137,7 +137,7 @@ def test_an_unknown_altitude_is_fitted_with_its_spread(day: tuple[EarthScene, Im
 
 def test_a_coarse_sun_that_contradicts_the_horizon_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
     scene, frame = day
-    # Mirrored at nadir's cone no more: the Sun stands where it cannot.
+    # The opposite of the true Sun direction is inconsistent with the horizon.
     wrong = SensedDirection(-(scene.camera_matrix @ scene.sun), scene.sun, np.radians(5.0))
     found = find_nadir(frame, MODEL.lens, replace(_gps(scene), sensed=(wrong,)), SETTINGS)
     assert found.status is HorizonStatus.REFUSED
@@ -147,7 +147,7 @@ def test_a_coarse_sun_that_contradicts_the_horizon_makes_it_refused(day: tuple[E
 
 
 def test_light_where_a_view_has_sky_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
-    """Turned by half a turn in the file, told with the attitude of the picture that was not turned."""
+    """The image is rotated by 180 deg, but the attitude is that of the original image."""
     scene, frame = day
     found = find_nadir(
         frame[::-1, ::-1],
@@ -159,7 +159,10 @@ def test_light_where_a_view_has_sky_makes_it_refused(day: tuple[EarthScene, Imag
 
 
 def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
-    """A first look of 14 lines each way, then 42 in its place only; less is read, and more is known."""
+    """The first pass reads 14 lines in each direction, the second pass 42 lines near the limb only.
+
+    Fewer pixels are read, and the result is more accurate.
+    """
     generator = np.random.default_rng((3, 0, 1))
     scene = random_scene(generator, MODEL, "sunlit", (400e3, 700e3))
     frame = render(MODEL, scene, generator)
@@ -184,7 +187,7 @@ def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
 
 
 def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> None:
-    """The paper's uniqueness problem (Fig. 14), made perfect: either rim may be limb, the other shadow."""
+    """The image shows the uniqueness problem of the paper (Fig. 14): either rim may be the limb."""
     scene = limb_scene(1000e3, zenith=np.array([1.0, 0.2, 0.3]), sun=np.array([1.0, 0.3, 0.2]), dip=0.25)
     frame = render(MODEL, scene, np.random.default_rng(4))
     band = np.minimum(frame, frame[::-1])
@@ -198,7 +201,7 @@ def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_reported() -> N
 
 
 def test_the_terminator_is_distinguished_from_the_limb() -> None:
-    """A crescent: the inner edge is as bright and as round as the outer, and stays out of the fit."""
+    """In a crescent, the inner edge is as bright and as round as the outer edge, but must not be fitted."""
     generator = np.random.default_rng(31)
     scene = random_scene(generator, MODEL, "terminator", (1200e3, 1800e3))
     frame = render(MODEL, scene, generator)
@@ -226,7 +229,10 @@ def test_impossible_knowledge_is_refused(wrong: dict[str, object], complaint: st
 
 
 def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
-    """OPS-SAT-1's picture, 27 lines; its own README tells of an independent fit of 0.44 px rms."""
+    """The photograph from OPS-SAT-1 has 27 scan lines.
+
+    Its README reports an independent fit with 0.44 px rms.
+    """
     if not PHOTOGRAPH.exists():
         pytest.skip("needs ../shared/data/limb")
     pixels = read_image(PHOTOGRAPH)
@@ -236,7 +242,7 @@ def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
     assert found.nadir is not None, found.reason
     assert found.nadir.residual <= 0.5
     assert found.nadir.used >= 20
-    # The sky is above: nadir is below the picture, and the limb rises to the right.
+    # The sky is at the top, so that nadir is below the image, and the limb rises to the right.
     assert found.nadir.direction[1] > 0.9
     circle = fit_circle(found.points[found.on_horizon])
     assert circle.radius == pytest.approx(22_211.0, rel=0.2)
@@ -262,13 +268,13 @@ JOINT_SETTINGS = finder_settings(WIDE_MODEL)
 UW = [MountedCamera(WIDE_MODEL.lens, np.array(one.mounting)) for one in suite("uw").cameras]
 VT = [MountedCamera(WIDE_MODEL.lens, np.array(one.mounting)) for one in suite("vt").cameras]
 EARTHLIGHT = 30.0
-"""Counts: light of 0.025 in the logarithmic camera."""
+"""Counts of a flux of 0.025 in the logarithmic camera."""
 ALTITUDE = 500e3
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A satellite, its cameras' pictures, and what it knows."""
+    """A satellite with the images of its cameras and its prior knowledge."""
 
     attitude: FloatArray
     position: FloatArray
@@ -278,7 +284,7 @@ class Instant:
 
     @property
     def nadir(self) -> FloatArray:
-        """The truth (3,), body axes."""
+        """The true nadir (3,) in body axes."""
         return np.asarray(attitude_matrix(self.attitude) @ (-self.position / np.linalg.norm(self.position)))
 
     @property
@@ -287,13 +293,13 @@ class Instant:
         return np.asarray(attitude_matrix(self.attitude) @ self.sun)
 
     def knowledge(self, sigma: float = 0.05) -> HorizonKnowledge:
-        """Return GPS, the Sun's ephemeris, and a rough attitude."""
+        """Return knowledge from GPS, the Sun's ephemeris, and a rough attitude."""
         rough = multiply(from_rotation_vector(np.array([0.6, -0.5, 0.6]) * sigma), self.attitude)
         return HorizonKnowledge(position=self.position, sun=self.sun, attitude=RoughAttitude(rough, sigma))
 
 
 def instant(cameras: list[MountedCamera], nadir: FloatArray, sun: FloatArray, seed: int) -> Instant:
-    """Return an instant above 53 deg north with nadir (3,), body axes, and the Sun (3,), inertial axes."""
+    """Return an instant above 53 deg north with nadir (3,) in body axes and the Sun (3,) in inertial axes."""
     down = np.array([-0.6, 0.0, -0.8])
     position = -(6_378_137.0 + ALTITUDE) * down
     middle = nadir / np.linalg.norm(nadir) + down
@@ -307,14 +313,14 @@ def instant(cameras: list[MountedCamera], nadir: FloatArray, sun: FloatArray, se
 
 
 def error_deg(found: JointNadir, truth: FloatArray) -> float:
-    """Return how far off a nadir is, deg."""
+    """Return the error of a nadir, deg."""
     assert found.nadir is not None, found.reason
     return float(np.degrees(np.linalg.norm(tangent_basis(truth) @ found.nadir.direction)))
 
 
 @pytest.fixture(scope="module")
 def level() -> Instant:
-    """Return a level satellite by day: three cameras on the limb, the fourth on the sky."""
+    """Return a level satellite by day, with three cameras on the limb and the fourth on the sky."""
     return instant(UW, np.array([0.02, -0.03, 1.0]), np.array([0.8, 0.5, 0.3]), 11)
 
 
@@ -331,7 +337,7 @@ def test_the_cameras_together_know_nadir_better_than_any_one(level: Instant) -> 
 
 
 def test_a_sun_that_is_known_exactly_refuses_no_true_limb(level: Instant) -> None:
-    """A cone through the edges is 0.1 to 0.3 deg off nadir before the limb is fitted; the Sun is not."""
+    """A cone through the edges is 0.1 to 0.3 deg off nadir before the limb fit, and the Sun is exact."""
     rough = level.knowledge()
     for sigma in (np.radians(0.005), np.radians(1.0)):
         seen = replace(rough, sensed=(SensedDirection(level.sun_in_body, level.sun, sigma),))
@@ -344,7 +350,10 @@ def test_a_sun_that_is_known_exactly_refuses_no_true_limb(level: Instant) -> Non
 
 
 def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three(level: Instant) -> None:
-    """All three limbs 6 km higher: a single one tilts nadir by 0.13 deg, three opposite ones do not."""
+    """All three limbs are 6 km higher.
+
+    A single limb then tilts nadir by 0.13 deg, but three opposite limbs do not.
+    """
     joint = nadir_of_cameras(level.frames, UW, level.knowledge(), JOINT_SETTINGS)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{nadir_of_cameras.__module__}.UNIT_DEPTH_HEIGHT", UNIT_DEPTH_HEIGHT - 6e3)
@@ -355,7 +364,7 @@ def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three
 
 
 def test_a_camera_that_says_otherwise_leaves_the_nadir_ambiguous(level: Instant) -> None:
-    """Two cameras with each other's pictures, and no third one to decide, and no attitude."""
+    """The images of two cameras are exchanged, and neither a third camera nor an attitude decides."""
     frames = {0: level.frames[0], 1: np.ascontiguousarray(level.frames[1][::-1])}
     found = nadir_of_cameras(frames, UW, HorizonKnowledge(position=level.position), JOINT_SETTINGS)
     assert found.nadir is None
@@ -371,7 +380,7 @@ def test_two_cameras_outvote_a_third(level: Instant) -> None:
 
 
 def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_cameras() -> None:
-    """Either rim of the band in the third image may be the limb; the other cameras decide."""
+    """Either rim of the band in the third image may be the limb, and the other cameras decide."""
     tilted = instant(UW, np.array([-0.22, -0.38, 1.0]), np.array([0.8, 0.5, 0.3]), 12)
     frames = {**tilted.frames, 2: np.minimum(tilted.frames[2], tilted.frames[2][::-1])}
     knowledge = HorizonKnowledge(position=tilted.position)
@@ -385,7 +394,10 @@ def test_an_ambiguous_image_is_searched_again_with_the_nadir_of_the_other_camera
 
 
 def test_one_camera_filled_and_the_others_dark_give_a_coarse_nadir() -> None:
-    """The Earth's edge is 68 deg from nadir: a field of 33 deg half a side is full up to about 25 deg off."""
+    """The limb is 68 deg from nadir.
+
+    The Earth therefore fills a field of 33 deg half width up to 25 deg off nadir.
+    """
     boresight = VT[0].in_body(np.array([0.0, 0.0, 1.0]))
     aside = tangent_basis(boresight)
     for seed, off in enumerate((np.array([0.0, 0.0]), np.array([0.15, 0.1]))):
@@ -409,7 +421,7 @@ def test_dark_pictures_give_no_coarse_nadir() -> None:
 
 
 def _changed(changes: Callable[[Hypothesis], Hypothesis]) -> Callable[..., Hypothesis | None]:
-    """Return `examine` with changes of every hypothesis."""
+    """Return `examine` with a modification of every hypothesis."""
 
     def examined(*arguments: Any) -> Hypothesis | None:
         found = examine(*arguments)
@@ -437,7 +449,7 @@ def test_a_horizon_counts_up_to_the_limit_of_each_evidence(
     wrong: float,
     status: HorizonStatus,
 ) -> None:
-    """Evidence on both sides of its documented limit, everything else as in a sunlit frame."""
+    """The tested evidence is on both sides of its documented limit, and all else is as in a sunlit frame."""
     scene, frame = day
     for value, expected in ((sound, HorizonStatus.FOUND), (wrong, status)):
         changed = _changed(lambda one, value=value: replace(one, **{evidence: value}))  # type: ignore[misc]
@@ -480,13 +492,13 @@ def test_a_measurement_states_its_altitude_points_and_tangent_covariance(
     assert found.nadir.used == np.count_nonzero(found.on_horizon) == len(found.limb) == len(found.limb_sigma)
     assert found.nadir.altitude == pytest.approx(600e3, abs=15e3)
     assert found.nadir.altitude_sigma == pytest.approx(SETTINGS.altitude_sigma, rel=0.01)
-    # The trace of a covariance does not depend on the axes, and there is no error along the direction.
+    # The trace of a covariance does not depend on the axes, and the error along the direction is zero.
     tangent = found.nadir.tangent_covariance
     assert np.trace(tangent) == pytest.approx(np.trace(found.nadir.covariance), rel=1e-6)
     assert found.nadir.sigma == pytest.approx(np.sqrt(0.5 * np.trace(tangent)), rel=1e-6)
     assert found.nadir.covariance @ found.nadir.direction == pytest.approx(np.zeros(3), abs=1e-12)
     assert found.nadir.direction == pytest.approx(found.view.nadir)
-    # An altitude above the mean sphere is wrong by the flattening.
+    # An altitude above the mean sphere is wrong by the flattening of the Earth.
     sphere = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
     assert sphere.nadir is not None
     assert 10e3 < sphere.nadir.altitude_sigma < 20e3

@@ -1,1 +1,1 @@
-"""Tests of objects among the stars."""
+"""Tests of the detection of objects among stars."""

@@ -1,4 +1,4 @@
-"""Objects that move among the stars, put into the simulated frames of `frames`."""
+"""Objects that move among the stars, drawn into the simulated frames of `frames`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _STEPS = 801
 def object_path(
     camera: Camera, direction: FloatArray, motion: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Return the pixels (801, 2) of an object that turns by `motion` (3,) rad among the stars.
+    """Return the pixels (801, 2) of an object that rotates by `motion` (3,) rad relative to the stars.
 
-    `direction` (3,) is where it is at mid-exposure; motion equal to the camera's `rotation` (3,) keeps it
-    there.
+    `direction` (3,) is the object's direction at mid-exposure. An object with the motion of the camera's
+    `rotation` (3,) stays in place.
     """
     time = np.linspace(-0.5, 0.5, _STEPS)[:, None]
     among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(time * motion)), 1, 2) @ direction
@@ -36,9 +36,9 @@ def add_object(
 
 
 def motion_across(direction: FloatArray, angle: float, towards: float) -> FloatArray:
-    """Return the turn (3,) that moves `direction` (3,) by `angle` rad along a great circle.
+    """Return the rotation (3,) that moves `direction` (3,) by `angle` rad along a great circle.
 
-    `towards` in rad is the way it goes in the image: 0 is along +x, pi/2 along +y.
+    `towards` (rad) is the direction of motion in the image: 0 is along +x, pi/2 along +y.
     """
     step = np.array([np.cos(towards), np.sin(towards), 0.0])
     axis = np.cross(direction, step)
@@ -46,7 +46,7 @@ def motion_across(direction: FloatArray, angle: float, towards: float) -> FloatA
 
 
 def star_field(camera: Camera, seed: int, faintest: float = 7.0) -> tuple[FloatArray, FloatArray]:
-    """Return the directions (n, 3) and magnitudes (n,) of the stars that `frame_with` shows."""
+    """Return the directions (n, 3) and magnitudes (n,) of the stars in the frames of `frame_with`."""
     return random_stars(np.random.default_rng(seed), camera.pinhole, 0.05, faintest)
 
 
@@ -58,7 +58,7 @@ def frame_with(
     objects: list[tuple[FloatArray, float]],
     faintest: float = 7.0,
 ) -> Image:
-    """Return a random star field with objects (path, magnitude); the same for the same seed."""
+    """Return a random star field with objects (path, magnitude), which depends only on the seed."""
     image = expose(camera, *star_field(camera, seed, faintest), rotation, exposure)
     for path, magnitude in objects:
         add_object(image, camera, path, magnitude, exposure)

@@ -1,8 +1,9 @@
-"""The three indicators: by hand, for stars at every angle, and for objects that are not stars.
+"""Tests of the three indicators: by hand, for stars at every angle, and for objects that are not stars.
 
-Objects among the stars: found when they are there, quiet when they are not, overlaps told apart.
+Tests of objects among stars: detections, false alarms and overlaps with stars.
 
-Objects that cross in the frame, from pixels to tracks; and a crowded sky at rest has an attitude.
+Tests of objects that cross in the frame, from pixels to tracks, and of the attitude from a crowded sky at
+rest.
 """
 
 from __future__ import annotations
@@ -56,7 +57,10 @@ _THETAS = [2.0, 10.0, 30.0, 60.0, 80.0, 90.0]
 
 
 def _stars(theta_deg: float, seed: int = 1, n: int = 14) -> tuple[FloatArray, FloatArray]:
-    """Return the exact ends (n, 2, 2) of stars over the whole field, and the turn (3,), 100 px at most."""
+    """Return exact ends (n, 2, 2) of star streaks over the whole field, and the rotation (3,).
+
+    The longest streak has 100 px.
+    """
     theta = np.deg2rad(theta_deg)
     turn = rate_at(theta, min(100.0 / _PINHOLE.focal_length / np.sin(theta), 0.3), 0.8)
     points = np.random.default_rng(seed).uniform(60.0, 960.0, (n, 2))
@@ -64,14 +68,14 @@ def _stars(theta_deg: float, seed: int = 1, n: int = 14) -> tuple[FloatArray, Fl
 
 
 def test_the_indicators_of_a_quarter_circle_by_hand() -> None:
-    """Centre (10, 20): from (13, 20) to (10, 23), a quarter turn of radius 3."""
+    """The streak from (13, 20) to (10, 23) is a quarter circle of radius 3 around (10, 20)."""
     ends = np.array([[[13.0, 20.0], [10.0, 23.0]]])
     centre = np.array([10.0, 20.0])
     assert centre_residuals(ends, centre)[0] == pytest.approx(0.0, abs=1e-15)
     assert angular_displacements(ends, centre)[0] == pytest.approx(0.5 * np.pi)
     assert lengths(ends)[0] == pytest.approx(3.0 * np.sqrt(2.0))
     assert slopes(ends)[0] == pytest.approx(0.75 * np.pi)
-    # A centre off by (1, 0) is missed by the part of it along the chord.
+    # If the centre is displaced by (1, 0), the residual is the component of the displacement along the chord.
     assert abs(centre_residuals(ends, centre + np.array([1.0, 0.0]))[0]) == pytest.approx(np.sqrt(0.5))
 
 
@@ -93,7 +97,7 @@ def test_a_star_in_the_same_place_is_the_star_itself(theta_deg: float) -> None:
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_exact_stars_deviate_nowhere_whatever_the_axis(theta_deg: float) -> None:
-    """Over the whole field, though the projection bends slopes by 1.8 deg and lengths by 6 % across it."""
+    """The projection changes slopes by 1.8 deg and lengths by 6 % over the field without a deviation."""
     ends, turn = _stars(theta_deg)
     found = evaluate(ends[:, ::-1], np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
     np.testing.assert_allclose(found.deviations, 0.0, atol=1e-6)
@@ -104,7 +108,7 @@ def test_exact_stars_deviate_nowhere_whatever_the_axis(theta_deg: float) -> None
 
 @pytest.mark.parametrize("theta_deg", _THETAS)
 def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg: float) -> None:
-    """Across and along a streak each difference of two ends has unit variance; the residual holds both."""
+    """Along and across a streak, end differences have unit variance, and the residual includes both."""
     rng = np.random.default_rng(3)
     ends, turn = _stars(theta_deg, n=14)
     long = lengths(ends) > 25.0
@@ -116,7 +120,7 @@ def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg:
         for _ in range(60)
     ]
     spread = np.sqrt(np.mean(np.square(deviations), axis=(0, 1)))
-    # The centre is itself fitted and the field's edge is stretched: a fifth.
+    # The tolerance of a fifth allows for the fitted centre and the stretched edge of the field.
     np.testing.assert_allclose(spread, [1.0, 1.0, np.sqrt(2.0)], rtol=0.2)
 
 
@@ -128,13 +132,13 @@ def test_deviations_are_in_standard_deviations_of_the_endpoint_errors(theta_deg:
 def test_each_indicator_sees_its_own_part_of_a_motion(
     theta_deg: float, along: float, across: float, expected: tuple[bool, bool, bool]
 ) -> None:
-    """An object whose second end is 6 px on, or to the side: 42 standard deviations of 0.1 px."""
+    """The second end of an object is displaced by 6 px, which is 42 standard deviations of 0.1 px."""
     ends, turn = _stars(theta_deg)
     one = int(np.argmax(lengths(ends)))
     chord = ends[one, 1] - ends[one, 0]
     chord /= np.linalg.norm(chord)
     side = np.array([-chord[1], chord[0]])
-    # Symmetric about the middle, so that the star in the same place is the same star.
+    # The displacement is symmetric about the middle, so that the reference star remains the same.
     moved = 0.5 * (along * chord + across * side)
     ends[one] += [-moved, moved]
     found = evaluate(ends, np.full(len(ends), 0.1), turn, _PINHOLE, _BOUNDS)
@@ -157,10 +161,10 @@ def test_the_lower_bound_keeps_a_quiet_frame_quiet_and_the_strict_rule_a_loud_on
     sigma = np.full(len(ends), 0.1)
     quiet = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, _BOUNDS)
     strict_only = evaluate(ends + 0.1 * noise, sigma, turn, _PINHOLE, (0.0, 0.0, 0.0))
-    # 2.5 sigma of thirty streaks and three indicators: a false alarm in nearly every frame.
+    # With 2.5 sigma limits for thirty streaks and three indicators, nearly every frame has a false alarm.
     assert strict_only.fired.any()
     assert not quiet.fired.any()
-    # Errors ten times the expected ones: the frame's own spread holds where the bound would fire.
+    # If the errors are ten times as large as expected, the scatter within the frame prevents false alarms.
     loud = evaluate(ends + noise, sigma, turn, _PINHOLE, _BOUNDS)
     assert np.count_nonzero(np.abs(loud.deviations) > _BOUNDS) > 3 * np.count_nonzero(loud.fired)
 
@@ -187,7 +191,7 @@ def _detect(pixels: FloatArray, rotation: FloatArray, exposure: float = 1.0) -> 
 
 
 def _turn(pixels: FloatArray, rotation: FloatArray, exposure: float) -> FloatArray:
-    """Return the rotation that the likelihood finds; the true one decides its sign."""
+    """Return the rotation estimated by maximum likelihood, with the sign of the true rotation."""
     settings = LikelihoodSettings(saturation=_SETTINGS.saturation, gain=_SETTINGS.gain)
     found = estimate_motion(pixels, _FRAME_CAMERA.pinhole, exposure, settings, rotation / exposure, 0.0)
     assert found.rate is not None
@@ -201,7 +205,7 @@ def _see(
     rotation: FloatArray = _ROTATION,
     exposure: float = 1.0,
 ) -> tuple[ObjectReport, FloatArray]:
-    """Return what is found in a frame with one object, and its true path in the image."""
+    """Return the detections in a frame with one object, and the object's true path in the image."""
     path = object_path(_FRAME_CAMERA, _PLACE, motion, rotation)
     pixels = frame_with(_FRAME_CAMERA, rotation, exposure, seed, [(path, magnitude)], _FAINTEST)
     return _detect(pixels, rotation, exposure), path
@@ -219,7 +223,7 @@ def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: floa
     report, path = _see(motion, 4.0, exposure=exposure)
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.5)
-    # The ends are in the order of the slower motion; the rates of both orders are reported.
+    # The ends are in the order of the slower motion, and the rates for both orders are reported.
     assert found.relative_rate == pytest.approx(px / _FOCAL / exposure, rel=0.02)
     assert found.other_relative_rate > found.relative_rate
     np.testing.assert_allclose(found.direction, [np.cos(towards), np.sin(towards)], atol=0.03)
@@ -233,7 +237,7 @@ def test_a_tracked_object_is_a_point_that_moves_among_the_stars(theta_deg: float
     found = _only(report)
     np.testing.assert_allclose(found.endpoints, path[[0, -1]], atol=0.3)
     assert set(found.fired) == {"displacement", "residual"}
-    # Against the stars, which go as -omega x v: the object goes the other way at the camera's own rate.
+    # Stars move by -omega x v, and the object moves in the opposite direction at the camera's rate.
     star = -np.cross(rotation, _PLACE)
     assert found.relative_rate == pytest.approx(np.linalg.norm(star), rel=0.02)
     np.testing.assert_allclose(found.direction, -star[:2] / np.linalg.norm(star[:2]), atol=0.05)
@@ -264,7 +268,7 @@ def test_frames_without_an_object_have_none() -> None:
         assert report.verdicts.count(Verdict.STAR) >= 4
 
 
-# Offset (px) of a second star along and across the streak of the first, 55 px long, and its magnitude.
+# Offset (px) of a second star along and across the 55 px long streak of the first star, and its magnitude.
 @pytest.mark.parametrize(
     ("along", "across", "magnitude"),
     [
@@ -289,7 +293,7 @@ def test_overlapping_streaks_of_two_stars_are_not_reported_as_an_object(
     image = expose(_FRAME_CAMERA, directions, magnitudes, _ROTATION, 1.0)
     report = _detect(read_out(_FRAME_CAMERA, image, 1.0, np.random.default_rng(6)), _ROTATION)
     assert report.objects == ()
-    # It was noticed, not overlooked: some region is stars, or unclear, by its pixels.
+    # The blend is recognised from its pixels: at least one region is classified as stars or as unclear.
     assert {Verdict.STARS, Verdict.UNCLEAR} & set(report.verdicts + report.crowded)
 
 
@@ -298,7 +302,7 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
     directions = np.concatenate([directions, _PLACE[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 4.0), _ROTATION, 1.0)
     star = -np.cross(_ROTATION, _PLACE)[:2]
-    # In the image it goes straight across the star's own path.
+    # In the image, the object moves perpendicular to the star's path.
     across = np.arctan2(star[0], -star[1])
     seen = object_path(
         _FRAME_CAMERA, _PLACE, _ROTATION + motion_across(_PLACE, 60.0 / _FOCAL, across), _ROTATION
@@ -313,7 +317,7 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
 @pytest.mark.parametrize("along", [8.0, 25.0])
 @pytest.mark.parametrize("magnitude", [4.0, 6.0])
 def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: float) -> None:
-    """The region of the two is long, and saturated at magnitude 4."""
+    """The blended region is long, and saturated at magnitude 4."""
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, _FAINTEST)
     directions = np.concatenate([directions, _PLACE[None]])
     image = expose(_FRAME_CAMERA, directions, np.append(magnitudes, 5.0), _ROTATION, 1.0)
@@ -337,7 +341,7 @@ def test_a_bright_star_whose_core_is_saturated_is_not_reported_as_an_object() ->
 
 
 def test_a_piece_of_a_faint_star_is_not_reported_as_an_object() -> None:
-    """At the limit of segmentation a streak falls into pieces; their light is a star's."""
+    """At the segmentation threshold, a streak breaks into segments with the total flux of a star."""
     directions, magnitudes = star_field(_FRAME_CAMERA, 5, 5.5)
     faint = np.concatenate([directions, _PLACE[None]])
     for seed in range(3):
@@ -401,14 +405,14 @@ def test_pixels_that_cannot_be_solved_for_leave_the_streak_unclear(monkeypatch: 
 
 HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 MEETING = np.array([251.3, 262.8])
-"""px, where both are after 7 s."""
+"""Position (px) of both objects after 7 s."""
 MOTIONS = np.array([[8.0, 2.0], [5.0, -5.5]])
-"""px/s: 0.33 and 0.30 deg/s."""
+"""Image motions (px/s), which are 0.33 and 0.30 deg/s."""
 MAGNITUDE = 4.5
 
 
 def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArray:
-    """Return the attitude (4,) of a camera with this boresight and north up."""
+    """Return the attitude (4,) of a camera with the given boresight and north up."""
     right, up = np.radians([right_ascension_deg, declination_deg])
     sight = np.array([np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)])
     east = np.array([-np.sin(right), np.cos(right), 0.0])
@@ -416,7 +420,7 @@ def _looking_at(right_ascension_deg: float, declination_deg: float) -> FloatArra
 
 
 def _places(since: FloatArray) -> FloatArray:
-    """Return the places (k, 2, 2) px of both at times (k,) s after they meet."""
+    """Return the positions (k, 2, 2) px of both objects at times (k,) s after they meet."""
     return np.asarray(MEETING + since[:, None, None] * MOTIONS)
 
 
@@ -448,7 +452,7 @@ def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_t
 @pytest.mark.parametrize(("right", "up"), [(-131.5, -72.95), (102.7, -39.5)])
 @pytest.mark.parametrize("rate_deg", [0.0, 0.3])
 def test_a_crowded_sky_at_rest_or_nearly_so_has_an_attitude(right: float, up: float, rate_deg: float) -> None:
-    """Its faint regions run together and look long; the streaks are at most 1.5 px."""
+    """Faint regions merge and look long, but the streaks are at most 1.5 px long."""
     held = _looking_at(right, up)
     turn = np.array([0.0, np.radians(rate_deg), 0.0])
     found = run(frame_job(held, turn, []))

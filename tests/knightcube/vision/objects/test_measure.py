@@ -1,4 +1,4 @@
-"""Objects beside stars and brighter than stars, through the vision job: neither is mistaken for the other."""
+"""Tests of the vision job with satellites beside stars and brighter than stars."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
 
 @dataclass(frozen=True)
 class Shot:
-    """A satellite at `place` (2,) px of mid-exposure that moves by `motion` (2,) px; `turn` (3,) rad/s."""
+    """A satellite at `place` (2,) px at mid-exposure that moves by `motion` (2,) px; `turn` (3,) rad/s."""
 
     place: FloatArray
     motion: FloatArray
@@ -31,20 +31,20 @@ class Shot:
     knows: bool = True
 
     def found(self) -> FrameFound:
-        """Return what the flight's vision finds."""
+        """Return the result of the vision job."""
         ways = self.place + np.outer(TIMES / EXPOSURE, self.motion)
         seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
         return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))
 
     def sighting(self, sighted: MeasuredObjects | None) -> int | None:
-        """Return which sighting is within a pixel of it."""
+        """Return the index of the detection within a pixel of the satellite, or None."""
         assert sighted is not None
         away = np.linalg.norm(sighted.points - self.place, axis=1)
         return int(away.argmin()) if len(away) and away.min() < 1.0 else None
 
 
 def _star(brightest: float, faintest: float) -> FloatArray:
-    """Return the place (2,) px of a star of such a magnitude, well within the frame and alone."""
+    """Return the position (2,) px of an isolated star in the magnitude range, away from the border."""
     stars, directions = sky_to(8.5)
     places = CAMERA.pinhole.project(directions @ attitude_matrix(HELD).T)
     inside = np.all((places > 60.0) & (places < 450.0), axis=1)
@@ -68,7 +68,7 @@ def test_an_object_beside_a_catalogue_star_is_sighted_where_it_is(
     focal = CAMERA.pinhole.focal_length
     claim = np.sqrt(0.5 * np.trace(sighted.covariance[own])) * focal
     assert claim < 0.06
-    # 99.99 % of two degrees of freedom.
+    # The limit is the 99.99 % quantile for two degrees of freedom.
     assert np.linalg.norm(sighted.points[own] - place) < 4.3 * claim
     assert abs(sighted.magnitudes[own] - magnitude) < 0.3
     assert len(sighted.points) == 1
@@ -84,7 +84,7 @@ def test_stars_alone_are_not_reported_as_objects() -> None:
 @pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize(("turn", "magnitude"), [(0.0, -1.0), (0.02, 2.0)])
 def test_a_bright_satellite_is_not_named_as_a_star(turn: float, magnitude: float, knows: bool) -> None:
-    """Neither the identification, tracked or lost in space, nor the refit with the catalogue names it."""
+    """Neither the identification nor the catalogue refit identifies the satellite as a star."""
     place, motion = np.array([203.3, 301.8]), np.array([2.5, 1.0])
     shot = Shot(place, motion, magnitude, np.array([0.0, turn, 0.0]), knows)
     found = shot.found()
@@ -100,7 +100,7 @@ def test_a_bright_satellite_is_not_named_as_a_star(turn: float, magnitude: float
 
 
 def test_the_catalogue_holds_stars_only() -> None:
-    """Hipparcos numbers end at 120,416, and no star moves faster than Barnard's, 10.4" a year."""
+    """Hipparcos numbers end at 120,416, and the fastest star is Barnard's with 10.4" per year."""
     stars = catalogue.load()
     assert len(np.unique(stars.hip)) == len(stars.hip)
     assert stars.hip.min() >= 1

@@ -1,4 +1,4 @@
-"""Stars are taken away from a region down to its noise; what is none of theirs is left and measured."""
+"""Tests of the subtraction of stars from a region, and of the measurement of the remaining light."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CORNER = np.array([200.0, 220.0])
 
 
 def _patch(middles: list[tuple[float, float]], flux: float, extra: FloatArray | None, seed: int) -> Patch:
-    """Return a patch of 90 x 40 px of stars of `flux` counts, and of an object of 40000 along `extra`."""
+    """Return a patch of 90 x 40 px with stars of `flux` counts, and an object of 40000 along `extra`."""
     image = np.zeros((40, 90))
     for middle in middles:
         direction = _CAMERA.pinhole.unit_vectors(np.array([middle]))[0]
@@ -43,7 +43,7 @@ def test_overlapping_stars_leave_nothing() -> None:
     patch = _patch(middles, 60_000.0, None, 1)
     paths, left = fit_stars(patch, _ROTATION, _CAMERA.pinhole)
     assert len(paths) >= 2
-    # Each true star has a path of its own, to a tenth of a pixel.
+    # Each true star has its own path, accurate to a tenth of a pixel.
     for middle in middles:
         assert min(np.linalg.norm(path.mean(axis=0) - middle) for path in paths) < 0.1
     assert brightest_left(patch, left) is None
@@ -87,5 +87,5 @@ def test_slopes_of_light_are_those_of_small_moves() -> None:
     step = 1e-4 * share[:, None]
     for slope, axis in ((across, [1.0, 0.0]), (down, [0.0, 1.0])):
         moved = [spread_over(path + sign * step * axis, 40, 24, 1.0) for sign in (1.0, -1.0)]
-        # To the light dropped at 5 sigma over the step.
+        # The tolerance is the flux beyond 5 sigma divided by the step.
         np.testing.assert_allclose(slope, (moved[0] - moved[1]) / 2e-4, atol=1e-5)

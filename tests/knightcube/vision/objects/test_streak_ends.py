@@ -1,4 +1,4 @@
-"""Regions, corners and ends of streaks, and the centre of rotation."""
+"""Tests of regions, corners and ends of streaks, and of the centre of rotation."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_lines_length_comes_from_its_moments_whatever_its_width() -> None:
     signal = np.zeros((60, 120), dtype=np.float32)
     signal[20:25, 10:91] = 3.0
     regions = find_regions(signal > 0, signal, least_area=2)
-    # Rows and columns of whole pixels: (81^2 - 1 - (5^2 - 1))/12 is the difference of the moments.
+    # For whole pixels, the difference of the moments is (81^2 - 1 - (5^2 - 1))/12.
     assert regions.length[0] == pytest.approx(np.sqrt(81.0**2 - 5.0**2))
     assert regions.flux[0] == pytest.approx(3.0 * 5 * 81)
 
@@ -60,7 +60,7 @@ def test_an_empty_mask_has_no_regions() -> None:
 def test_the_local_threshold_passes_normal_noise_at_its_own_rate() -> None:
     signal = np.random.default_rng(4).normal(0.0, 5.0, (700, 700)).astype(np.float32)
     passed = threshold_local(signal, np.full_like(signal, 5.0), 2.0).mean()
-    # 2.275 % of a normal variable; neighbouring sums are correlated, so about 54,000 are independent.
+    # A normal variable exceeds 2 sigma with 2.275 %. About 54,000 of the correlated sums are independent.
     assert passed == pytest.approx(0.02275, abs=5.0 * np.sqrt(0.02275 / 54_000))
 
 
@@ -86,7 +86,7 @@ def test_hot_pixels_are_repaired_and_stars_are_left() -> None:
 
 
 def test_light_taken_from_some_pixels_leaves_the_sums_of_what_is_left() -> None:
-    """At the frame's corners and edges too."""
+    """The test includes pixels at the corners and edges of the frame."""
     generator = np.random.default_rng(9)
     image = generator.integers(0, 1000, (40, 50)).astype(np.float32)
     pixels = np.unique(np.append(generator.integers(0, image.size, 300), [0, 49, 50, image.size - 1]))
@@ -100,14 +100,14 @@ def test_light_taken_from_some_pixels_leaves_the_sums_of_what_is_left() -> None:
 def test_the_derivative_kernel_is_the_published_one_of_3_4() -> None:
     printed = np.array([[0.0466, 0, -0.0466], [0.3446, 0, -0.3446], [0.0466, 0, -0.0466]])
     kernel = np.outer(gaussian_kernel(0.5, 1), gaussian_derivative_kernel(0.5, 1))
-    # 3.4 is written for convolution, which mirrors it.
+    # Equation 3.4 is written for convolution, which mirrors the kernel.
     np.testing.assert_allclose(kernel[:, ::-1], printed, atol=5.5e-5)
 
 
 def test_the_gradient_of_a_ramp_is_its_slope() -> None:
     y, x = np.mgrid[0:40, 0:50]
     gx, gy = gradient(3.0 * x - 2.0 * y, sigma=1.0)
-    # The kernels are cut at three sigma: 3 % of the derivative's weight lies beyond.
+    # The kernels are truncated at three sigma, and 3 % of the derivative's weight lies beyond.
     np.testing.assert_allclose(gx[8:-8, 8:-8], 3.0, rtol=0.03)
     np.testing.assert_allclose(gy[8:-8, 8:-8], -2.0, rtol=0.03)
 
@@ -206,7 +206,7 @@ def test_extension_moves_both_ends_outward() -> None:
 _ROLLS = [0.0, 0.4, 0.8, 1.6, 2.5]
 
 
-# Four neighbours take a streak near the diagonals for a row of corners, and it is refused.
+# With four neighbours, a streak near the diagonals looks like a row of corners and is rejected.
 _TOO_SLANTED = [0.8, 2.5]
 
 
@@ -214,7 +214,7 @@ _PINHOLE = star_camera().pinhole
 
 
 def _streaks(theta: float, angle: float, n: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return starts, ends (n, 3) with 0.1 px of error, and the unit axis."""
+    """Return starts and ends (n, 3) of streaks with 0.1 px of error, and the unit rotation axis."""
     rng = np.random.default_rng(seed)
     axis = rate_at(theta, 1.0, rng.uniform(0.0, 2.0 * np.pi))
     starts = _PINHOLE.unit_vectors(rng.uniform(50.0, 970.0, (n, 2)))

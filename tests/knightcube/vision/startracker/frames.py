@@ -1,4 +1,4 @@
-"""Frames of the simulator's star camera, at rest or turning, with the attitude at mid-exposure."""
+"""Frames of the simulated star camera, at rest or rotating, with the attitude at mid-exposure."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class SkyFrame:
     """A frame and its truth.
 
     Attributes:
-        attitude: (4,) at mid-exposure, ICRS to camera.
-        rate: (3,) rad/s in the camera's axes.
-        stars: (n, 2) px at mid-exposure, the brightest first; `electrons` (n,) of each.
+        attitude: attitude (4,) at mid-exposure, from ICRS to camera axes.
+        rate: rate (3,) in camera axes, rad/s.
+        stars: positions (n, 2) at mid-exposure, px, brightest star first; `electrons` (n,) of each.
     """
 
     pixels: Image
@@ -39,7 +39,7 @@ class SkyFrame:
     electrons: FloatArray
 
     def rate_bound(self, most: int = 30) -> float:
-        """Return the Cramer-Rao bound of the rate's magnitude, rad/s, from the `most` brightest stars."""
+        """Return the Cramer-Rao bound of the rate's magnitude from the `most` brightest stars, rad/s."""
         camera = self.camera
         floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
         stars, light = self.stars[:most], self.electrons[:most]
@@ -48,17 +48,17 @@ class SkyFrame:
         return float(np.sqrt(axis @ bound.covariance @ axis))
 
     def attitude_bound(self, most: int = 60) -> FloatArray:
-        """Return the Cramer-Rao bound of the attitude at mid-exposure, covariance (3, 3) rad^2.
+        """Return the Cramer-Rao bound of the attitude covariance (3, 3) at mid-exposure, rad^2.
 
-        From the `most` brightest stars, whose places are independent: the shape of the point spread is known,
-        and the turn over the exposure, odd in time, tells nothing of its middle while the rate is constant.
+        The bound uses the `most` brightest stars with independent positions. The shape of the point spread is
+        known, and errors of a constant rate are not correlated with the attitude at mid-exposure.
         """
         camera = self.camera
         floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
         motion = CameraMotion.steady(self.rate * self.exposure)
         total = np.zeros((3, 3))
         for star, light in zip(self.stars[:most], self.electrons[:most], strict=True):
-            # After the turn and the point spread: x, y, electrons, background.
+            # Rotation and point spread are followed by the parameters x, y, electrons and background.
             alone = star_information(camera.pinhole, motion, star, float(light), camera.psf_sigma, floor)[
                 4:, 4:
             ]
@@ -73,14 +73,14 @@ class SkyFrame:
 
 
 def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
-    """Return d(pixel)/d(turn about the camera's axes), (2, 3) px/rad, by differences."""
+    """Return the derivatives (2, 3) of pixel coordinates by rotation about the camera axes, px/rad."""
     direction = camera.unit_vectors(star)
     step = 1e-5 * np.cross(np.eye(3), direction)
     return np.asarray((camera.project(direction - step) - camera.project(direction + step)).T / 2e-5)
 
 
 def sky() -> SkyIndex:
-    """Return the default index, of the frames' epoch."""
+    """Return the default index, whose epoch is that of the frames."""
     return default_index()
 
 
@@ -93,7 +93,7 @@ def sky_frame(
 ) -> SkyFrame:
     """Return a random field of the real sky with streaks of about `streak_px` at the boresight.
 
-    The axis is as far off the boresight as `theta_deg` says, lowest to highest.
+    The angle of the rotation axis from the boresight is drawn between the two values of `theta_deg`.
     """
     attitude = normalise(rng.standard_normal(4))
     theta, roll = rng.uniform(*np.radians(theta_deg)), rng.uniform(0.0, 2.0 * np.pi)

@@ -1,6 +1,7 @@
-"""Foregrounds and defects put on a frame of stars: what a photograph or a worn sensor has besides the sky.
+"""Foregrounds and defects that are added to a frame of stars, as in photographs or from a worn sensor.
 
-Each takes pixels (rows, columns) as floating numbers, the span of its stars in counts, and a generator.
+Each function takes pixels (rows, columns) as floats, the brightness range of the stars in counts, and a
+generator.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ from knightcube.astro.arrays import FloatArray, Image
 
 Spoiler = Callable[[FloatArray, float, np.random.Generator], FloatArray]
 
-# Of a foreground's light: its own texture, pixel by pixel.
+# Pixel-to-pixel texture of a foreground, relative to its brightness.
 _TEXTURE = 0.02
 
 
 def spoilt(pixels: Image, kind: str, rng: np.random.Generator) -> Image:
-    """Return `pixels` (rows, columns) of whole counts, with the foreground or defect `kind` of SPOILERS."""
+    """Return integer `pixels` (rows, columns) with the foreground or defect `kind` of SPOILERS."""
     top = float(np.iinfo(pixels.dtype).max)
     frame = pixels.astype(float)
     span = max(float(np.percentile(frame, 99.9) - np.median(frame)), 20.0)
@@ -26,13 +27,13 @@ def spoilt(pixels: Image, kind: str, rng: np.random.Generator) -> Image:
 
 
 def _grid(frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return y (rows, 1) and x (1, columns) of the pixels, 0 to 1 down and across."""
+    """Return y (rows, 1) and x (1, columns) of the pixels, from 0 to 1 down and across."""
     rows, columns = frame.shape
     return np.linspace(0.0, 1.0, rows)[:, None], np.linspace(0.0, 1.0, columns)[None]
 
 
 def _lit(frame: FloatArray, light: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return the frame with `light` added, with its texture."""
+    """Return the frame with a foreground of brightness `light` and its texture."""
     return frame + light * (1.0 + _TEXTURE * rng.standard_normal(frame.shape))
 
 
@@ -170,4 +171,4 @@ SPOILERS: dict[str, Spoiler] = {
     "column pattern": _column_pattern,
     "cosmic rays": _cosmic,
 }
-"""What is put on a frame, by name."""
+"""Foregrounds and defects that can be added to a frame, by name."""

@@ -1,4 +1,4 @@
-"""Frames of stars with foregrounds or defects, and the star tracker's answers for them."""
+"""Frames of stars with foregrounds or defects, and the solutions of the star tracker for them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EXPOSURE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A frame with its truth: boresight (3,), field in degrees."""
+    """A frame with its true boresight (3,) and field of view in degrees."""
 
     source: str
     pixels: Image
@@ -36,7 +36,7 @@ class Scene:
 
 
 def rendered(frames: int, streak_px: float) -> Iterator[Scene]:
-    """Yield random frames of the simulator's camera, with streaks of `streak_px` (0: points)."""
+    """Yield random frames of the simulated camera, with streaks of `streak_px` px, or points if it is 0."""
     for number in range(frames):
         scene = sky_frame(np.random.default_rng([_SEED, number]), streak_px, _EXPOSURE)
         boresight = attitude_matrix(scene.attitude)[2]
@@ -44,19 +44,19 @@ def rendered(frames: int, streak_px: float) -> Iterator[Scene]:
 
 
 def photographed(folder: Path) -> Iterator[Scene]:
-    """Yield the photographs of a folder."""
+    """Yield the photographs in a folder with their true pointing."""
     for name, truth in json.loads((folder / "truth.json").read_text()).items():
         yield Scene("photographs", read_image(folder / name), centre_of(truth), truth["fov"])
 
 
 def spoilt_scene(scene: Scene, kind: str, number: int) -> Scene:
-    """Return the `number`-th scene with the foreground or defect `kind`."""
+    """Return a scene with the foreground or defect `kind`, drawn with the seed `number`."""
     rng = np.random.default_rng([_SEED, number, zlib.crc32(kind.encode())])
     return Scene(scene.source, spoilt(scene.pixels, kind, rng), scene.boresight, scene.field_deg)
 
 
 def found_boresight(scene: Scene) -> FloatArray | None:
-    """Return the boresight (3,) that the star tracker finds; None where it refuses."""
+    """Return the boresight (3,) found by the star tracker; None where it refuses."""
     field = scene.field_deg
     camera, scale = believed(scene.pixels, field, field * (1.0 - FIELD_SHARE), field * (1.0 + FIELD_SHARE))
     found = solve_frame(scene.pixels, camera, scale, _EXPOSURE, sky(), SolveSettings())

@@ -1,4 +1,4 @@
-"""Least-squares fits of attitude, scale and distortion to directions made from known ones."""
+"""Tests of least-squares fits of attitude, scale and distortion to simulated directions."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def directions(count: int, seed: int = 1) -> FloatArray:
 
 
 def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
-    """From two degrees and three per cent away, to the rounding of the last quadratic step."""
+    """The fit starts two degrees and three per cent off, and converges quadratically to rounding errors."""
     seen, quaternion = directions(12), normalise(np.array([0.3, -0.2, 0.5, 0.7]))
     matrix = attitude_matrix(quaternion)
     reference = stretched(seen, 1.03) @ matrix
@@ -65,7 +65,7 @@ def test_the_attitude_and_scale_of_exact_directions_are_found() -> None:
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_the_covariance_is_that_of_many_fits_and_the_squares_have_their_freedom(free_scale: bool) -> None:
-    """400 fits of 12 stars of different accuracy: chi-squares of 3 or 4 and of 24 - 3 or - 4 per fit."""
+    """In 400 fits of 12 stars, attitude and residuals have the chi-squares 3 or 4 and 24 minus 3 or 4."""
     draw = np.random.default_rng(2)
     seen, parameters = directions(12), 4 if free_scale else 3
     sigma = np.where(np.arange(12) < 4, SIGMA, 3.0 * SIGMA)
@@ -74,7 +74,7 @@ def test_the_covariance_is_that_of_many_fits_and_the_squares_have_their_freedom(
         noisy = normalise(seen + sigma[:, None] * draw.normal(size=(12, 3)))
         found = refine(noisy, seen, sigma, np.eye(3), 1.0, free_scale)
         assert found is not None
-        # A = exp(-[d x]): the error d of the rotation.
+        # The rotation error d is defined by A = exp(-[d x]).
         turn = np.array([found.matrix[1, 2], found.matrix[2, 0], found.matrix[0, 1]])
         error = np.append(turn, math.log(found.scale)) if free_scale else turn
         errors.append(float(error @ np.linalg.solve(found.covariance, error)))
@@ -100,7 +100,7 @@ def test_a_start_on_the_other_side_of_the_sky_diverges() -> None:
 def test_residuals_beyond_three_sigma_of_their_chi_square_increase_the_variances(
     excess: float, factor: float
 ) -> None:
-    """12 stars and 4 parameters leave 20 degrees of freedom: 1 + 3 sqrt(2 / 20) = 1.949."""
+    """With 12 stars and 4 parameters, 20 degrees of freedom give a limit of 1 + 3 sqrt(2 / 20) = 1.949."""
     squares = np.full(12, excess * 20.0 / 12.0)
     assert inflation(squares, 4) == pytest.approx(factor)
     assert inflation(np.array([50.0, 50.0]), 4) == 1.0, "two stars leave no residuals"
@@ -108,7 +108,7 @@ def test_residuals_beyond_three_sigma_of_their_chi_square_increase_the_variances
 
 
 def test_a_widened_fit_has_the_scatter_of_its_residuals() -> None:
-    """Sigmas that are three times too small."""
+    """The assumed standard deviations are three times too small."""
     draw = np.random.default_rng(3)
     seen = directions(40)
     noisy = normalise(seen + 3.0 * SIGMA * draw.normal(size=(40, 3)))
@@ -155,7 +155,7 @@ CORNER = math.hypot(0.36, 0.36)
 
 
 def barrel(true: FloatArray, distortion: float) -> FloatArray:
-    """Return the directions (n, 3) where a lens images true ones, t (1 + c (t / R)^2) for the tangent t."""
+    """Return the directions (n, 3) imaged by a lens that moves the tangent t to t (1 + c (t / R)^2)."""
     tangents = true[:, :2] / true[:, 2:]
     square = np.sum(tangents**2, axis=1, keepdims=True) / CORNER**2
     return np.asarray(
@@ -166,7 +166,7 @@ def barrel(true: FloatArray, distortion: float) -> FloatArray:
 def distorted_fit(
     seen: FloatArray, sky: FloatArray, sigma: float, first: int, far: float = 0.0
 ) -> DistortedFit | None:
-    """Return the fit that grows from the `first` stars nearest to the axis, which match their own numbers."""
+    """Return the fit that starts from the `first` stars nearest to the axis, with correct matches."""
     index = cast(SkyIndex, SimpleNamespace(stars=SimpleNamespace(direction=sky)))
     known = np.argsort(-seen[:, 2])[:first]
     field = StarField(seen, np.full(len(seen), sigma), (0.36, 0.36))
@@ -188,7 +188,7 @@ def test_a_match_grows_from_the_axis_as_the_distortion_is_determined(distortion:
 
 
 def test_the_distorted_fits_covariance_is_that_of_many_fits() -> None:
-    """100 lenses of 5 % in the corner, 30 stars in one half: attitude and scale have a chi-square of 4."""
+    """For 100 lenses of 5 % at the corner, attitude and scale have a chi-square of 4."""
     draw = np.random.default_rng(4)
     errors, shares = [], []
     for _ in range(100):

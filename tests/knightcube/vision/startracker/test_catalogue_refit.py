@@ -1,4 +1,4 @@
-"""The second fit, with all stars of the sky known: nearer to the truth, as sure as it says, or left alone."""
+"""Tests of the second fit with all catalogue stars: accuracy, covariance, and rejection."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MILKY_WAY = 16
 
 @cache
 def _first(seed: int, streak_px: float = _STREAK_PX) -> tuple[SkyFrame, FrameSolution]:
-    """Return a frame whose streaks are nearly half the field, and what the first fit makes of it."""
+    """Return a frame whose streaks are nearly half the field long, and the solution of the first fit."""
     frame = sky_frame(np.random.default_rng([77, seed]), streak_px, _EXPOSURE, _CAMERA)
     motion = estimate_motion(frame.pixels, _CAMERA.pinhole, _EXPOSURE, _LIKELIHOOD, frame.rate, 0.0)
     prior = AttitudePrior(multiply(from_rotation_vector(np.array([2e-4, -1e-4, 1e-4])), frame.attitude), 3e-4)
@@ -58,7 +58,7 @@ def _rate_error(solution: FrameSolution, frame: SkyFrame) -> float:
 
 
 def test_attitude_and_rate_come_nearer_to_the_truth() -> None:
-    """Root mean squares over three frames in which unseen stars had drawn the first fit off."""
+    """The rms errors are those of three frames in which undetected stars bias the first fit."""
     errors = []
     for seed in _SEEDS:
         frame, first = _first(seed)
@@ -82,7 +82,7 @@ def test_stars_that_hidden_light_had_silenced_have_a_say_again() -> None:
 
 
 def test_the_error_is_what_the_covariance_says() -> None:
-    """A chi-square of 9: below its quantile at 1 - 1e-3."""
+    """The limit is the quantile 1 - 1e-3 of a chi-square with 9 degrees of freedom."""
     squares = 0.0
     for seed in _SEEDS:
         error, fix = _error(_second(seed), _first(seed)[0].attitude), _second(seed).fix
@@ -92,7 +92,7 @@ def test_the_error_is_what_the_covariance_says() -> None:
 
 
 def test_it_needs_little_memory_in_the_milky_way() -> None:
-    """The worker that holds it is bounded: of 1200 stars no pair but those close by is looked at."""
+    """The worker's memory is limited, so that only close pairs of the 1200 stars are examined."""
     frame, first = _first(_MILKY_WAY, 120.0)
     tracemalloc.start()
     try:
@@ -104,7 +104,7 @@ def test_it_needs_little_memory_in_the_milky_way() -> None:
 
 
 def test_what_is_in_no_catalogue_stays_among_the_stars_without_a_say() -> None:
-    """The brightest star identified but one is struck off the catalogue."""
+    """The second brightest identified star is removed from the catalogue."""
     frame, first = _first(_SEEDS[0])
     struck = int(np.sort(first.star[first.matched])[1])
     known = sky()
@@ -128,7 +128,7 @@ def test_what_is_in_no_catalogue_stays_among_the_stars_without_a_say() -> None:
 
 
 def test_another_rate_than_before_is_not_believed() -> None:
-    """The first fit a hundredth off and sure of itself: the second, which finds the truth, contradicts it."""
+    """The first rate is wrong by 1 % with a small covariance, so that the correct second rate is rejected."""
     frame, first = _first(_SEEDS[0])
     motion = first.motion
     assert motion is not None

@@ -1,4 +1,4 @@
-"""The attitude from places whose errors differ along and across: as good as can be and as it says."""
+"""Tests of the attitude from positions with different errors along and across: accuracy and covariance."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
 _ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
 _ALONG_PX, _ACROSS_PX = 2.0, 0.1
 _TRIALS = 200
-# Of a chi-square of 600 degrees of freedom: its quantiles at 1e-5, over 600.
+# Quantiles at 1e-5 of a chi-square with 600 degrees of freedom, divided by 600.
 _LOW, _HIGH = 0.77, 1.27
 
 
 def _streaks(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return places (n, 2) px and covariances (n, 2, 2), long in a direction of each star's own."""
+    """Return positions (n, 2) px and covariances (n, 2, 2), each elongated in a random direction."""
     points = rng.uniform(50.0, 970.0, (count, 2))
     angle = rng.uniform(0.0, np.pi, count)
     axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=-1).reshape(-1, 2, 2)
@@ -52,7 +52,7 @@ def _error(found: ImageFit) -> FloatArray:
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> None:
-    """The believed focal length one part in a hundred wrong, where it is free."""
+    """If the scale is fitted, the assumed focal length is wrong by 1 %."""
     points, covariance = _streaks(np.random.default_rng(1), 10)
     reference = _reference(points)
     scale = 1.01 if free_scale else 1.0
@@ -65,7 +65,7 @@ def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> 
 
 @pytest.mark.parametrize("free_scale", [False, True])
 def test_the_errors_scatter_as_the_covariance_says_and_less_than_with_round_ones(free_scale: bool) -> None:
-    """Monte Carlo of 200 fields of 12 stars; the round errors have the same mean variance."""
+    """The 200 fields of 12 stars are compared with fields of isotropic errors with the same mean variance."""
     rng = np.random.default_rng(2)
     mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
     for _ in range(_TRIALS):
@@ -100,7 +100,7 @@ def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
 
 
 def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_says() -> None:
-    """Two of 14 stars lie 6 px, sixty deviations across their streaks, from where they should."""
+    """Two of 14 stars are displaced by 6 px, which is sixty standard deviations across their streaks."""
     rng = np.random.default_rng(4)
     mismatch = 0.0
     for _ in range(_TRIALS):
@@ -117,7 +117,7 @@ def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_
 
 
 def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells() -> None:
-    """One of four stars is wrong, but nobody could say which."""
+    """One of four stars is wrong, but the data do not show which one."""
     rng = np.random.default_rng(5)
     points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
     reference = _reference(points)
@@ -137,7 +137,7 @@ def test_stars_in_one_direction_fix_no_attitude() -> None:
 
 
 def test_stars_that_belong_elsewhere_do_not_give_an_attitude() -> None:
-    """Two stars a right angle apart where the image shows them together: no turn brings them there."""
+    """Two stars at a right angle are imaged side by side, which no attitude explains."""
     points = np.array([[500.0, 500.0], [520.0, 500.0]])
     reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     with pytest.raises(AttitudeError):
@@ -154,12 +154,12 @@ def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() 
         squares.append(error @ np.linalg.solve(found.fix.covariance, error) / 3.0)
         off.append(np.linalg.norm(error[:2]) * found.camera.focal_length)
     assert np.mean(squares) < 1.0
-    # A fit of the focal length alone is 0.7 px off.
+    # A fit of the focal length alone has an error of 0.7 px.
     assert np.sqrt(np.mean(np.square(off))) < 0.2
 
 
 def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
-    """Monte Carlo of 200 fields of 12 stars that move by 1 px a frame's height of delay, one deviation."""
+    """In 200 fields, 12 stars move by one standard deviation of the delay, which is 1 px per frame height."""
     rng = np.random.default_rng(6)
     known, unknown, delays = 0.0, 0.0, 0.0
     for _ in range(_TRIALS):
@@ -180,7 +180,7 @@ def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covar
 
 
 def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_they_know() -> None:
-    """Monte Carlo of 200 fields: all err by 0.05 px, which is ten times the noise of the brightest."""
+    """In 200 fields, all positions err by 0.05 px, which is ten times the noise of the brightest stars."""
     rng = np.random.default_rng(7)
     known, unknown, off, without = 0.0, 0.0, 0.0, 0.0
     for _ in range(_TRIALS):
@@ -194,7 +194,7 @@ def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_the
         error = _error(other)
         unknown += float(error @ np.linalg.solve(other.fix.covariance, error))
         without += float(np.sum(error[:2] ** 2))
-    # A share of the brightest is left out before: the variance of those left is a little too small.
+    # Some of the brightest stars are rejected, so that the variance of the others is slightly too small.
     assert known / (3.0 * _TRIALS) < 2.3
     assert unknown > 4.0 * known
     assert off < 0.7 * without

@@ -1,4 +1,4 @@
-"""Lost in space on synthetic lists whose truth is known: what must be named, and what must be refused."""
+"""Tests of identification lost in space on synthetic star lists: identifications and refusals."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _right(found: StarMatch, drawn: StarList) -> bool:
     "kind", configurations(), ids=lambda kind: f"{kind.field_deg}-{kind.noise_px}-{kind.false_stars}"
 )
 def test_every_configuration_of_the_issue_is_named(kind: ListKind) -> None:
-    """A slice of `python -m tests.studies.bench starid`."""
+    """The lists are a small part of `python -m tests.studies.bench starid`."""
     for seed in range(10):
         drawn = _drawn(kind, seed)
         assert _right(identify(drawn.field(), SKY), drawn), seed
@@ -84,7 +84,7 @@ def test_other_cameras_and_worse_detectors_are_served_too(kind: ListKind) -> Non
 
 @pytest.mark.parametrize(("false_stars", "least"), [(3, 6), (10, 6), (20, 5)])
 def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
-    """A slice of `python -m tests.studies.bench starid --hard`; the field of view is unknown."""
+    """The lists are a small part of `python -m tests.studies.bench starid --hard`, with an unknown field."""
     right = 0
     for seed in range(6):
         drawn = _drawn(
@@ -121,7 +121,10 @@ def test_points_strewn_at_random_are_refused(known_deg: float | None) -> None:
 
 
 def test_a_refusal_keeps_to_its_work() -> None:
-    """Within 20 ms by `tests.studies.bench starid` on a quiet machine; ten times that on any."""
+    """The refusal takes at most 20 ms in `tests.studies.bench starid` on an idle machine.
+
+    The test allows ten times as much.
+    """
     drawn = draw_random(ListKind(known_deg=None), 40, np.random.default_rng(99))
     field = drawn.field()
     identify(field, SKY)
@@ -163,7 +166,7 @@ def test_a_camera_that_has_no_mirror_takes_none_for_the_sky() -> None:
 
 
 def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
-    """The four brightest of lists whose next star is clearly fainter."""
+    """The lists are chosen so that the fifth star is clearly fainter than the four brightest."""
     named = 0
     for seed in range(20):
         drawn = _drawn(ListKind(noise_px=0.1, magnitude_error=0.0), seed)
@@ -176,9 +179,10 @@ def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
 
 @pytest.mark.parametrize(("field_deg", "known_deg"), [(12.0, 0.1), (28.0, None)])
 def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> None:
-    """The squared error over its covariance has mean 3, that of a chi-square of three axes.
+    """The squared error over its covariance has a mean of 3, as a chi-square with three degrees of freedom.
 
-    With the field unknown too: the given sigmas are of the believed scale, 17 deg, and not of the true one.
+    With an unknown field, the given standard deviations refer to the assumed field of 17 deg instead of the
+    true field.
     """
     squares = []
     for seed in range(150):
@@ -189,12 +193,12 @@ def test_the_covariance_is_honest(field_deg: float, known_deg: float | None) -> 
         turn = attitude_matrix(found.fix.quaternion) @ attitude_matrix(drawn.attitude).T
         error = 0.5 * np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]])
         squares.append(error @ np.linalg.solve(found.fix.covariance, error))
-    # Standard deviation of the mean of 150 chi-squares of three: sqrt(6 / 150) = 0.2.
+    # The mean of 150 chi-squares with three degrees of freedom scatters by sqrt(6 / 150) = 0.2.
     assert 2.3 < np.mean(squares) < 3.8
 
 
 def test_sigmas_that_are_too_small_by_half_are_found_out() -> None:
-    """The covariance is widened when the residuals say so."""
+    """The covariance is increased if the residuals are too large."""
     drawn = _drawn(ListKind(field_deg=20.0, noise_px=0.5), 5)
     field = drawn.field()
     honest = identify(field, SKY)
@@ -219,12 +223,15 @@ def test_a_field_of_a_single_repeated_direction_names_nothing() -> None:
 
 
 def test_the_triangles_of_neighbours_join_a_star_with_two_of_its_five_nearest() -> None:
-    """Stars along a great circle at growing distances: the nearest stars of each are counted by hand."""
+    """The stars lie on a great circle at increasing distances.
+
+    The nearest stars of each can be counted by hand.
+    """
     angle = np.cumsum(np.arange(1, 46)) * 1e-4
     direction = np.stack([np.sin(angle), np.zeros(45), np.cos(angle)], axis=1)
     field = StarField(direction, np.full(45, 1e-5), (0.2, 0.2))
     expected = set()
-    # Only the 40 brightest stars are centres.
+    # Only the 40 brightest stars are used as centres.
     for centre in range(40):
         near = sorted(range(45), key=lambda other: abs(angle[other] - angle[centre]))[1:6]
         expected |= {tuple(sorted((centre, a, b))) for a in near for b in near if a < b}

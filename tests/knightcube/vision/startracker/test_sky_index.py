@@ -1,4 +1,4 @@
-"""The index: its triangles against geometry, its file against damage."""
+"""Tests of the sky index: triangles against geometry, and damaged files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,10 @@ def test_the_triangles_are_those_of_enumeration() -> None:
 
 
 def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() -> None:
-    """A hundred stars brighter than all others, in a few degrees: ranks leave their neighbours out."""
+    """A hundred stars within a few degrees are brighter than all others.
+
+    Their neighbours therefore have low ranks.
+    """
     near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(100, 2)
     direction = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(3000)])
     sizes, ranks = np.array([0.2, 0.3, 0.5]), np.array([4, 6])
@@ -79,7 +82,10 @@ def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() 
 
 
 def test_a_sky_turned_has_the_same_triangles() -> None:
-    """A star's reach is itself a side, to a neighbour: rounding has no say in which triangles end there."""
+    """The range of a star is the distance of a neighbour.
+
+    Rounding must not affect the choice of triangles.
+    """
     direction = _strewn(60)
     sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
     first = np.unique(np.sort(build_triangles(direction, sizes, ranks, 0).corners, axis=1), axis=0)
@@ -168,7 +174,7 @@ def test_loading_the_whole_index_takes_less_than_50_ms() -> None:
 
 
 def test_the_stars_move_to_another_epoch_by_their_proper_motion() -> None:
-    """Groombridge 1830, HIP 57939: 7.06 arcsec a year."""
+    """Groombridge 1830, HIP 57939, moves by 7.06 arcsec per year."""
     sky = default_index()
     (star,) = np.flatnonzero(sky.stars.hip == 57939)
     later = sky.at(sky.stars.epoch + 10.0).stars.direction[star]

@@ -1,6 +1,6 @@
-"""Right ascension, declination and roll against known directions.
+"""Tests of right ascension, declination and roll against known directions.
 
-Aberration against its published constant, its geometry, and the Earth's published velocity.
+Tests of aberration against its published constant, its geometry, and the published velocity of the Earth.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def test_stars_ahead_and_behind_stay_and_lengths_stay_one() -> None:
 
 
 def test_the_angle_to_the_apex_follows_the_half_angle_formula() -> None:
-    """tan(theta'/2) = sqrt((1 - beta)/(1 + beta)) tan(theta/2): exact at any speed (Einstein 1905)."""
+    """The formula tan(theta'/2) = sqrt((1 - beta)/(1 + beta)) tan(theta/2) is exact (Einstein 1905)."""
     beta = 0.5
     theta = np.array([0.3, 1.0, 2.0, 3.0])
     stars = np.stack([np.sin(theta), np.zeros(4), np.cos(theta)], axis=-1)
@@ -71,21 +71,21 @@ def test_an_impossible_velocity_is_refused() -> None:
 
 
 def test_the_earths_velocity_is_the_published_one() -> None:
-    """ERFA's own test of epv00 (barycentric, au a day) at MJD 53411.52501161."""
+    """The value is ERFA's own test of epv00 (barycentric, au per day) at MJD 53411.52501161."""
     published = np.array([-0.01091874268116823295, -0.01246525461732861538, -0.005404773180966231279])
     found = earth_velocity(2_453_412.02501161) * DAY / ASTRONOMICAL_UNIT
     np.testing.assert_allclose(found, published, atol=1e-11)
 
 
 def test_the_earths_velocity_is_the_slope_of_the_suns_place_by_another_series() -> None:
-    """The Almanac's, over a day: 0.1 % of 30 km/s, and the Sun's own 16 m/s about the barycentre."""
+    """The tolerance is 0.1 % of 30 km/s, plus 16 m/s for the Sun's motion about the barycentre."""
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         before, after = sun_position(np.array([date - 0.5, date + 0.5]))
         assert np.linalg.norm(earth_velocity(date) - (before - after) / DAY) < 46.0
 
 
 def test_the_earth_is_opposite_the_sun() -> None:
-    """Meeus, Astronomical Algorithms, Example 26.b: the Sun at 1992 October 13.0 TD, J2000, by VSOP87, au."""
+    """Meeus, Astronomical Algorithms, example 26.b: the Sun on 1992 October 13.0 TD in J2000 axes, au."""
     published = np.array([-0.93739691, -0.31316824, -0.13577924])
     place, _ = earth_from_sun(2_448_908.5)
     np.testing.assert_allclose(-place / ASTRONOMICAL_UNIT, published, atol=1e-6)

@@ -1,6 +1,6 @@
-"""From a frame to an attitude: points, streaks, a prior, and frames that show nothing to be told by.
+"""Tests of the attitude from a frame with points, with streaks, with a prior, and without usable stars.
 
-By how much a frame's attitude differs from that of mid-exposure when the body speeds up or is shaken.
+Tests of the attitude error at mid-exposure if the body accelerates or vibrates.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def _solve(
     frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
-    # The simulated lens has no distortion; only its focal length may be wrong.
+    # The simulated lens has no distortion, and only its focal length may be wrong.
     camera, settings = NARROW.pinhole, SolveSettings(uncalibrated_lens=False)
     return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 
 
 def _mismatch(found: FrameSolution, truth: FloatArray) -> float:
-    """Return the squared error of the attitude over its covariance."""
+    """Return the squared attitude error, normalised by the covariance."""
     assert found.fix is not None
     error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
     return float(error @ np.linalg.solve(found.fix.covariance, error))
@@ -77,7 +77,7 @@ def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: fl
 
 
 def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
-    """The triangle that names the stars tells a scale of its own, up to a part in a thousand off."""
+    """The triangle that identifies the stars has its own scale, which is wrong by up to 0.1 %."""
     for seed in range(3):
         found = _solve(sky_frame(np.random.default_rng([31, seed]), 40.0, 0.1))
         assert found.status is SolveStatus.SOLVED
@@ -94,7 +94,7 @@ def test_a_streaked_frame_tells_the_rate_and_a_frame_at_rest_does_not() -> None:
 
 
 def test_the_attitudes_of_many_frames_scatter_as_their_covariances_say() -> None:
-    """Twelve frames of three degrees of freedom: chi-square between its quantiles at 1e-4."""
+    """Twelve frames have 36 degrees of freedom, and the limits are the quantiles of chi-square at 1e-4."""
     frames = [sky_frame(np.random.default_rng([13, number]), 0.0, 0.1) for number in range(12)]
     total = sum(_mismatch(_solve(frame, scale=_KNOWN_TO_A_PERCENT), frame.attitude) for frame in frames)
     assert 11.9 < total < 76.4
@@ -119,7 +119,10 @@ def test_a_wrong_prior_costs_time_but_no_truth() -> None:
 
 
 def test_an_attitude_far_from_its_prior_is_not_forced_to_the_prior() -> None:
-    """The brightest place is 1.2 px off, by a star beside it: four agree on a roll of 30 prior sigmas."""
+    """The brightest position is 1.2 px off.
+
+    Four stars agree on a roll that differs from the prior by 30 sigmas.
+    """
     camera, sigma = Pinhole.from_field_of_view(512, 512, float(np.radians(20.0))), 1e-4
     prior = np.array([-0.40584763582055994, 0.7184116261147981, 0.029066639845090374, 0.5642052484779536])
     x = np.array([277.82, 104.81, 59.83, 6.82, 172.6, 204.45, 18.86, 173.75, 340.37, 466.16, 119.75])
@@ -147,7 +150,7 @@ def test_noise_alone_shows_no_star() -> None:
 
 
 def test_points_that_are_not_stars_are_refused_with_the_reason() -> None:
-    """A real frame's points, moved about at random: the same light, another sky."""
+    """The points of a real frame are moved at random, which keeps their flux but shows no real sky."""
     rng = np.random.default_rng(17)
     pixels = rng.normal(100.0, 10.0, (1024, 1024))
     rows, columns = np.mgrid[-4:5, -4:5]
@@ -176,7 +179,7 @@ def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
 
 @pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
 def test_a_mirrored_photograph_is_solved_and_said_to_be_mirrored() -> None:
-    """The attitude is that of the picture as it should be; the places are those of the picture as it came."""
+    """The attitude is that of the unmirrored image, and the positions are those of the given image."""
     upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
     camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)
     good, mirrored = (
@@ -196,7 +199,7 @@ def test_a_mirrored_photograph_is_solved_and_said_to_be_mirrored() -> None:
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)
-# Weights over time, from -1 to 1, that a weighting stands for: mean, ends, and the least squares' parabola.
+# Time weights, from -1 to 1, of the three weightings: mean, ends, and least-squares parabola.
 _EVEN = np.linspace(-1.0, 1.0, 401)
 _PARABOLA = np.linalg.pinv(np.stack([np.ones(401), _EVEN, _EVEN**2], axis=1))[0]
 _WEIGHTS = {
@@ -207,7 +210,7 @@ _WEIGHTS = {
 
 
 def _turns(*powers: float) -> FloatArray:
-    """Return turns (4, 3) about x that go as a polynomial of time, without its constant."""
+    """Return rotations (4, 3) about x that are a polynomial of time without a constant term."""
     angle = sum(factor * _TIMES ** (power + 1) for power, factor in enumerate(powers))
     return np.outer(angle, [1.0, 0.0, 0.0])
 
@@ -216,7 +219,10 @@ def _turns(*powers: float) -> FloatArray:
 def test_a_steady_acceleration_draws_the_attitude_off_as_the_integral_says(
     weighting: Weighting, part: float
 ) -> None:
-    """Of a t^2 / 2 the mean over T is a T^2 / 24, the ends are at a T^2 / 8, a parabola fitted at nothing."""
+    """For a rotation a t^2 / 2, the mean over T is a T^2 / 24.
+
+    The ends are at a T^2 / 8, and the middle of a fitted parabola is zero.
+    """
     acceleration = 0.3
     off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)
     assert off[0, 0] == pytest.approx((acceleration * _EXPOSURE**2 / part) ** 2, abs=1e-30)
@@ -230,7 +236,7 @@ def test_a_steady_rate_leaves_no_doubt_nor_does_what_is_odd_in_time(weighting: W
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
-    """To the fourth power of time they give what the fine weights do."""
+    """Up to the fourth power of time, the nodes agree with the fine weights."""
     weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
     off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), np.zeros((3, 3)), _EXPOSURE)
@@ -239,7 +245,7 @@ def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) -> None:
-    """Monte Carlo of 4,000 exposures, each side of the middle integrated twice; its variance to 10 %."""
+    """In 4,000 random exposures, the acceleration is integrated twice. The variance is accurate to 10 %."""
     weighting, fine = _WEIGHTS[name]
     density, steps, trials = 0.03, 200, 4000
     step = 0.5 * _EXPOSURE / steps

@@ -1,6 +1,6 @@
-"""The bound on chance matches against strewn stars, and the order statistic against enumeration.
+"""Tests of the bound on chance matches against random stars, and of the order statistic against enumeration.
 
-Tracking from a prior, and the verification that it shares with every other method.
+Tests of tracking from a prior, and of the verification that all methods share.
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ def _chance(observed: int, spread: float) -> Chance:
 
 
 def test_the_bound_is_not_below_what_strewn_stars_show() -> None:
-    """One field, all turns and shifts, scale known: sky and image both strewn, ten stars of a unit square.
+    """Sky and image are random sets of ten stars in a unit square.
 
-    Every pair of the image is laid on every pair of the sky that is as long, and the best number of matches
-    counted; how often it reaches five is compared with the bound for five.
+    All rotations and shifts at a known scale are tried.
+
+    Every pair of image stars is aligned with every sky pair of equal length, and the largest number of
+    matches is counted. The frequency of five matches is compared with the bound.
     """
     rng = np.random.default_rng(5)
     sigma, gate, stars, trials, reached = 0.004, 3.0, 10, 120, 0
@@ -130,7 +132,10 @@ def test_an_attitude_off_by_half_a_degree_does_not_verify() -> None:
 
 
 def test_few_stars_that_verify_near_a_prior_may_be_chance_in_the_whole_sky() -> None:
-    """What was searched enters: four blurred stars convince a tracker and not one that is lost."""
+    """The bound depends on the searched area.
+
+    Four stars with large errors are sufficient in tracking, but not lost in space.
+    """
     convinced = {"tracking": 0, "lost": 0}
     for seed in range(15):
         drawn = _drawn(ListKind(noise_px=1.0, magnitude_error=0.0, known_deg=0.1), seed)

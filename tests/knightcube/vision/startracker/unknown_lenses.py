@@ -1,4 +1,4 @@
-"""Drawn stars through lenses of which the star tracker knows only the field."""
+"""Simulated stars through lenses of which the star tracker only knows the field of view."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _NOISE_PX = 0.1
 _FIELDS_DEG = 8.0, 30.0
 
 
-# px of 1024, and part of the radius at the corner: standard deviations of the lenses drawn.
+# Standard deviations of lens centre (px of 1024) and of distortion at the corner relative to the radius.
 LENSES = {"perfect": (0.0, 0.0), "usual": (10.0, 0.005), "poor": (25.0, 0.02)}
 
 
 def drawn_lens(kind: str, rng: np.random.Generator) -> Lens:
-    """Return a random lens of a kind of LENSES."""
+    """Return a random lens of the given kind in LENSES."""
     off, bent = LENSES[kind]
     field = math.radians(rng.uniform(*_FIELDS_DEG))
     focal_length = 0.5 * _PIXELS / math.tan(0.5 * field)
@@ -46,7 +46,7 @@ def drawn_lens(kind: str, rng: np.random.Generator) -> Lens:
 
 
 def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
-    """Return the attitude (4,) of a camera whose axis goes through the picture's middle."""
+    """Return the attitude (4,) of a camera whose axis passes through the image centre."""
     middle = np.array([[0.5 * (lens.columns - 1), 0.5 * (lens.rows - 1)]])
     z = lens.unit_vectors(middle)[0]
     right = (
@@ -57,7 +57,7 @@ def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
         lens.unit_vectors(middle + np.array([0.0, 1.0]))[0]
         - lens.unit_vectors(middle - np.array([0.0, 1.0]))[0]
     )
-    # Half of what is not square goes to either side, as a fit of both does.
+    # The departure of the two image axes from a right angle is divided equally, as in a fit.
     one, other = (side - z * (side @ z) for side in (right, down))
     x = one / np.linalg.norm(one) + np.cross(other / np.linalg.norm(other), z)
     x /= np.linalg.norm(x)
@@ -65,7 +65,7 @@ def of_the_middle(lens: Lens, attitude: FloatArray) -> FloatArray:
 
 
 def drawn(kind: str, number: int) -> tuple[FrameSolution, FloatArray]:
-    """Return the solution of a drawn picture, and the true attitude (4,) of its middle."""
+    """Return the solution of a simulated image, and the true attitude (4,) of its centre."""
     rng = np.random.default_rng([_SEED, number, *kind.encode()])
     lens, attitude = drawn_lens(kind, rng), normalise(rng.standard_normal(4))
     stars = catalogue.load()

@@ -1,1 +1,1 @@
-"""Mirrors `knightcube.vision.streaks`."""
+"""Tests of `knightcube.vision.streaks`."""

@@ -1,4 +1,4 @@
-"""Simulated frames of the real sky, with their true motion and stars."""
+"""Simulated frames of the real sky with their true motion and stars."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ EPOCH = 2030.0
 
 @dataclass(frozen=True)
 class Scene:
-    """A frame, its true motion, and its stars, brightest first.
+    """A frame with its true motion and its stars, brightest first.
 
-    `stars` (n, 2) px at mid-exposure, `electrons` (n,).
+    `stars` (n, 2) are positions at mid-exposure, px, and `electrons` (n,) their fluxes.
     """
 
     pixels: Image
@@ -32,7 +32,7 @@ class Scene:
     camera: StarCameraModel
 
     def bound(self, most: int = 20) -> RateBound:
-        """Return the Cramer-Rao bound of the `most` brightest stars."""
+        """Return the Cramer-Rao bound of the rate from the `most` brightest stars."""
         floor = self.camera.read_noise**2 + self.camera.dark_current * self.exposure + 1.0 / 12.0
         return rate_bound(
             self.camera.pinhole,
@@ -46,7 +46,7 @@ class Scene:
 
 
 def turn_of(theta: float, length: float, roll: float, camera: StarCameraModel = CAMERA) -> FloatArray:
-    """Return the turn (3,) rad, `theta` rad off the boresight, that draws streaks of about `length` px."""
+    """Return the rotation (3,) rad, `theta` rad off the boresight, for streaks of about `length` px."""
     pinhole = camera.pinhole
     axis = np.array([np.sin(theta) * np.cos(roll), np.sin(theta) * np.sin(roll), np.cos(theta)])
     off_axis = 0.5 * pinhole.columns / pinhole.focal_length
@@ -63,7 +63,7 @@ def real_sky(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a random field of the real sky under a constant rate; the same for the same seed."""
+    """Return a random field of the real sky at a constant rate, which depends only on the seed."""
     rng = np.random.default_rng([seed, 777])
     turn = turn_of(theta, length, rng.uniform(0.0, 2.0 * np.pi), camera)
     return taken(rng, turn, np.zeros(3), exposure, camera, faintest)
@@ -77,9 +77,9 @@ def taken(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a random field under turn + growth t; growth must be along the turn.
+    """Return a random field for the rate turn + growth t, where `growth` must be parallel to `turn`.
 
-    With a rolling shutter the motion goes on for as long as rows are read.
+    With a rolling shutter, the motion continues until all rows are read.
     """
     middle = quaternion.normalise(rng.standard_normal(4))
     open_for = 1.0 + camera.rows * camera.line_time / exposure

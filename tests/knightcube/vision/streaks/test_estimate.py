@@ -1,4 +1,4 @@
-"""The estimator on simulated frames of the real sky, compared with the truth and the Cramer-Rao bound."""
+"""Tests of the rate estimator on simulated frames, against the truth and the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_stars_have_their_true_positions_at_mid_exposure() -> None:
     off = found.stars[found.used] - scene.stars[nearest]
     squares = [_squared(o, c) for o, c in zip(off, found.star_covariance[found.used], strict=True)]
     assert np.median(squares) < 4.0
-    # The faintest of them are known to a few tenths only.
+    # The faintest of the used stars are accurate to a few tenths of a pixel only.
     assert np.median(np.abs(off[:8])) < 0.1
 
 
@@ -165,7 +165,7 @@ def test_a_rate_that_begins_or_ends_at_zero_is_fitted(growth: float, length: flo
 
 
 def test_a_step_within_the_exposure_is_fitted_with_the_course_from_navigation() -> None:
-    """The camera rests for a third of the exposure and then accelerates: the rate is not linear in time."""
+    """The camera rests for a third of the exposure and then accelerates, which is not linear in time."""
     turn = turn_of(np.radians(70.0), 40.0, 0.9)
     share = 1.0 / 3.0
 
@@ -204,7 +204,7 @@ def test_a_rotation_that_reverses_within_the_exposure_is_rejected() -> None:
 
 
 def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
-    """A scan along the circles about the axis finds the angle, because the regions have wrong lengths."""
+    """The regions have wrong lengths. A scan along the circles about the rotation axis finds the angle."""
     scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
     found = _estimated(scene)
     assert found.rate is not None
@@ -215,7 +215,7 @@ def test_streaks_of_half_the_field_are_fitted_though_few_are_entire() -> None:
 
 
 def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
-    """A line time of 20 us changes the lengths of 100 px streaks in 0.2 s by one per cent."""
+    """A line time of 20 us changes the lengths of 100 px streaks by 1 % for an exposure of 0.2 s."""
     camera = replace(CAMERA, line_time=2e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(21), turn, np.zeros(3), 0.2, camera)
@@ -231,7 +231,7 @@ def test_a_rolling_shutter_biases_the_rate_unless_it_is_modelled() -> None:
 
 
 def test_a_rolling_shutter_distinguishes_a_rotation_from_its_reverse() -> None:
-    """The two rates differ by 5 %. Without a prior, the covariance includes both."""
+    """The rates of both signs differ by 5 %. Without a prior rate, the covariance includes both rates."""
     camera = replace(CAMERA, line_time=5e-5)
     turn = turn_of(np.radians(90.0), 102.0, 0.2)
     scene = taken(np.random.default_rng(22), turn, np.zeros(3), 0.2, camera)
@@ -278,7 +278,7 @@ def test_invalid_arguments_raise_an_error() -> None:
 
 
 def _brightest(scene: Scene, factor: float) -> tuple[FitProblem, StreakScene]:
-    """Return the frame and its 12 brightest stars under `factor` times the true rotation."""
+    """Return a frame and its 12 brightest stars under `factor` times the true rotation."""
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), _SETTINGS, 1.0)
     motion = CameraMotion.steady(factor * scene.rate * scene.exposure)
@@ -352,14 +352,14 @@ def test_pieces_of_streaks_form_chains_and_entire_streaks_do_not() -> None:
 
 
 def test_a_rotation_supported_only_by_streaks_at_the_border_is_rejected() -> None:
-    """In run 216 of seed 2026, 1.37 times the true angle fits all streaks that the border cuts."""
+    """In run 216 of seed 2026, 1.37 times the true angle fits all streaks that the border truncates."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(2026, 216).exposed(camera)
     _assert_right_or_refused(camera, scene)
 
 
 def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
-    """All bright streaks show only one end, and 0.88 of the true angle fits these."""
+    """All bright streaks show only one end, and 0.88 times the true angle fits these ends."""
     camera, generator = StarCameraModel(field_of_view=FIELD), np.random.default_rng((4242, 2, 50, 7))
     theta = np.radians(generator.uniform(0.0, 90.0))
     _assert_right_or_refused(camera, slew(generator, float(theta), 0.5, 0.2, model=camera))
@@ -367,7 +367,7 @@ def test_a_rotation_is_rejected_if_the_only_entire_streak_is_longer() -> None:
 
 @pytest.mark.parametrize("run", [188, 970])
 def test_the_whole_frame_gives_the_angle_if_bright_regions_are_blends(run: int) -> None:
-    """In these crowded frames, 2.5 times the true angle explains some of the light."""
+    """In these crowded frames, 2.5 times the true angle explains a part of the flux."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, _ = RandomSlew.drawn(62, run).exposed(camera)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
@@ -383,7 +383,10 @@ def _assert_right_or_refused(camera: StarCameraModel, scene: Drawn) -> None:
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:
-    """The sum over 12 frames has 36 degrees of freedom: 19 to 62 in 99 % of cases, half for a safe bound."""
+    """A chi-square with 36 degrees of freedom lies between 19 and 62 in 99 % of cases.
+
+    The lower limit is halved.
+    """
     total = 0.0
     for seed in range(12):
         scene = real_sky(400 + seed, np.radians((0.0, 30.0, 60.0, 90.0)[seed % 4]), 45.0, 0.2)
@@ -396,7 +399,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
 
 
 def test_the_rate_reaches_the_bound_without_faint_stars() -> None:
-    """The ratio to the bound over 12 frames stays below 1.31, the 99 % limit of 36 degrees of freedom."""
+    """The ratio to the bound over 12 frames is below 1.31, the 99 % limit for 36 degrees of freedom."""
     ratios = []
     for seed in range(12):
         theta = np.radians((0.0, 30.0, 60.0, 90.0)[seed % 4])

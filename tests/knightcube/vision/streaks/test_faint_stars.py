@@ -1,4 +1,4 @@
-"""Running sums on circles about the axis include all samples on the detector."""
+"""Tests that running sums on circles about the rotation axis include all samples on the detector."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_running_sums_are_those_of_every_sample_of_every_circle(theta: float, le
     wrapped = there % columns.shape[1]
     held = running_sums(light.reshape(-1), pinhole, grid, 1.0)
     count = (exist[:, wrapped] & on_grid).sum(axis=2)
-    # A pixel's border is met to single precision.
+    # Samples at the border of a pixel may be rounded differently in single precision.
     assert np.mean(held.count != count) < 2e-3
     assert np.max(np.abs(held.count - count)) <= 2
     expected = (samples[:, wrapped] * on_grid).sum(axis=2)

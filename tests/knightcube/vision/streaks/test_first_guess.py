@@ -1,4 +1,4 @@
-"""First guesses of axis and angle from the bright regions of simulated frames."""
+"""Tests of initial guesses of axis and angle from the bright regions of simulated frames."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_scan_along_the_circles_gives_the_angle_nearest_to_a_prior_first() -> 
 
 @pytest.mark.parametrize("growth", [1.5, -1.5])
 def test_the_asymmetry_of_regions_shows_a_change_of_the_rate(growth: float) -> None:
-    """The sign is relative to the rotation: the guessed axis may be the reverse of the true one."""
+    """The sign is relative to the rotation, because the guessed axis may be opposite to the true axis."""
     rotation = turn_of(np.radians(70.0), 120.0, 0.4)
     scene = taken(np.random.default_rng(74), rotation, growth * rotation, 0.5)
     _, regions = _regions(scene)

@@ -1,4 +1,4 @@
-"""Bright regions, binning, width of the point spread, limbs and colour mosaics."""
+"""Tests of bright regions, binning, point-spread width, limbs and colour mosaics."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST = 12
 
 
 def _frame(mask: np.ndarray) -> ReducedFrame:
-    """Return a frame whose 3 x 3 sums exceed the threshold where `mask` (rows, columns) says."""
+    """Return a frame whose 3 x 3 sums exceed the threshold at the true pixels of `mask` (rows, columns)."""
     light = np.where(mask, 100.0, 0.0).astype(np.float32).reshape(-1)
     light += mask.reshape(-1) * np.arange(mask.size, dtype=np.float32) % 7
     nothing = np.zeros(mask.size, dtype=np.bool_)
@@ -40,7 +40,7 @@ def _frame(mask: np.ndarray) -> ReducedFrame:
 
 @pytest.mark.parametrize("share", [0.02, 0.2, 0.35, 0.45, 0.7])
 def test_regions_are_those_of_an_independent_labelling(share: float) -> None:
-    """Regions are 8-connected at every density, also near percolation."""
+    """Regions are 8-connected for every pixel density, also near percolation."""
     rng = np.random.default_rng(5)
     mask = np.zeros(_SHAPE, dtype=np.bool_)
     mask[1:-1, 1:-1] = rng.random((_SHAPE[0] - 2, _SHAPE[1] - 2)) < share
@@ -83,7 +83,7 @@ def test_binning_keeps_light_and_saturation() -> None:
     sums, top = Binning.suited(Pinhole(8, 8, 10.0), 2.0).frame(pixels, 1000.0)
     assert sums.shape == (4, 4)
     assert sums[0, 0] == 16 * (0 + 1 + 8 + 9)
-    # The last sum holds 1008, the one before it at most 976.
+    # The last sum contains a pixel of 1008, and the one before it at most 976.
     assert top == 4 * 1008
     assert (sums >= top).sum() == 1
     assert np.all(sums % 16 == 0)
@@ -103,7 +103,7 @@ def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> 
     assert np.linalg.norm(error) < 0.005 * np.linalg.norm(scene.rate)
     assert found.psf_sigma == pytest.approx(3.0, rel=0.05)
     assert found.length == pytest.approx(90.0, rel=0.3)
-    # The stars used are those of the sky, in pixels of the frame.
+    # The used stars are stars of the simulated sky, in pixels of the full frame.
     apart = np.linalg.norm(found.stars[found.used][:, None] - scene.stars, axis=2).min(axis=1)
     assert np.median(apart) < 0.5
 
@@ -117,7 +117,7 @@ def test_the_line_time_of_binned_rows_is_a_multiple_whether_stated_or_not() -> N
     assert binning.settings(stated).line_time_sigma == 0.0
 
 
-# Chi-square of 3 that chance exceeds once in a thousand.
+# Chi-square with 3 degrees of freedom that one frame in a thousand exceeds by chance.
 _HONEST = 16.3
 
 

@@ -1,4 +1,4 @@
-"""Distorted pinhole: positions forth and back, and the motion of stars in the distorted image."""
+"""Tests of the distorted pinhole: positions in both directions, and the motion of stars in the image."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position() -> None:
 
 @pytest.mark.parametrize("parameter", range(8))
 def test_sensitivities_are_derivatives_of_the_position(parameter: int) -> None:
-    """The derivative by the acceleration is of second order, here exact to a thousandth."""
+    """The derivative by the acceleration has an error of second order, which is below 0.1 % here."""
     change = np.zeros(8)
     change[parameter] = 1e-5 if parameter < 6 else 1e-2
 

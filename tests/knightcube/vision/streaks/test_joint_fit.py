@@ -1,4 +1,4 @@
-"""Correction of the length of a motion, and the selection of fitted stars."""
+"""Tests of the correction of streak lengths and of the selection of fitted stars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STARS = 16
 
 
 def _seen(theta: float, length: float, turned: float) -> tuple[FitProblem, StreakScene, CameraMotion]:
-    """Return a frame, its brightest stars under `turned` times the true motion, and that motion."""
+    """Return a frame, its brightest stars under `turned` times the true motion, and the true motion."""
     sky = real_sky(21, np.radians(theta), length, 0.2)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -66,7 +66,7 @@ _ROOM = 20
 
 
 def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
-    """Return a frame and its brightest stars as they are, the first of them with a say."""
+    """Return a frame and its brightest stars at their true positions, of which the first are trusted."""
     sky = real_sky(7, np.radians(theta), length, 1.0)
     frame = reduce_frame(sky.pixels, SATURATION, CAMERA.gain)
     camera = FitProblem(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
@@ -80,7 +80,7 @@ def _taken(theta: float, length: float) -> tuple[FitProblem, StreakScene]:
 
 @pytest.mark.parametrize(("theta", "length"), [(90.0, 60.0), (60.0, 400.0), (30.0, 400.0), (3.0, 250.0)])
 def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: float) -> None:
-    """The prediction is within a third for straight, oblique and bent streaks and those leaving the frame."""
+    """The prediction is within a third for straight, oblique, curved and partly visible streaks."""
     camera, scene = _taken(theta, length)
     windows = camera.windows(scene)
     taken = windows.strips.index.size + windows.patches.index.size
@@ -89,7 +89,7 @@ def test_the_number_of_pixels_of_windows_is_predicted(theta: float, length: floa
 
 
 def test_the_brightest_stars_are_fitted_while_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The order of the stars does not matter, and the rate is within its covariance."""
+    """The result does not depend on the order of the stars, and the rate agrees with its covariance."""
     camera, scene = _taken(60.0, 300.0)
     room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
     monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)
@@ -112,7 +112,7 @@ def test_trusted_stars_are_fitted_without_regard_to_room(monkeypatch: pytest.Mon
 
 
 def test_a_fit_with_a_much_wider_point_spread_is_rejected() -> None:
-    """Stars twice as wide as the initial width are not the given stars."""
+    """Stars twice as wide as the initial width are rejected as a wrong model."""
     camera, scene = _taken(60.0, 300.0)
     assert joint_fit.joint_fit(camera, scene) is not None
     assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None

@@ -1,4 +1,4 @@
-"""Scatter of the stars' equations, by random draws of their noise."""
+"""Tests of the scatter of the stars' equations with randomly drawn noise."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ _KEPT = np.array([0, 1, 2, 6])
 
 
 def _drawn(noise: float, blind: bool = False) -> StarEquations:
-    """Return what stars of very unequal light say whose scores scatter by `noise` times their own noise.
+    """Return equations of stars with very different fluxes.
 
-    A star that is `blind` knows nothing of two directions of its own.
+    Their scores scatter by `noise` times the noise.
+
+    If `blind`, each star has no information in two random directions.
     """
     rng = np.random.default_rng(3)
     change = rng.normal(size=(_STARS, 4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, (_STARS, 1, 1))
@@ -30,7 +32,7 @@ def _drawn(noise: float, blind: bool = False) -> StarEquations:
 @pytest.mark.parametrize("blind", [False, True])
 @pytest.mark.parametrize("noise", [1.0, 3.0])
 def test_the_scatter_of_noise_is_one_per_degree_of_freedom(noise: float, blind: bool) -> None:
-    """Neither the units of the parameters nor undetermined directions matter."""
+    """The result depends neither on the units of the parameters nor on undetermined directions."""
     assert contradiction(_drawn(noise, blind)) == pytest.approx(noise**2, rel=0.1)
 
 

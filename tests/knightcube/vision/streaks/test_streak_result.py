@@ -1,4 +1,4 @@
-"""Status, direction of time and reversal of results, and checks of the arguments."""
+"""Tests of status, sign and time reversal of results, and of the argument checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Uncertainty of the rotation: calibration errors and their correction by the stars, and residuals."""
+"""Tests of the uncertainty of the rotation: calibration errors, their correction, and residuals."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TURN = np.array([0.02, 0.03, 0.0])
 
 
 def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
-    """Return each star's seeming turns (n, 3, m), and its information (n, 3, 3) when ends alone count."""
+    """Return each star's apparent rotation (n, 3, m), and its information (n, 3, 3) if only ends count."""
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))
@@ -47,7 +47,7 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
 
 
 def _together(seeming: FloatArray, information: FloatArray) -> FloatArray:
-    """Return what all stars together take errors for, (3, m)."""
+    """Return the apparent rotation (3, m) by all stars together for each calibration error."""
     return np.asarray(np.linalg.solve(information.sum(axis=0), np.sum(information @ seeming, axis=0)))
 
 
@@ -56,10 +56,11 @@ def test_an_exact_camera_has_no_errors() -> None:
 
 
 def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
-    """A shift by dx is to first order a rotation by dx / f about y, which turns the rate with it.
+    """A shift by dx is to first order a rotation by dx / f about y, which rotates the rate vector.
 
-    Of that only one of the two components of the motion asks: the flow of the second order, which the shift
-    changes as well, takes back that of the other. Of stars on a square that counts for half.
+    Only half of this rotation appears in the rate, because the second-order flow, which the shift also
+    changes, cancels the effect on one of the two components of the motion. The factor of one half holds for
+    stars on a square.
     """
     focal = CAMERA.pinhole.focal_length
     found = _together(*_seeming(replace(EXACT, centre=5.0)))
@@ -69,7 +70,7 @@ def test_a_wrong_image_centre_appears_as_a_rotated_rate() -> None:
 
 
 def test_wrong_focal_length_and_wrong_line_time_appear_as_another_rate() -> None:
-    """For an axis across the boresight, the rate is a length divided by the focal length."""
+    """For an axis perpendicular to the boresight, the rate is a streak length divided by the focal length."""
     found = _together(*_seeming(replace(EXACT, focal_length=0.01)))
     assert found[:, 0] == pytest.approx(0.01 * _TURN, abs=0.1 * 0.01 * float(np.linalg.norm(_TURN)))
     late = _together(*_seeming(replace(EXACT, line_time=1e-5)))
@@ -78,7 +79,7 @@ def test_wrong_focal_length_and_wrong_line_time_appear_as_another_rate() -> None
 
 
 def test_an_unstated_shutter_appears_as_a_larger_rotation_for_each_star() -> None:
-    """The delay lengthens the paths without changing their curvature."""
+    """The delay of the rows lengthens the paths without changing their curvature."""
     turn = np.array([0.07, 0.05, -0.05])
     late, _ = _seeming(replace(EXACT, line_time=1e-5), turn)
     size = float(np.linalg.norm(turn))
@@ -98,7 +99,7 @@ def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() ->
 
 
 def test_significant_calibration_errors_are_corrected_and_others_widen_the_covariance() -> None:
-    """A distortion of 1 % exceeds the noise a hundredfold; a chance error is not corrected."""
+    """A distortion of 1 % exceeds the noise by a factor of 100, whereas a chance error is not corrected."""
     seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
     score = np.einsum("nij,njk->ni", precise, seeming)
@@ -160,7 +161,7 @@ def test_two_stars_give_a_rate_with_a_large_covariance() -> None:
 
 
 def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In crowded frames, the brightest streaks fitted with all hidden stars give smaller errors."""
+    """In crowded frames, a fit of the brightest streaks with all their hidden stars has smaller errors."""
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(saturation=SATURATION, gain=camera.gain, knowledge=EXACT)
     errors = []
@@ -183,7 +184,7 @@ def test_stars_hidden_in_streaks_do_not_move_the_ends(monkeypatch: pytest.Monkey
 
 
 def _left(residual: float, noise: float, shift: str) -> tuple[StreakResiduals, StreakScene]:
-    """Return residuals of ends or sides displaced by `residual` px on blocks of pixels, with `noise`."""
+    """Return residuals of ends or sides that are displaced by `residual` px, with a noise factor `noise`."""
     rng = np.random.default_rng(3)
     images = np.zeros((40, 7, 10, 9), dtype=np.float32)
     ends, sides = slice(0, 20), slice(20, 40)

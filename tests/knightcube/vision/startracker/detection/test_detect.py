@@ -1,8 +1,8 @@
-"""Stars of simulated frames are found, measured to the bound, and told from what is none.
+"""Tests of detection: stars in simulated frames are found, measured to the bound, and told from others.
 
-Stars about predicted places.
+Tests of detection near predicted star positions.
 
-Real photographs: the brightest detections are stars of the catalogue, where the truth says they are.
+Tests on real photographs: the brightest detections are catalogue stars at their true positions.
 """
 
 from __future__ import annotations
@@ -306,7 +306,7 @@ def test_wrong_predictions_are_refused() -> None:
 
 
 def test_stars_that_move_by_a_few_pixels_are_measured_where_they_are_in_the_middle() -> None:
-    """Trails of 3 px along a slope: the errors are as large as claimed, also among faint stars."""
+    """For trails of 3 px on a sloping background, the errors agree with the covariance."""
     rng = np.random.default_rng(12)
     trail, squares, claims = np.array([2.5, 1.5]), [], []
     for _ in range(6):
@@ -325,20 +325,20 @@ def test_stars_that_move_by_a_few_pixels_are_measured_where_they_are_in_the_midd
         off = found.points - TRAILED[found.prediction]
         squares += np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.covariance), off).tolist()
         claims += found.sigma.tolist()
-    assert 0.7 < np.median(squares) < 2.3  # 1.39 of two degrees of freedom
+    assert 0.7 < np.median(squares) < 2.3  # median 1.39 for two degrees of freedom
     assert np.median(claims) < 0.03
 
 
 SKY = Path(__file__).parents[5].parent / "shared" / "data" / "sky"
 _TOLERANCE = 0.007
-"""Of the frame's width: the lenses' distortion is not taken out."""
+"""Tolerance as a fraction of the frame's width, because the lens distortion is not corrected."""
 _AMONG = 80
 
 pytestmark = pytest.mark.skipif(not SKY.is_dir(), reason="the photographs of ../shared/data/sky are missing")
 
 
 def catalogue_places(truth: dict[str, float], shape: tuple[int, ...]) -> FloatArray:
-    """Return the pixels of the brightest stars in the field, by cedar-solve's convention of roll."""
+    """Return the pixels of the brightest stars in the field, with the roll convention of cedar-solve."""
     ra, dec, roll = (np.radians(truth[name]) for name in ("ra", "dec", "roll"))
     boresight = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
@@ -375,7 +375,7 @@ def test_nearly_all_of_the_twenty_brightest_detections_are_bright_catalogue_star
 
 
 def test_leaves_are_not_among_the_stars() -> None:
-    """The tree fills the picture's upper right corner."""
+    """The tree fills the upper right corner of the image."""
     found = detect(read_image(SKY / "tree.jpg")).stars()
     in_tree = (found.points[:, 0] > 310.0) & (found.points[:, 1] < 310.0)
     assert np.count_nonzero(in_tree[:20]) <= 5

@@ -1,4 +1,4 @@
-"""The other centroids: where a star without noise is found, and how each pixel moves the result."""
+"""Tests of the alternative centroids: positions of a star without noise, and the effect of each pixel."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _stars(flux: float) -> FloatArray:
 
 
 def _start(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of mass and its slopes, all zero: they must not be needed."""
+    """Return the centre of mass with zero derivatives, because the derivatives must not be used."""
     step = np.arange(-3.0, 4.0)
     total = clean.sum(axis=(1, 2))
     x, y = clean.sum(axis=1) @ step / total, clean.sum(axis=2) @ step / total
@@ -47,7 +47,7 @@ def test_the_slopes_are_those_of_finite_differences(method: str) -> None:
             changed[:, row, column] += sign * step
             moved.append(METHODS[method](changed, variance, start, WIDTH)[0])
         numeric = (moved[0] - moved[1]) / (2.0 * step)
-        # The weights of the parabola's fit are held; they too follow the light, to the second order.
+        # The parabola's weights are held fixed, although they depend on the pixels in second order.
         assert slopes[:, :, row, column] == pytest.approx(numeric, rel=0.15, abs=2e-8)
 
 

@@ -1,4 +1,4 @@
-"""Windows around stars, and the noise model, from drawn pixels whose noise is known."""
+"""Tests of windows around stars and of the noise model, on drawn pixels with known noise."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def test_a_window_holds_the_counts_above_the_sky_and_marks_pixels_that_cannot_be
     assert len(windows) == 2
     assert windows.light.shape == windows.good.shape == (2, 5, 5)
     assert windows.light[0].tolist() == (pixels[3:8, 2:7] - 10.0).tolist()
-    # 57 counts and more are saturated, but keep their light.
+    # Pixels of 57 counts and more are saturated, but keep their counts.
     assert windows.good[0].tolist() == (pixels[3:8, 2:7] < 57.0).tolist()
-    # The second star stands in the lower left corner: nine pixels are in the frame, all saturated.
+    # Nine pixels of the second window, in the lower left corner, are in the frame, and all are saturated.
     assert windows.light[1, :3, 2:].tolist() == (pixels[7:, :3] - 20.0).tolist()
     assert np.count_nonzero(windows.light[1]) == 9
     assert not windows.good[1].any()
@@ -43,7 +43,7 @@ def test_smoothing_spreads_a_point_as_one_two_one_on_both_axes() -> None:
 def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
     photon: float, mismatch: float
 ) -> None:
-    """Residuals with the variance s^2 + p m + q^2 m^2, of which the fit has absorbed a fifth."""
+    """The residuals have the variance s^2 + p m + q^2 m^2, of which the fit has absorbed a fifth."""
     draw = np.random.default_rng(1)
     noise = draw.uniform(2.0, 4.0, 300)
     light = draw.uniform(0.0, 1.0, (300, 7, 7)) ** 3 * draw.uniform(50.0, 3000.0, (300, 1, 1))
@@ -54,13 +54,13 @@ def test_photon_noise_and_mismatch_are_distinguished_by_their_growth_with_light(
     found = measure_noise(residual, floor, leverage, light, noise, None)
     assert found.photon == pytest.approx(photon, rel=0.1, abs=0.02)
     assert found.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
-    # Hot pixels beyond five standard deviations do not count.
+    # Hot pixels beyond five standard deviations are ignored.
     spoilt = residual.copy()
     spoilt[:, 3, 3] += 40.0 * np.sqrt(true[:, 3, 3])
     other = measure_noise(spoilt, floor, leverage, light, noise, None)
     assert other.photon == pytest.approx(photon, rel=0.3, abs=0.1)
     if photon > 0.0:
-        # A known gain gives the photon noise, and the mismatch is the median over the stars.
+        # A known gain determines the photon noise, and the mismatch is the median over the stars.
         known = measure_noise(residual, floor, leverage, light, noise, 1.0 / photon)
         assert known.photon == pytest.approx(photon)
         assert known.mismatch == pytest.approx(mismatch, rel=0.1, abs=0.006)
@@ -75,7 +75,10 @@ def test_few_bright_pixels_give_no_measure_noise() -> None:
 
 
 def test_the_variance_of_a_pixel_is_the_sum_of_sky_photons_and_mismatch() -> None:
-    """Noise of 3 counts, 0.5 counts^2 per count, 10 % of 20 counts: 9 + 10 + 4; no light is negative."""
+    """Noise of 3 counts, photon noise of 0.5 counts^2 per count and 10 % of 20 counts give 9 + 10 + 4.
+
+    Negative counts add no variance.
+    """
     light = np.array([[[20.0, -20.0]]])
     variance = NoiseModel(photon=0.5, mismatch=0.1).variance(light, np.array([3.0]))
     assert variance[0, 0] == pytest.approx([23.0, 9.0])

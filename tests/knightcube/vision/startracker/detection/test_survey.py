@@ -1,6 +1,6 @@
-"""The parts of detection against independent computations.
+"""Tests of the steps of the survey against independent computations.
 
-Star frames with foregrounds and defects.
+Tests on star frames with foregrounds and defects.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def test_the_light_is_the_integral_over_each_pixel() -> None:
 
 
 def test_the_window_s_centre_is_that_of_the_printed_sums() -> None:
-    """Eq. 16-20 by loops, the border being that of a x a pixels."""
+    """Equations 16 to 20 are evaluated by loops over a window of a x a pixels with its border."""
     a = 7
     window = np.random.default_rng(1).uniform(0.0, 50.0, (a, a))
     window[3, 3] += 500.0
@@ -145,7 +145,7 @@ def test_a_frame_with_a_foreground_or_defects_is_solved(kind: str) -> None:
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are missing")
 def test_photographs_with_a_foreground_or_defects_are_solved_and_never_wrongly() -> None:
-    """Before noise was measured by block and hot pixels were replaced, 1 of 8 was right."""
+    """With a global noise estimate and without hot-pixel repair, only 1 of 8 frames was solved."""
     chosen = [s for s in photographed(PHOTOGRAPHS) if s.pixels.size < 800_000][:2]
     kinds = ("bright third", "hot 1 %")
     spoilt = [spoilt_scene(scene, kind, n) for kind in kinds for n, scene in enumerate(chosen)]
